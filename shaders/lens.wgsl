@@ -6,7 +6,7 @@
 
 #import angle
 
-@group(0) @binding(12) var<storage, read> lenses: array<Lens, MAX_VIEWS>;
+@group(0) @binding(12) var<storage, read> lenses: array<Lens>;
 
 // Values of `Lens.model`; 0 is a pinhole.
 const OPENCV: u32 = 1;

@@ -5,11 +5,13 @@
 // each the index of its first splat, and `project` writes the visible splats, so that splats keep the
 // order of their cluster views. Twin of `src/render/cpu/project`, where the equations are documented.
 // `PROJECTION` stands for `pinhole` (static pinhole cameras) or `unscented` (lenses and rolling
-// shutters).
+// shutters), and `ACTORS` for `actors` (chunks of actors, and those of the twin beneath them) or
+// `no_actors`.
 
 #import constants
 #import layout
 #import math
+#import ACTORS
 #import PROJECTION
 
 override SH_DEGREE: u32;
@@ -94,10 +96,11 @@ fn project(
     let gaussian = geometry(cluster_view.line, thread);
     let projected = project_shape(gaussian, chunk_view, true);
     shapes[slot] = projected.shape;
-    let rgb = color(cluster_view.line, thread, projected.from_camera_m);
+    let stored = color(cluster_view.line, thread, projected.from_camera_m);
+    let rgb = lit(stored, cluster_view.chunk_view, gaussian.mean_m);
     colors[slot] = SplatColor(rgb, projected.depth_m);
     let depth = bitcast<u32>(max(projected.depth_m, frame.near_m)) - bitcast<u32>(frame.near_m);
-    keys[slot] = (chunk_view.view << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
+    keys[slot] = (index_of_view(chunk_view) << DEPTH_BITS) | min(depth, (1u << DEPTH_BITS) - 1u);
     splat_indices[slot] = slot;
 }
 

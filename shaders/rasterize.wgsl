@@ -2,12 +2,14 @@
 // pixels of a row, so that loading a splat and computing the terms that depend on the row are shared by
 // four pixels. Splats are loaded batch by batch into workgroup memory.
 //
-// `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`. Twin of
+// `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`, and `INSTANCES` for `instances.wgsl` or
+// `no_instances.wgsl`. Twin of
 // `src/render/cpu/rasterize.rs`.
 
 #import constants
 #import layout
 #import math
+#import INSTANCES
 #import resolve
 #import BACKGROUND
 
@@ -108,6 +110,7 @@ fn main(
                 if DEPTH {
                     sums.depth += weight * color_depth.w;
                 }
+                note_owner(first + k, sums.transmittance, after, counts);
                 sums.transmittance = select(sums.transmittance, after, counts);
                 running = after;
                 done = !any(counts);

@@ -2,7 +2,7 @@
 // `rasterize`, so that the sums stay in registers.
 //
 // The output is tile after tile, and within a tile one plane of 256 values after another, in this order
-// and only if requested: packed RGBA8, red, green, blue, opacity, depth. Twin of
+// and only if requested: packed RGBA8, red, green, blue, opacity, depth, instance. Twin of
 // `src/render/cpu/resolve.rs`.
 
 override RGB8: bool;
@@ -28,7 +28,7 @@ struct Sums {
 
 // Writes four pixels of a tile; `first_pixel` is the index of the first one in the tile.
 fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
-    let planes = u32(RGB8) + 3u * u32(RGB) + u32(OPACITY) + u32(DEPTH);
+    let planes = u32(RGB8) + 3u * u32(RGB) + u32(OPACITY) + u32(DEPTH) + INSTANCE_PLANES;
     var at = tile * planes * PLANE + first_pixel;
     let opacity = 1.0 - sums.transmittance;
     if RGB8 {
@@ -53,6 +53,10 @@ fn resolve(tile: u32, first_pixel: u32, sums: Sums) {
         let covered = opacity > vec4f(0.0);
         let depth_m = sums.depth / select(vec4f(1.0), opacity, covered);
         write(at, bitcast<vec4u>(select(vec4f(0.0), depth_m, covered)));
+        at += PLANE;
+    }
+    if INSTANCE_PLANES == 1u {
+        write(at, instances());
     }
 }
 

@@ -20,15 +20,15 @@ const ROOT_3: f32 = 1.7320508;
 // The splat of a Gaussian. One that is out of range is returned as not visible, unless `decided`: then
 // `cull` has found it visible, and that stands.
 fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projected {
-    let view_index = view.view;
+    let lens = index_of_lens(view);
     let mean = vec4f(gaussian.mean_m, 1.0);
     let rows = view.camera_from_chunk;
     let center_m = vec3f(dot(rows[0], mean), dot(rows[1], mean), dot(rows[2], mean));
-    let center = project_point(view_index, center_m, 0.0);
+    let center = project_point(lens, center_m, 0.0);
     let depth_m = depth(gaussian.mean_m, view, center_m, center.fraction);
     let off_axis_rad = angle(length(center.point_m.xy), center.point_m.z);
     let in_range = depth_m >= frame.near_m && depth_m <= frame.far_m
-        && off_axis_rad <= lenses[view_index].widest_rad
+        && off_axis_rad <= lenses[lens].widest_rad
         && gaussian.log2_opacity >= frame.log2_alpha_cut;
     if !in_range && !decided {
         return Projected();
@@ -41,10 +41,10 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
         axes_m[axis] = vec3f(dot(rows[0].xyz, axis_m), dot(rows[1].xyz, axis_m), dot(rows[2].xyz, axis_m));
     }
     let from_camera_m =
-        gaussian.mean_m - view.camera_m + center.fraction * lenses[view_index].moved_world_m;
+        gaussian.mean_m - view.camera_m + center.fraction * lenses[lens].moved_world_m;
 
     // Small Gaussians: the expansion around the centre.
-    let expanded = expand_axes(view_index, center, axes_m);
+    let expanded = expand_axes(lens, center, axes_m);
     if expanded.close {
         let u = expanded.root_px;
         let xs = vec3f(u[0].x, u[1].x, u[2].x);
@@ -52,7 +52,7 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
         let minors = cross(xs, ys);
         let covariance = vec3f(dot(xs, xs), dot(xs, ys), dot(ys, ys));
         let foot = Footprint(center.at_px + expanded.shift_px, covariance, dot(minors, minors), 1.0);
-        var projected = shape_of(foot, gaussian.log2_opacity, view_index);
+        var projected = shape_of(foot, gaussian.log2_opacity, index_of_view(view));
         projected.depth_m = depth_m;
         projected.from_camera_m = from_camera_m;
         return projected;
@@ -64,8 +64,8 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
     var sum_px = vec2f(0.0);
     for (var axis = 0u; axis < 3u; axis++) {
         let offset_m = ROOT_3 * axes_m[axis];
-        let one_px = project_point(view_index, center_m + offset_m, center.fraction).at_px - center.at_px;
-        let other_px = project_point(view_index, center_m - offset_m, center.fraction).at_px - center.at_px;
+        let one_px = project_point(lens, center_m + offset_m, center.fraction).at_px - center.at_px;
+        let other_px = project_point(lens, center_m - offset_m, center.fraction).at_px - center.at_px;
         pairs[axis] = vec4f(one_px, other_px);
         sum_px += one_px + other_px;
     }
@@ -97,7 +97,7 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
         }
     }
     let foot = Footprint(center.at_px + mean_px, covariance, det_unblurred, units_per_px);
-    var projected = shape_of(foot, gaussian.log2_opacity, view_index);
+    var projected = shape_of(foot, gaussian.log2_opacity, index_of_view(view));
     projected.depth_m = depth_m;
     projected.from_camera_m = from_camera_m;
     return projected;
@@ -148,11 +148,11 @@ fn project_point_at(view_index: u32, at_end_m: vec3f, fraction: f32) -> Projecte
 // part that a camera with a rolling shutter adds by moving. That part is as exact as the row that sees
 // the centre: a millionth of the camera's motion during the exposure.
 fn depth(mean: vec3f, view: ChunkView, at_end_m: vec3f, fraction: f32) -> f32 {
-    if lenses[view.view].by_distance != 0u {
-        return exact_distance(mean, view, fraction * lenses[view.view].moved_world_m);
+    if lenses[index_of_lens(view)].by_distance != 0u {
+        return exact_distance(mean, view, fraction * lenses[index_of_lens(view)].moved_world_m);
     }
-    let moved_m = fraction * lenses[view.view].moved_m;
-    let more_m = moved_m.z + rotation_shift(view.view, at_end_m + moved_m, fraction).z;
+    let moved_m = fraction * lenses[index_of_lens(view)].moved_m;
+    let more_m = moved_m.z + rotation_shift(index_of_lens(view), at_end_m + moved_m, fraction).z;
     let exact_m = exact_z(mean, view);
     let sum = two_sum(exact_m.x, more_m);
     return sum.x + (sum.y + exact_m.y);

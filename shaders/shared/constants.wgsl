@@ -6,7 +6,13 @@ const EXTENT_SLACK_PX: f32 = 2e-3;
 const MAX_SIGMA_PX: f32 = 1e9;
 const DEPTH_BITS: u32 = 28;
 const MAX_VIEWS: u32 = 16;
+const VIEW_BITS: u32 = 4;
 const SKY_CUT: f32 = 0.003921568627;
+
+const SHADOW_DEPTH: f32 = 0.5;
+const SHADOW_FADE_M: f32 = 0.3;
+const SHADOW_GROUND_M: f32 = 0.05;
+const SHADOW_TOP_M: f32 = 0.3;
 
 const CLUSTER: u32 = 256;
 const SOA_BLOCK: u32 = 32;

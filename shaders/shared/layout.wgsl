@@ -59,6 +59,21 @@ struct ChunkView {
     slope_max: vec2f,
 }
 
+struct ChunkLight {
+    tint: vec3f,
+    first_shadow: u32,
+    shadows: u32,
+    pad0: u32,
+    pad1: u32,
+    pad2: u32,
+}
+
+struct ChunkShadow {
+    actor_from_chunk: array<vec4f, 3>,
+    half_m: vec2f,
+    pad: vec2f,
+}
+
 struct Lens {
     center_px: vec2f,
     model: u32,
@@ -81,6 +96,11 @@ struct Lens {
     pad2: u32,
     axis_angle: vec4f,
     expansion: vec4f,
+}
+
+struct Owner {
+    cluster_view: u32,
+    instance: u32,
 }
 
 struct ClusterView {

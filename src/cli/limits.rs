@@ -26,3 +26,7 @@ pub(super) const REPORT_WINDOW_PX: i64 = 256;
 
 /// Most Gaussians of a street of `wildcity bench gpu`: each takes 200 B while the street is made.
 pub(super) const BENCH_GAUSSIANS: i64 = 100_000_000;
+
+/// Gaussians for the triangles of an actor's mesh, unless the command says otherwise. See `docs/actors.md` for what a
+/// truck looks like with fewer and more.
+pub(super) const ACTOR_MESH_GAUSSIANS: u32 = 200_000;

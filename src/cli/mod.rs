@@ -2,7 +2,7 @@
 //!
 //! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
 //! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
-//! failure, 2 for a command line that cannot be parsed.
+//! failure, 2 for a command line that cannot be parsed; `episode run` has more, which its help lists.
 //!
 //! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
 //! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
@@ -11,12 +11,15 @@
 
 use std::process::ExitCode;
 
+mod actor;
 mod backend_options;
 mod bench;
 mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod episode;
+mod exit;
 mod import;
 mod input_files;
 mod inspect;
@@ -64,8 +67,10 @@ enum Command {
     Push(push::Push),
     Lod(lod::Lod),
     Twin(twin::Twin),
+    Actor(actor::Actor),
     Render(render::Render),
     Replay(replay::Replay),
+    Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
     Bench(bench::Bench),
@@ -87,8 +92,10 @@ pub fn main() -> ExitCode {
         Command::Push(command) => command.run(),
         Command::Lod(command) => command.run(),
         Command::Twin(command) => command.run(),
+        Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
         Command::Bench(command) => command.run(),
@@ -101,7 +108,7 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::FAILURE
+            error.downcast_ref::<exit::Exit>().map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }
     }
 }

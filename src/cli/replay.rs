@@ -23,7 +23,8 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again; the exit code is 1 if an image differs, or if the recording is incomplete.
+    /// Render every frame again; the exit code is 1 if an image, a time, a hash or the summary at the end differs, or
+    /// if the recording is incomplete.
     /// Without --out, stops at the first difference.
     #[arg(long)]
     verify: bool,
@@ -92,6 +93,11 @@ impl Replay {
                 writeln!(out, "differs     {difference}")?;
             }
         }
+        match &report.wrong_value {
+            None => {}
+            Some(wrong) if self.verify => anyhow::bail!("the record contradicts itself: {wrong}"),
+            Some(wrong) => writeln!(out, "wrong       {wrong}")?,
+        }
         // An empty or unfinished recording does not prove that the whole episode repeats.
         let missing = match (recording.frames.is_empty(), &recording.end) {
             (true, _) => "has no frames",
@@ -104,7 +110,7 @@ impl Replay {
 }
 
 fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> {
-    let RecordedEpisode { header, frames, versions, end } = recording;
+    let RecordedEpisode { header, frames, versions, end, .. } = recording;
     let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
     let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
     writeln!(out, "session     {}, seed {}", header.session, header.seed)?;

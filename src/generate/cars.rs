@@ -47,6 +47,31 @@ impl Car {
         Self { kind, tail_m, forward, left, paint: paint.gloss(0.14), spacing }
     }
 
+    /// A car of a kind and colour with its middle on the origin, which looks along x.
+    pub(super) fn model(kind: &'static Kind, paint: Paint) -> Self {
+        let tail_m = DVec3::new(-0.5 * kind.length_m, 0.0, 0.0);
+        Self {
+            kind,
+            tail_m,
+            forward: DVec3::X,
+            left: DVec3::Y,
+            paint: paint.gloss(0.14),
+            spacing: 1.0,
+        }
+    }
+
+    /// Length, width and height, in metres.
+    pub(super) fn size_m(&self) -> DVec3 {
+        let top_m = (0..=100).map(|i| self.kind.middle_line_m(f64::from(i) / 100.0));
+        DVec3::new(self.kind.length_m, self.kind.width_m, top_m.fold(0.0, f64::max))
+    }
+
+    /// Paints body, glass, lamps and wheels, without the shade below: of a car that will move.
+    pub(super) fn paint_model(&self, painter: &mut Painter) {
+        self.paint_body(painter);
+        self.inside(painter);
+    }
+
     /// The bodies that cast the car's shadow: body and cabin, a little smaller than painted.
     pub(super) fn occluders(&self) -> [Occluder; 2] {
         let Kind { length_m, width_m, .. } = *self.kind;
@@ -72,6 +97,12 @@ impl Car {
     }
 
     fn paint_all(&self, painter: &mut Painter) {
+        self.paint_body(painter);
+        self.shade_below(painter);
+        self.inside(painter);
+    }
+
+    fn paint_body(&self, painter: &mut Painter) {
         let xs = self.lengthwise(painter);
         for side in [-1.0, 1.0] {
             self.flank(painter, &xs, side);
@@ -83,8 +114,6 @@ impl Car {
         }
         self.end(painter, 1.0);
         self.end(painter, 0.0);
-        self.shade_below(painter);
-        self.inside(painter);
     }
 
     /// The dark interior, which is visible through gaps between the surfels.
@@ -166,9 +195,9 @@ impl Car {
     fn upper(&self, painter: &mut Painter, xs: &[f64], side: f64) {
         let length_m = self.kind.length_m;
         // v from 0 at the shoulder to 1 at the roof's edge, on to 2 on the middle line.
-        let mut vs = vec![0.0, 0.12];
+        let mut vs = painter.refined(&[0.0, 0.12]);
         vs.extend(painter.even(0.12, 0.86, 0.25).into_iter().skip(1));
-        vs.push(1.0);
+        vs.extend(painter.refined(&[0.86, 1.0]).into_iter().skip(1));
         vs.extend(painter.even(1.0, 2.0, 0.34).into_iter().skip(1));
         let section = |x_m: f64, v: f64| {
             let x = x_m / length_m;
@@ -252,16 +281,18 @@ impl Car {
                 self.place(x_m + radius_m * r * cos, side * y_m, TYRE_M + radius_m * r * sin)
             }
         };
+        let detail = painter.refined(&[0.0, 1.0]).len() - 1;
         let around = |count: usize| -> Vec<f64> {
+            let count = count * detail;
             let step_rad = std::f64::consts::TAU / count as f64;
             // Outwards for either side: with r as v, u × v points to -left when u turns left.
             (0..=count).map(|i| side * i as f64 * step_rad).collect()
         };
         let arch = disc(TYRE_M + 0.09, half_m - 0.16);
-        painter.sheet(&around(10), &[0.1, 0.55, 1.0], arch, |_, _| {
-            Some(Paint::matt(0.07, 0.07, 0.08).open(0.5))
-        });
-        let rings = [0.0, 0.22, 0.48, 0.68, 0.82, 1.0];
+        let radii = painter.refined(&[0.1, 0.55, 1.0]);
+        painter
+            .sheet(&around(10), &radii, arch, |_, _| Some(Paint::matt(0.07, 0.07, 0.08).open(0.5)));
+        let rings = painter.refined(&[0.0, 0.22, 0.48, 0.68, 0.82, 1.0]);
         let rim = Paint::matt(0.66, 0.67, 0.70).gloss(0.1);
         painter.sheet(&around(15), &rings, disc(TYRE_M, half_m - 0.035), |angle_rad, r| {
             let spoke = (angle_rad.abs() * 5.0 / std::f64::consts::TAU).fract() < 0.55;
@@ -279,9 +310,8 @@ impl Car {
             let y_m = side * (half_m - 0.035 - 0.20 * t);
             self.place(x_m + TYRE_M * cos, y_m, TYRE_M + TYRE_M * sin)
         };
-        painter.sheet(&around(14), &[0.0, 0.5, 1.0], tread, |_, _| {
-            Some(Paint::matt(0.12, 0.12, 0.13))
-        });
+        let across = painter.refined(&[0.0, 0.5, 1.0]);
+        painter.sheet(&around(14), &across, tread, |_, _| Some(Paint::matt(0.12, 0.12, 0.13)));
     }
 
     /// A door mirror: a small box with glass towards the tail.
@@ -289,8 +319,8 @@ impl Car {
         let x = self.kind.windscreen[1] - 0.055;
         let (x_m, z_m) = (x * self.kind.length_m, self.kind.belt_m(x) + 0.03);
         let inner_m = self.half_width_m(x) - 0.04;
-        let ys = [0.0, 0.06, 0.12, 0.18];
-        let zs = [0.0, 0.06, 0.12];
+        let ys = painter.refined(&[0.0, 0.06, 0.12, 0.18]);
+        let zs = painter.refined(&[0.0, 0.06, 0.12]);
         // Towards the tail u runs to the car's right, towards the nose to its left.
         for (forward_m, sign) in [(-0.05, -1.0), (0.05, 1.0)] {
             let us = facing(&ys, sign * side);
@@ -303,7 +333,8 @@ impl Car {
         }
         let outer =
             |u_m: f64, v_m: f64| self.place(x_m - side * u_m, side * (inner_m + 0.18), z_m + v_m);
-        painter.sheet(&[-0.05, 0.05], &zs, outer, |_, _| Some(self.paint.times(0.85)));
+        let us = painter.refined(&[-0.05, 0.05]);
+        painter.sheet(&us, &zs, outer, |_, _| Some(self.paint.times(0.85)));
     }
 
     /// The shaded ground between the wheels, 2 cm above the road.

@@ -19,6 +19,7 @@
 //!
 //! Behind them is a sky of its own ([`SKY`]).
 
+mod actors;
 mod backdrop;
 mod buildings;
 mod canyon;
@@ -29,6 +30,7 @@ mod facade;
 mod furniture;
 mod ground_floor;
 mod light;
+mod pedestrian;
 mod plants;
 mod random;
 mod road;
@@ -36,6 +38,7 @@ mod route;
 mod street;
 mod surface;
 
+pub use actors::{ACTOR_REVISION, ActorModel, actor_models};
 pub use canyon::canyon;
 pub use city::{Cell, City, city, city_drive};
 use serde::{Deserialize, Serialize};

@@ -46,6 +46,8 @@ pub(super) enum Occluder {
 /// against those whose shadow can reach it.
 #[derive(Clone, Debug)]
 pub(super) struct Light {
+    /// Whether the sun stands in the zenith: for objects that will turn.
+    overhead: bool,
     occluders: Vec<Occluder>,
     first_cell: [i64; 2],
     columns: usize,
@@ -59,7 +61,13 @@ impl Light {
         let low_m = reaches.iter().fold(DVec2::INFINITY, |low, reach| low.min(reach[0]));
         let high_m = reaches.iter().fold(DVec2::NEG_INFINITY, |high, reach| high.max(reach[1]));
         if occluders.is_empty() {
-            return Self { occluders, first_cell: [0, 0], columns: 0, cells: Vec::new() };
+            return Self {
+                overhead: false,
+                occluders,
+                first_cell: [0, 0],
+                columns: 0,
+                cells: Vec::new(),
+            };
         }
         let first_cell = cell_of(low_m);
         let last_cell = cell_of(high_m);
@@ -75,11 +83,21 @@ impl Light {
                 }
             }
         }
-        Self { occluders, first_cell, columns, cells }
+        Self { overhead: false, occluders, first_cell, columns, cells }
+    }
+
+    /// Light for objects that will turn: half of the sun from the zenith, and more of the sky, so that it fits every
+    /// heading.
+    pub(super) fn overhead() -> Self {
+        Self { overhead: true, ..Self::new(Vec::new()) }
     }
 
     /// Light that falls on a surface, to be multiplied by the albedo.
     pub(super) fn on(&self, point_m: DVec3, normal: DVec3) -> DVec3 {
+        if self.overhead {
+            let up = 0.5 + 0.5 * normal.z;
+            return 0.55 * normal.z.max(0.0) * SUN + 1.35 * (up * SKY + (1.0 - up) * GROUND);
+        }
         let facing = normal.dot(TO_SUN).max(0.0);
         let sun = if facing > 0.0 { facing * self.sun_at(point_m + 0.06 * normal) } else { 0.0 };
         let up = 0.5 + 0.5 * normal.z;

@@ -77,6 +77,8 @@ pub(super) struct Painter<'a> {
     light: &'a Light,
     /// Spacing of everything, as a factor: above 1 is coarser.
     spacing: f64,
+    /// Factor on the numbers of cells that do not follow the spacing, such as those around a wheel.
+    detail: usize,
 }
 
 impl<'a> Painter<'a> {
@@ -86,7 +88,23 @@ impl<'a> Painter<'a> {
             gaussians: Gaussians { sh_degree: 1, ..Gaussians::default() },
             light,
             spacing: 1.0 / density.sqrt(),
+            detail: 1,
         }
+    }
+
+    /// The same for an object that is seen from near by: with `detail` times as many cells along every edge.
+    pub(super) fn detailed(light: &'a Light, detail: usize) -> Self {
+        Self { spacing: 1.0 / detail as f64, detail, ..Self::new(light, 1.0) }
+    }
+
+    /// Break points with as many cells between two of them as the detail asks for.
+    pub(super) fn refined(&self, points: &[f64]) -> Vec<f64> {
+        let between = |pair: &[f64]| {
+            let [from, to] = [pair[0], pair[1]];
+            (0..self.detail).map(move |k| from + (to - from) * k as f64 / self.detail as f64)
+        };
+        let last = points.last().copied();
+        points.windows(2).flat_map(between).chain(last).collect()
     }
 
     /// Paints what `draw` paints with all spacings `factor` times as wide: for distant objects.

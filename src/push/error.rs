@@ -114,6 +114,8 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::Name { .. }
         | StoreError::NoTwin { .. }
         | StoreError::NoVersion { .. }
+        | StoreError::NoActor { .. }
+        | StoreError::NothingToCut { .. }
         | StoreError::GarbageCollected { .. }
         | StoreError::Leased { .. }
         | StoreError::Damaged { .. }

@@ -35,5 +35,7 @@ pub use publish::{Viewpoints, publish};
 pub use queue::{Begun, PushQueue};
 pub use report::{CellChange, FileReport, PushReport, Ranges};
 pub use request::{CellSelection, PushRequest, RequestedFile, profile_with};
-pub use source::{SourceAxes, SourceFile, SourceScene, provenance, read_scene};
+pub use source::{
+    SourceAxes, SourceFile, SourceScene, provenance, read_actor, read_scene, read_tracked,
+};
 pub use status::{Progress, Push, PushedVersion, State, Status};

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
-use wildcity_twin::ingest::{self, Axes, IngestError, Progress};
+use wildcity_twin::ingest::{self, Axes, IngestError, Progress, TrackedObject};
 
 /// The axes and unit of a scene file, and how the user wrote them.
 #[derive(Clone, Debug)]
@@ -65,6 +65,35 @@ pub fn read_scene(
     let (mut gaussians, hash) = ingest::read_hashed(path, progress)?;
     axes.axes.apply(&mut gaussians);
     Ok(SourceScene { gaussians, hash })
+}
+
+/// As [`read_scene`], with another number of Gaussians for the triangles of a mesh.
+///
+/// # Errors
+/// As [`ingest::read`].
+pub fn read_actor(
+    path: &Path,
+    axes: &SourceAxes,
+    mesh_gaussians: u32,
+    progress: Progress<'_>,
+) -> Result<SourceScene, IngestError> {
+    let (mut gaussians, hash) = ingest::read_with(path, mesh_gaussians, progress)?;
+    axes.axes.apply(&mut gaussians);
+    Ok(SourceScene { gaussians, hash })
+}
+
+/// The tracked objects of a recorded drive, each in its own axes, and the file's BLAKE3 in hex.
+///
+/// # Errors
+/// As [`ingest::read_tracked`].
+pub fn read_tracked(
+    path: &Path,
+    axes: &SourceAxes,
+    progress: Progress<'_>,
+) -> Result<(Vec<TrackedObject>, String), IngestError> {
+    let (mut objects, hash) = ingest::read_tracked(path, progress)?;
+    objects.iter_mut().for_each(|object| axes.axes.apply(&mut object.gaussians));
+    Ok((objects, hash))
 }
 
 /// The provenance of a version that is made from files with these hashes. It contains no time and no user,

@@ -3,12 +3,16 @@
 //! A position is subtracted from the camera's in f64, once per chunk and frame, and only the difference is
 //! rounded to f32: a twin 4,500 km from its origin loses nothing.
 
-use glam::{DVec2, DVec3, Vec3};
+use std::sync::Arc;
+
+use glam::{DMat3, DVec2, DVec3, Vec3, Vec4};
+use rayon::prelude::*;
 
 use super::View;
 use super::constants::{DEPTH_BITS, SLOPE_SLACK};
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::Camera;
-use wildcity_scene::{Chunk, RenderProfile};
+use wildcity_scene::{Chunk, RenderProfile, Scene};
 
 /// A splat: a Gaussian on the image of one view (48 bytes).
 ///
@@ -224,6 +228,62 @@ impl ChunkView {
     }
 }
 
+/// An actor's contact shadow relative to a chunk of the twin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ChunkShadow {
+    /// Rows of the rigid transform from the chunk to the actor's axes, translation last, in metres.
+    pub actor_from_chunk: [[f32; 4]; 3],
+    /// Half the length and half the width of the actor's box, in metres.
+    pub half_m: [f32; 2],
+    /// Half the size of the box outside of which there is no shadow, in metres.
+    reach_m: Vec3,
+}
+
+impl ChunkShadow {
+    /// The shadow of an actor; `None` if it has none.
+    fn new(placed: &PlacedChunk, chunk: &Chunk) -> Option<Self> {
+        let shadow = placed.shadow?;
+        let actor_from_world = placed.world_from_actor.rotation.inverse();
+        let origin_m = actor_from_world * (chunk.origin_m() - placed.world_from_actor.position_m);
+        let rows = DMat3::from_quat(actor_from_world).transpose();
+        let row = |axis: usize| rows.col(axis).extend(origin_m[axis]).as_vec4().to_array();
+        Some(Self {
+            actor_from_chunk: [row(0), row(1), row(2)],
+            half_m: [0.5 * shadow.length_m, 0.5 * shadow.width_m],
+            reach_m: shadow.reach_m(),
+        })
+    }
+
+    /// Whether the shadow can fall on a Gaussian with its centre in a box, relative to the chunk's origin, in
+    /// metres; `true` when in doubt.
+    pub fn may_touch(&self, min_m: Vec3, max_m: Vec3) -> bool {
+        let center_m = (0.5 * (min_m + max_m)).extend(1.0);
+        let half_m = 0.5 * (max_m - min_m);
+        (0..3).all(|axis| {
+            let row = Vec4::from_array(self.actor_from_chunk[axis]);
+            // Beyond any rounding error: 1e-5 m at 100 m.
+            let spread_m = row.truncate().abs().dot(half_m) + 1e-3;
+            row.dot(center_m).abs() <= self.reach_m[axis] + spread_m
+        })
+    }
+
+    /// The shadows that may fall on each chunk of the twin; empty if no actor has one.
+    pub fn by_chunk(scene: &Scene) -> Vec<Vec<Self>> {
+        if scene.placed.iter().all(|placed| placed.shadow.is_none()) {
+            return Vec::new();
+        }
+        let of_chunk = |chunk: &Arc<Chunk>| {
+            let clusters = chunk.clusters().iter();
+            let none = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+            let (min_m, max_m) =
+                clusters.fold(none, |(min_m, max_m), c| (min_m.min(c.min_m), max_m.max(c.max_m)));
+            let shadows = scene.placed.iter().filter_map(|placed| Self::new(placed, chunk));
+            shadows.filter(|shadow| shadow.may_touch(min_m, max_m)).collect()
+        };
+        scene.chunks.par_iter().map(of_chunk).collect()
+    }
+}
+
 /// Half-spaces in which every Gaussian misses the image, to cull whole clusters of 256 at once.
 ///
 /// The bound is that of the linearised projection and not of the true ellipsoid: a linearised splat can be
@@ -292,5 +352,47 @@ impl Frustum {
             let distance = nearest + plane.offset_m + plane.spread * sigma_m;
             distance >= -1e-5 * (plane.normal.length() * center.length() + plane.offset_m.abs())
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+    use wildcity_scene::actor::ContactShadow;
+    use wildcity_scene::geometry::Pose;
+
+    /// Boxes around an actor that is turned: the test may only reject those without a shadowed corner.
+    #[test]
+    fn no_box_with_a_shadowed_corner_is_skipped() {
+        let world_from_actor = Pose {
+            position_m: DVec3::new(4.0e6, -3.0, 0.1),
+            rotation: DQuat::from_rotation_z(0.7) * DQuat::from_rotation_y(0.1),
+        };
+        let chunk = Arc::new(Chunk::new([0, 0], DVec3::new(4.0e6 - 20.0, 0.0, 0.0), 0, 0));
+        let shadow = ContactShadow { length_m: 4.0, width_m: 2.0 };
+        let placed = PlacedChunk {
+            shadow: Some(shadow),
+            ..PlacedChunk::at_rest(chunk.clone(), world_from_actor, 0)
+        };
+        let relative = ChunkShadow::new(&placed, &chunk).unwrap();
+        let mut touched = 0;
+        for i in 0..4_000_u32 {
+            let share = |k: u32| f64::from(i * k % 4_001) / 4_001.0 - 0.5;
+            let at_m = DVec3::new(10.0 * share(37), 10.0 * share(101), 1.5 * share(467));
+            let mean_m = (world_from_actor.position_m - chunk.origin_m() + at_m).as_vec3();
+            let half_m = Vec3::new(0.4, 0.3, 0.05) * (1.0 + share(911) as f32);
+            let may = relative.may_touch(mean_m - half_m, mean_m + half_m);
+            let is_shadowed = |corner: u32| {
+                let sign = |bit: u32| if corner >> bit & 1 == 0 { -1.0 } else { 1.0 };
+                let corner_m = mean_m + half_m * Vec3::new(sign(0), sign(1), sign(2));
+                let from_actor_m =
+                    chunk.origin_m() + corner_m.as_dvec3() - world_from_actor.position_m;
+                shadow.factor(world_from_actor.rotation.inverse() * from_actor_m) < 1.0
+            };
+            assert!(may || !(0..8).any(is_shadowed), "{i}");
+            touched += u32::from(may);
+        }
+        assert!((400..2_000).contains(&touched), "{touched}");
     }
 }

@@ -13,6 +13,7 @@
 //! An image is a function of (scene, render profile, views). It depends on no clock, no cache and no number
 //! of threads.
 
+mod actor_views;
 pub mod automatic;
 pub mod compare;
 pub mod constants;
@@ -32,13 +33,14 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::sky::{CubeMap, DrawableSky, SkyError};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
-pub use view::{RollingShutter, View};
+pub use view::{Readout, RollingShutter, View};
 
 /// What is rendered together: all views of one step.
 #[derive(Clone, Copy, Debug)]
@@ -50,6 +52,12 @@ pub struct Frame<'a> {
     /// The cameras: 1 to [`MAX_VIEWS`].
     pub views: &'a [View],
 }
+
+/// The twin in [`Target::instances`].
+pub const TWIN_INSTANCE: u16 = 1;
+
+/// Actor 0 in [`Target::instances`].
+pub const FIRST_ACTOR_INSTANCE: u16 = 2;
 
 /// Most views of one frame: the cameras of the largest rig.
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
@@ -71,6 +79,9 @@ pub struct Target<'a> {
     /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are
     /// in the camera's axes and point towards the camera; 0 where there is no depth.
     pub normals: Option<&'a mut [f32]>,
+    /// `[height, width]`: whose Gaussian brings the transmittance to a half or less: 0 none, [`TWIN_INSTANCE`] the
+    /// twin, and actor `k` is `k` + [`FIRST_ACTOR_INSTANCE`].
+    pub instances: Option<&'a mut [u16]>,
     /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
 }
@@ -89,6 +100,9 @@ impl Target<'_> {
         let Some(field) = FieldMask::of(camera) else { return };
         if let Some(rgb8) = &mut self.rgb8 {
             field.clear_outside(camera, 3, rgb8);
+        }
+        if let Some(instances) = &mut self.instances {
+            field.clear_outside(camera, 1, instances);
         }
         for (values, image) in [(4, &mut self.rgba), (1, &mut self.depth_m), (1, &mut self.opacity)]
         {
@@ -194,6 +208,14 @@ pub enum RenderError {
     /// The sky cannot be drawn as the profile asks.
     #[error(transparent)]
     Sky(#[from] SkyError),
+    /// More actors than [`PlacedChunk::MAX_ACTORS`](wildcity_scene::actor::PlacedChunk::MAX_ACTORS).
+    #[error("{placed} chunks of actors are placed; at most {limit} are drawn: remove actors")]
+    Actors {
+        /// The given number.
+        placed: usize,
+        /// The largest number that is drawn.
+        limit: usize,
+    },
     /// The device failed. The next frame opens it again.
     #[error("{device} failed: {reason}")]
     Device {
@@ -273,6 +295,7 @@ impl Frame<'_> {
                 ("depth_m", target.depth_m.as_ref().map(|b| b.len()), pixels),
                 ("opacity", target.opacity.as_ref().map(|b| b.len()), pixels),
                 ("normals", target.normals.as_ref().map(|b| b.len()), 3 * pixels),
+                ("instances", target.instances.as_ref().map(|b| b.len()), pixels),
             ];
             if target.normals.is_some() && target.depth_m.is_none() {
                 return Err(RenderError::Normals { view });
@@ -303,11 +326,16 @@ impl Frame<'_> {
         }
     }
 
-    /// Checks the number of views.
+    /// Checks the number of views, and that of placed chunks.
     ///
     /// # Errors
-    /// [`RenderError::Views`].
+    /// [`RenderError::Views`], [`RenderError::Actors`].
     pub fn check_views(&self) -> Result<(), RenderError> {
+        let placed = self.scene.placed.len();
+        let limit = PlacedChunk::MAX_ACTORS;
+        if placed > limit {
+            return Err(RenderError::Actors { placed, limit });
+        }
         let count = self.views.len();
         match (1..=MAX_VIEWS).contains(&count) {
             true => Ok(()),

@@ -45,6 +45,17 @@ pub struct StageOutputs {
     pub order: Option<Vec<u32>>,
     /// Of bin.
     pub tiles: Option<TileLists>,
+    /// Of project: whose splats they are, for instance ids; in order of `first_splat`. The gpu backend gives none.
+    pub owners: Vec<SplatOwner>,
+}
+
+/// Whose splats begin at a place of [`StageOutputs::splats`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SplatOwner {
+    /// Index of the first splat.
+    pub first_splat: u32,
+    /// As in [`Target::instances`](crate::Target::instances).
+    pub instance: u16,
 }
 
 /// The lists of splats of all tiles.

@@ -99,16 +99,7 @@ impl<'a> UnscentedView<'a> {
         if view.is_static_pinhole() {
             return None;
         }
-        let [translation_m, rotation_rad] = match &view.rolling_shutter {
-            None => [0.0; 2],
-            Some(RollingShutter { world_from_camera_first: first, .. }) => {
-                let last = &view.world_from_camera;
-                [
-                    first.position_m.distance(last.position_m),
-                    first.rotation.angle_between(last.rotation),
-                ]
-            }
-        };
+        let [translation_m, rotation_rad] = motion(view);
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
         let FieldCone { image_rad, least_px_per_rad, most_px_per_rad } =
@@ -131,6 +122,19 @@ impl<'a> UnscentedView<'a> {
             cull_bound,
             expansion_bound: ExpansionBound::of(view, profile),
         })
+    }
+
+    /// The same camera elsewhere, or in other motion: only what depends on its poses is computed again.
+    pub fn moved<'b>(&self, view: &'b View) -> UnscentedView<'b> {
+        let [translation_m, rotation_rad] = motion(view);
+        UnscentedView {
+            view,
+            camera_from_world: view.world_from_camera.inverse(),
+            range_m: self.range_m,
+            cull_bound: CullBound { translation_m, rotation_rad, ..self.cull_bound },
+            // The lens is the same.
+            expansion_bound: self.expansion_bound.filter(|_| rotation_rad <= 0.5),
+        }
     }
 
     /// Whether a Gaussian with its centre in a box and standard deviations up to `sigma_m` can touch the
@@ -234,6 +238,15 @@ impl<'a> UnscentedView<'a> {
         let out = distance_px > reach_px;
         !out
     }
+}
+
+/// How far a view's camera moves during the exposure, in metres, and by how many radians it rotates.
+fn motion(view: &View) -> [f64; 2] {
+    let Some(RollingShutter { world_from_camera_first: first, .. }) = &view.rolling_shutter else {
+        return [0.0; 2];
+    };
+    let last = &view.world_from_camera;
+    [first.position_m.distance(last.position_m), first.rotation.angle_between(last.rotation)]
 }
 
 /// How far off the axis a centre may lie and still be drawn, in radians.

@@ -14,8 +14,12 @@ use super::measure::sky_bytes;
 use wildcity_render::compare::images::view_along;
 use wildcity_render::cpu::Cpu;
 use wildcity_render::gpu::{Gpu, GpuUsage};
-use wildcity_render::{Backend, Frame, FrameStats, RenderError, RollingShutter, Target, View};
+use wildcity_render::{
+    Backend, Frame, FrameStats, Readout, RenderError, RollingShutter, Target, View,
+};
+use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{
     Bivariate, Fisheye, Lens, ShutterDirection, Windshield, WindshieldReference,
 };
@@ -100,7 +104,7 @@ const fn feature(name: &'static str, add: fn(&mut Step)) -> Feature {
     Feature { name, add }
 }
 
-const FEATURES: [Feature; 18] = [
+const FEATURES: [Feature; 21] = [
     feature("nothing else", |_| {}),
     feature("SH degree 1", |step| step.scene = Scene::from_gaussians(&street(1))),
     feature("SH degree 3", |step| step.scene = Scene::from_gaussians(&street(3))),
@@ -145,6 +149,13 @@ const FEATURES: [Feature; 18] = [
         step.depth = true;
         step.normals = true;
     }),
+    feature("two actors", |step| step.place_actors(DVec3::ZERO)),
+    // Moving while the rows of a camera at rest are exposed.
+    feature("two moving actors", |step| {
+        step.place_actors(DVec3::new(0.0, -0.9, 0.0));
+        step.view.readout = Some(Readout { direction: ShutterDirection::TopToBottom, share: 1.0 });
+    }),
+    feature("instance ids", |step| step.instances = true),
     // The host computes the trust from the opacity.
     feature("trust", |step| step.opacity = true),
 ];
@@ -218,6 +229,7 @@ struct Step {
     depth: bool,
     opacity: bool,
     normals: bool,
+    instances: bool,
 }
 
 impl Step {
@@ -232,6 +244,34 @@ impl Step {
             depth: false,
             opacity: false,
             normals: false,
+            instances: false,
+        }
+    }
+
+    /// Two actors of one asset, with shadows and a tint. `since_start_m` is their way during the exposure.
+    fn place_actors(&mut self, since_start_m: DVec3) {
+        let size = 0.02_f64.ln() as f32;
+        let mut ball = Gaussians::with_capacity(1, 500);
+        for i in 0..500 {
+            let at = |k: usize| (i * k % 499) as f64 / 499.0;
+            ball.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
+            ball.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            ball.ln_scales.push([size; 3]);
+            ball.logit_opacities.push(3.0);
+            ball.sh.extend([0.1; 12]);
+        }
+        let chunk = Arc::new(Scene::single_chunk(&ball));
+        for (actor, x) in [-8.0, -2.0].into_iter().enumerate() {
+            let pose = Pose { position_m: DVec3::new(x, 0.0, 0.0), ..Pose::IDENTITY };
+            let placed = PlacedChunk::at_rest(Arc::clone(&chunk), pose, actor as u16);
+            let mut start = pose;
+            start.position_m -= since_start_m;
+            self.scene.placed.push(PlacedChunk {
+                world_from_actor_at_start: start,
+                tint: [1.0, 0.5, 0.5],
+                shadow: Some(ContactShadow { length_m: 4.0, width_m: 1.8 }),
+                ..placed
+            });
         }
     }
 
@@ -243,6 +283,7 @@ impl Step {
         let FrameStats { evaluations, .. } = self.render(cpu)?;
         let device = device.map(|gpu| self.device_counts(&gpu)).transpose()?.flatten();
         let gaussians = self.scene.gaussians() as u64;
+        let ids = u64::from(self.instances);
         let floats = u64::from(self.depth) + u64::from(self.opacity) + 3 * u64::from(self.normals);
         let sky_bytes = sky_bytes(&self.scene, &self.profile)?;
         let hood_bytes = self.appearance.overlay.as_ref().map_or(0, |hood| hood.rgba8().len());
@@ -250,8 +291,8 @@ impl Step {
             gaussians,
             host_bytes_per_gaussian: self.scene.bytes() as f64 / gaussians as f64,
             other_host_bytes: sky_bytes + hood_bytes as u64,
-            // 8-bit colour, and f32 for the other outputs.
-            host_bytes_per_pixel: 3 + 4 * floats,
+            // 8-bit colour, u16 for instance ids, and f32 for the other outputs.
+            host_bytes_per_pixel: 3 + 2 * ids + 4 * floats,
             evaluations,
             device,
         })
@@ -281,11 +322,13 @@ impl Step {
         let mut depth_m = plane(self.depth, 1);
         let mut opacity = plane(self.opacity, 1);
         let mut normals = plane(self.normals, 3);
+        let mut instances = self.instances.then(|| vec![0; pixels]);
         let target = Target {
             rgb8: Some(&mut rgb8),
             depth_m: depth_m.as_deref_mut(),
             opacity: opacity.as_deref_mut(),
             normals: normals.as_deref_mut(),
+            instances: instances.as_deref_mut(),
             appearance: (!self.appearance.is_identity()).then_some(&self.appearance),
             ..Target::default()
         };

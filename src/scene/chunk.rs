@@ -10,6 +10,7 @@
 //! three columns of reads. 256 Gaussians in Morton order form a *cluster* with a bounding box, which is
 //! culled as a unit.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -17,6 +18,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
+use super::actor::PlacedChunk;
 use super::{Gaussians, Sky, sh};
 
 /// Edge of a cell, in metres.
@@ -301,6 +303,27 @@ impl Chunk {
         self.lane_group(index / LANES)[column].0[index % LANES]
     }
 
+    /// The Gaussians before activation, in the order of the chunk and in its origin's axes. Opacities of 1, which no
+    /// logit has, become 1 - 1e-13; empty lanes become invisible Gaussians.
+    pub fn to_gaussians(&self) -> Gaussians {
+        let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count);
+        for index in 0..self.count {
+            let value = |column| self.value(index, column);
+            let three = |column| [0, 1, 2].map(|axis| value(column + axis));
+            let mean_m = DVec3::from_array(three(column::MEAN).map(f64::from)) + self.origin_m;
+            gaussians.means_m.push(mean_m.to_array());
+            let quat = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
+            let is_empty = quat == [0.0; 4];
+            gaussians.quats_wxyz.push(if is_empty { [1.0, 0.0, 0.0, 0.0] } else { quat });
+            let ln = |scale_m: f32| f64::from(scale_m).max(1e-30).ln() as f32;
+            gaussians.ln_scales.push(three(column::SCALE).map(ln));
+            gaussians.logit_opacities.push(logit_from_log2(value(column::LOG2_OPACITY)));
+            let count = columns(self.sh_degree) - column::SH;
+            gaussians.sh.extend((0..count).map(|k| value(column::SH + k)));
+        }
+        gaussians
+    }
+
     /// Memory that a chunk of `count` Gaussians of an SH degree needs, in bytes.
     pub fn bytes_of(sh_degree: u8, count: u64) -> u64 {
         let lanes = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
@@ -330,6 +353,12 @@ fn is_drawable(columns: impl Iterator<Item = f32>) -> bool {
 fn log2_sigmoid(logit: f32) -> f32 {
     let x = f64::from(logit);
     ((x.min(0.0) - (-x.abs()).exp().ln_1p()) * std::f64::consts::LOG2_E) as f32
+}
+
+/// The inverse of [`log2_sigmoid`], within -100 to 30: `-ln(1/opacity - 1)`.
+fn logit_from_log2(log2_opacity: f32) -> f32 {
+    let inverse_less_one = (-f64::from(log2_opacity) * std::f64::consts::LN_2).exp_m1();
+    (-inverse_less_one.max(0.0).ln()).clamp(-100.0, 30.0) as f32
 }
 
 /// The Gaussians of a file, sorted by cell, then by 16 m block, then by Morton code.
@@ -441,7 +470,7 @@ fn spread(x: u64) -> u64 {
 }
 
 /// The chunks that a frame draws, and the sky behind them. The global id of a Gaussian is its index when
-/// counting through all chunks in order.
+/// counting through all chunks in order, and then through the actors' in order.
 ///
 /// ```
 /// use wildcity_scene::{Gaussians, Scene};
@@ -462,6 +491,9 @@ fn spread(x: u64) -> u64 {
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
+    /// Actors. Of Gaussians with equal depths, those of the twin are in front, then those of actors in the order of
+    /// this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
+    pub placed: Vec<PlacedChunk>,
     /// The sky; without one, the background colour of the render profile is drawn (black by default).
     pub sky: Option<Arc<Sky>>,
 }
@@ -478,22 +510,50 @@ impl Scene {
             }
             Arc::new(chunk)
         };
-        Self { chunks: partition.cells.par_iter().map(chunk).collect(), sky: None }
+        Self { chunks: partition.cells.par_iter().map(chunk).collect(), ..Self::default() }
     }
 
-    /// Number of Gaussians in all chunks.
+    /// All Gaussians in one chunk with its origin at that of their axes, in Morton order: for assets of actors. Means
+    /// in f32 are exact to 4 µm within 64 m.
+    pub fn single_chunk(gaussians: &Gaussians) -> Chunk {
+        let mut order: Vec<(u64, usize)> =
+            gaussians.means_m.iter().map(morton).zip(0..gaussians.len()).collect();
+        order.par_sort_unstable();
+        let mut chunk = Chunk::new([0, 0], DVec3::ZERO, gaussians.sh_degree, gaussians.len());
+        for (_, index) in order {
+            chunk.push(&RawGaussian {
+                mean_m: gaussians.means_m[index].map(|m| m as f32),
+                quat_wxyz: gaussians.quats_wxyz[index],
+                ln_scale: gaussians.ln_scales[index],
+                logit_opacity: gaussians.logit_opacities[index],
+                sh: gaussians.sh_of(index),
+            });
+        }
+        chunk
+    }
+
+    /// Number of Gaussians in all chunks, with those of each actor.
     pub fn gaussians(&self) -> usize {
-        self.chunks.iter().map(|chunk| chunk.len()).sum()
+        let placed = self.placed.iter().map(|placed| &placed.chunk);
+        self.chunks.iter().chain(placed).map(|chunk| chunk.len()).sum()
     }
 
-    /// Spherical-harmonic degree; 0 for an empty scene.
+    /// Spherical-harmonic degree of the twin; 0 if it is empty.
     pub fn sh_degree(&self) -> u8 {
         self.chunks.first().map_or(0, |chunk| chunk.sh_degree())
     }
 
-    /// Memory that the chunks have allocated, in bytes.
+    /// Every chunk once, in order: those of the twin, then those of actors. Actors may share chunks.
+    pub fn distinct_chunks(&self) -> impl Iterator<Item = &Arc<Chunk>> {
+        let mut shared = BTreeSet::new();
+        let placed = self.placed.iter().map(|placed| &placed.chunk);
+        let own = placed.filter(move |chunk| shared.insert(Arc::as_ptr(chunk)));
+        self.chunks.iter().chain(own)
+    }
+
+    /// Memory that the chunks have allocated, in bytes. What several actors share is counted once.
     pub fn bytes(&self) -> usize {
-        self.chunks.iter().map(|chunk| chunk.bytes()).sum()
+        self.distinct_chunks().map(|chunk| chunk.bytes()).sum()
     }
 }
 
@@ -577,6 +637,27 @@ mod tests {
             for chunk in [laid, pushed] {
                 assert_eq!(opacities(&chunk), [f32::NEG_INFINITY, -1.0], "{column} is {value}");
             }
+        }
+    }
+
+    #[test]
+    fn raw_values_are_restored() {
+        let raw = three();
+        let scene = Scene::from_gaussians(&raw);
+        let mut again = Gaussians::default();
+        scene.chunks.iter().for_each(|chunk| again.append(&chunk.to_gaussians()));
+        // In order of cells.
+        let order = [1, 0, 2];
+        for (index, from) in order.into_iter().enumerate() {
+            assert_eq!(again.means_m[index], raw.means_m[from]);
+            assert_eq!(again.quats_wxyz[index], [1.0, 0.0, 0.0, 0.0]);
+            assert_eq!(again.sh_of(index), raw.sh_of(from));
+            for axis in 0..3 {
+                let off = again.ln_scales[index][axis] - raw.ln_scales[from][axis];
+                assert!(off.abs() < 1e-6, "{off}");
+            }
+            let [was, is] = [raw.logit_opacities[from], again.logit_opacities[index]];
+            assert!((was.clamp(-100.0, 30.0) - is).abs() < 1e-4, "{was} became {is}");
         }
     }
 

@@ -2,6 +2,9 @@
 
 use std::ops::Range;
 
+use glam::{DQuat, DVec3};
+
+use super::geometry::Pose;
 use super::sh;
 
 /// Raw Gaussians, as columns of equal length `n`.
@@ -106,6 +109,22 @@ impl Gaussians {
             selected.push_from(self, index);
         }
         selected
+    }
+
+    /// Moves and rotates all Gaussians with their colours, from the axes of `b` to those of `a`.
+    pub fn transform(&mut self, a_from_b: &Pose) {
+        for mean_m in &mut self.means_m {
+            *mean_m = a_from_b.transform_point(DVec3::from_array(*mean_m)).to_array();
+        }
+        for quat in &mut self.quats_wxyz {
+            let [w, x, y, z] = quat.map(f64::from);
+            let q = a_from_b.rotation * DQuat::from_xyzw(x, y, z, w);
+            *quat = [q.w, q.x, q.y, q.z].map(|q| q as f32);
+        }
+        let colors = sh::ShRotation::new(a_from_b.rotation_matrix(), self.sh_degree);
+        for color in self.sh.chunks_exact_mut(3 * sh::coefficients(self.sh_degree)) {
+            colors.apply(color);
+        }
     }
 
     /// Number of Gaussians.

@@ -10,6 +10,7 @@
 //! `f32` record format loses nothing. Means are f64 until they are relative to their chunk; the renderer
 //! subtracts the camera in f64 once per chunk and frame.
 
+pub mod actor;
 pub mod appearance;
 pub mod chunk;
 pub mod gaussian;
@@ -17,6 +18,7 @@ pub mod geometry;
 pub mod lod;
 pub mod manifest;
 pub mod profile;
+pub mod random;
 pub mod record;
 pub mod rig;
 pub mod route;
@@ -25,6 +27,7 @@ pub mod sky;
 pub mod trajectory;
 pub mod validate;
 
+pub use actor::{ActorBox, ActorClass};
 pub use chunk::{Chunk, Scene};
 pub use gaussian::Gaussians;
 pub use manifest::Manifest;

@@ -202,8 +202,18 @@ impl Episode {
     /// The summary so far. An episode that its agent terminated counts as completed, even if `outcome` says
     /// that the connection failed afterwards.
     pub fn summary(&self, outcome: Outcome) -> EpisodeSummary {
-        let completed = self.terminated || outcome == Outcome::Completed;
-        let off_model = self.least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
+        self.summary_with(outcome, self.least_trust)
+    }
+
+    /// The summary of an episode whose images had another least trust: that of a record, for a replay.
+    pub(crate) fn summary_with(
+        &self,
+        outcome: Outcome,
+        least_trust: Option<f64>,
+    ) -> EpisodeSummary {
+        let completed =
+            self.terminated || matches!(outcome, Outcome::Completed | Outcome::OffModel);
+        let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model) {
             (true, true) => Outcome::OffModel,
             (true, false) => Outcome::Completed,
@@ -214,7 +224,7 @@ impl Episode {
             steps: self.step,
             time_us: self.time_us(),
             distance_m: self.distance_m,
-            least_trust: self.least_trust,
+            least_trust,
         }
     }
 

@@ -52,6 +52,7 @@ pub use record::format::{
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
+    WrongValue,
 };
 pub use session::Session;
 pub use viewpoint::viewpoints;

@@ -33,3 +33,81 @@ pub const GROUND_NEAR_M: f64 = 25.0;
 
 /// Smallest z component of a ground plane's unit normal: a slope of 45 degrees, steeper than any street.
 pub const GROUND_UP: f64 = std::f64::consts::FRAC_1_SQRT_2;
+
+/// Longest sub-step of traffic, in microseconds.
+pub const SUB_STEP_US: i64 = 10_000;
+
+/// Most actors of a scenario.
+pub const ACTORS: usize = 256;
+
+/// Most triggers of one actor.
+pub const TRIGGERS: usize = 64;
+
+/// Most points of a course that a scenario lists.
+pub const COURSE_POINTS: usize = 4096;
+
+/// Most keyframes of all tracks of a file: 256 actors for 20 minutes at 10 Hz are three million.
+pub const TRACK_KEYFRAMES: usize = 4 << 20;
+
+/// Fastest actor, in m/s: as fast as the ego.
+pub const ACTOR_SPEED_M_S: f64 = EGO_SPEED_M_S;
+
+/// Largest acceleration or braking of an actor, in m/s²: beyond the grip of tyres on a dry road.
+pub const ACTOR_ACCELERATION_M_S2: f64 = 20.0;
+
+/// An IDM actor looks for a lead within this many of its desired gaps to a standing lead. A lead at this distance
+/// changes its acceleration by at most 1/16 of the largest.
+pub const LEAD_GAPS: f64 = 4.0;
+
+/// Least and largest distance within which an IDM actor looks for a lead, in metres.
+pub const LEAD_M: [f64; 2] = [20.0, 400.0];
+
+/// Largest scenario file, in bytes: as large as a message on the wire.
+pub const SCENARIO_BYTES: usize = 1 << 20;
+
+/// Largest tracks or map file, in bytes.
+pub const MAP_BYTES: usize = 256 << 20;
+
+/// Most combinations of a sweep.
+pub const SWEEP_CASES: u64 = 100_000;
+
+/// Longest episode that a scenario may ask for, in seconds: a day.
+pub const END_S: f64 = 86_400.0;
+
+/// Longest id of a lane, in bytes.
+pub const LANE_ID_BYTES: usize = 256;
+
+/// Most points of one line or outline of a map: 50 km at 0.5 m.
+pub const LINE_POINTS: usize = 100_000;
+
+/// Points of the route in an observation: AlpaSim's number.
+pub const ROUTE_POINTS: u32 = 20;
+
+/// How far behind and ahead of its last place the ego is searched on its route, in metres.
+pub const ROUTE_SEARCH_M: [f64; 2] = [30.0, 100.0];
+
+/// Farther than this from that part, the ego is searched on the whole route, in metres.
+pub const ROUTE_LOST_M: f64 = 50.0;
+
+/// The share of a route from which on it may be done, and the distance from its end, in metres (HUGSIM).
+pub const ROUTE_DONE: f64 = 0.99;
+/// See [`ROUTE_DONE`].
+pub const ROUTE_END_M: f64 = 10.0;
+
+/// Slower than this is stuck, in m/s (Bench2Drive).
+pub const STUCK_M_S: f64 = 0.1;
+
+/// Commands of one route.
+pub const COMMANDS: usize = 1000;
+
+/// Longest text of a command, in bytes.
+pub const COMMAND_BYTES: usize = 1000;
+
+/// Most frames of 0.5 s by which a start is shifted.
+pub const START_FRAMES: u32 = 100;
+
+/// Most positions of a collision course.
+pub const POSITIONS: usize = 4096;
+
+/// Most actions of one trigger.
+pub const ACTIONS: usize = 16;

@@ -1,13 +1,19 @@
 //! Actors: Gaussians that move and rotate as one.
 
-use glam::{DMat3, DQuat, DVec3};
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
 
 use super::order::low_discrepancy;
 use super::{Case, CaseBody, CaseRun};
-use wildcity_render::RenderError;
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of};
-use wildcity_render::compare::images::max_difference;
-use wildcity_scene::{Gaussians, RenderProfile, Scene, sh};
+use wildcity_render::compare::images::{RenderedImage, max_difference};
+use wildcity_render::compare::psnr::psnr_db;
+use wildcity_render::{Readout, RenderError, RollingShutter, View};
+use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::ShutterDirection;
+use wildcity_scene::{Gaussians, Rays, RenderProfile, Scene, sh};
 
 pub(super) const T25: Case = Case {
     number: "T25",
@@ -28,7 +34,9 @@ fn t25(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         ("turned about all", DQuat::from_rotation_x(2.5) * DQuat::from_rotation_z(0.4)),
     ] {
         // The actor and the camera rotate alike about the origin, so the image must not change.
-        let turned = Scene::from_gaussians(&rotated(&actor, turn));
+        let mut turned = actor.clone();
+        turned.transform(&Pose { rotation: turn, ..Pose::IDENTITY });
+        let turned = Scene::from_gaussians(&turned);
         let mut moved = view;
         moved.world_from_camera.rotation = turn * view.world_from_camera.rotation;
         let image = run.render_and_compare(what, &turned, &profile, moved)?;
@@ -61,20 +69,112 @@ fn actor() -> Gaussians {
     actor
 }
 
-/// The same Gaussians rotated about the origin, with their colours.
-fn rotated(actor: &Gaussians, turn: DQuat) -> Gaussians {
-    let mut turned = actor.clone();
-    let colours = sh::ShRotation::new(DMat3::from_quat(turn), 3);
-    for mean in &mut turned.means_m {
-        *mean = (turn * DVec3::from_array(*mean)).to_array();
+pub(super) const T29: Case = Case {
+    number: "T29",
+    what: "actors around the camera, under a road, 1,000 m away, and overlapping one another",
+    bound: "agrees with f64; at least 60 dB against the same Gaussians within the scene",
+    body: CaseBody::Light(t29),
+};
+
+fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let profile = RenderProfile::default();
+    let road = road();
+    let turned = |yaw_rad: f64| DQuat::from_rotation_y(yaw_rad) * DQuat::from_rotation_x(0.3);
+    let pose = |x: f64, y: f64, z: f64, yaw_rad: f64| Pose {
+        position_m: DVec3::new(x, y, z),
+        rotation: turned(yaw_rad),
+    };
+    // The balls of an actor are 4 to 6 m from its origin.
+    let places: [(&str, f64, Vec<Pose>); 4] = [
+        ("around the camera", 120.0, vec![pose(0.2, 0.1, -5.0, 0.1)]),
+        ("under the road", 120.0, vec![pose(0.0, 5.0, 3.0, 0.6)]),
+        ("1,000 m away", 20_000.0, vec![pose(300.0, 0.0, 1_000.0, 2.0)]),
+        ("overlapping", 120.0, vec![pose(0.0, 0.0, 2.0, 0.2), pose(0.3, 0.0, 2.2, 0.5)]),
+    ];
+    let actor = actor();
+    for (what, focal_px, poses) in places {
+        let mut view = forward_view([160, 120], focal_px);
+        if focal_px > 1_000.0 {
+            let toward = poses[0].transform_point(DVec3::new(0.0, 0.0, 5.0)).normalize();
+            view.world_from_camera.rotation = DQuat::from_rotation_arc(DVec3::Z, toward);
+        }
+        let (placed, merged) = placed_and_merged(&road, &actor, &poses);
+        let image = run.render_and_compare(what, &placed, &profile, view)?;
+        let truth = run.render(&merged, &profile, view)?;
+        run.check_at_least_db(
+            format!("{what}: as within the scene, dB"),
+            psnr_of(&image, &truth),
+            60.0,
+        );
+        let alone = run.render(&Scene::from_gaussians(&road), &profile, view)?;
+        let seen = max_difference(&image.rgba, &alone.rgba) > 0.1;
+        run.check(format!("{what}: the actor is seen"), seen == (what != "under the road"));
     }
-    for quat in &mut turned.quats_wxyz {
-        let [w, x, y, z] = quat.map(f64::from);
-        let q = turn * DQuat::from_xyzw(x, y, z, w);
-        *quat = [q.w, q.x, q.y, q.z].map(|q| q as f32);
+    Ok(())
+}
+
+pub(super) const T30: Case = Case {
+    number: "T30",
+    what: "actors at 30 m/s across a rolling shutter of 30 ms: a camera at rest, and one that drives along",
+    bound: "agrees with f64; at least 38 dB against exact rays at each row's moment; at least 60 dB between an actor \
+            that keeps pace and both at rest",
+    body: CaseBody::Light(t30),
+};
+
+fn t30(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let profile = RenderProfile::default();
+    let exact = RenderProfile { rays: Rays::Exact, ..profile };
+    let across_m = DVec3::new(0.9, 0.0, 0.0);
+    let actor = actor();
+    let (at_rest, _) = placed_and_merged(&Gaussians::default(), &actor, &[Pose::IDENTITY]);
+    let mut moving = at_rest.clone();
+    moving.placed[0].world_from_actor_at_start.position_m = -across_m;
+    let direction = ShutterDirection::TopToBottom;
+    let still = forward_view([96, 64], 60.0);
+    let view = View { readout: Some(Readout { direction, share: 1.0 }), ..still };
+
+    // The camera at rest.
+    let image = run.render_and_compare("across", &moving, &profile, view)?;
+    let truth = run.render_reference(&moving, &exact, view)?;
+    run.check_at_least_db("across: exact rays, dB", psnr_of(&image, &truth), 38.0);
+
+    // The camera drives along: nothing moves.
+    let mut first = view.world_from_camera;
+    first.position_m -= across_m;
+    let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first: first });
+    let along = View { rolling_shutter, ..view };
+    let image = run.render_and_compare("along", &moving, &profile, along)?;
+    let truth = run.render(&at_rest, &profile, still)?;
+    run.check_at_least_db("along: as at rest, dB", psnr_of(&image, &truth), 60.0);
+    Ok(())
+}
+
+/// An actor at some poses in a scene, and the same Gaussians within it.
+fn placed_and_merged(scene: &Gaussians, actor: &Gaussians, poses: &[Pose]) -> (Scene, Scene) {
+    let chunk = Arc::new(Scene::single_chunk(actor));
+    let mut merged = scene.clone();
+    let mut placed = Scene::from_gaussians(scene);
+    for (index, pose) in poses.iter().enumerate() {
+        let mut moved = actor.clone();
+        moved.transform(pose);
+        merged.append(&moved);
+        placed.placed.push(PlacedChunk::at_rest(Arc::clone(&chunk), *pose, index as u16));
     }
-    for colour in turned.sh.chunks_exact_mut(3 * sh::coefficients(3)) {
-        colours.apply(colour);
-    }
-    turned
+    (placed, Scene::from_gaussians(&merged))
+}
+
+/// A closed road below the camera (y down), 3 m wide and 40 m long.
+fn road() -> Gaussians {
+    let surfel = |i: usize| GaussianSpec {
+        mean_m: DVec3::new(0.1 * (i % 80) as f64 - 4.0, 1.5, 1.0 + 0.1 * (i / 80) as f64),
+        sigma_m: DVec3::new(0.08, 0.004, 0.08),
+        opacity: 0.99,
+        rgb: [0.4, 0.4, 0.45],
+        ..GaussianSpec::default()
+    };
+    gaussians_of(&(0..80 * 300).map(surfel).collect::<Vec<_>>())
+}
+
+fn psnr_of(image: &RenderedImage, truth: &RenderedImage) -> f64 {
+    psnr_db(image.rgba.iter().zip(&truth.rgba).map(|(a, b)| f64::from(a - b)))
 }

@@ -212,14 +212,14 @@ fn t18(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-pub(super) const T29: Case = Case {
-    number: "T29",
+pub(super) const T31: Case = Case {
+    number: "T31",
     what: "images of a half to a quarter of the native size, of dust and of large Gaussians",
     bound: "agrees with f64; 2 dB nearer to the native image shrunk than with the blur of its own pixels",
-    body: CaseBody::Light(t29),
+    body: CaseBody::Light(t31),
 };
 
-fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     let profile = RenderProfile::default();
     let scene = scene_of(&(0..3_000).map(of_any_size).collect::<Vec<_>>());
     let native = forward_view([192, 144], 150.0);
@@ -248,7 +248,7 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     Ok(())
 }
 
-/// Gaussians with standard deviations of 0.05 to 6 native px in the view of T29, thin ones among them.
+/// Gaussians with standard deviations of 0.05 to 6 native px in the view of T31, thin ones among them.
 fn of_any_size(i: usize) -> GaussianSpec {
     let [x, y, z, size, flat, ..] = low_discrepancy(i);
     let away_m = 4.0 + 8.0 * z;

@@ -31,6 +31,13 @@ pub const SCENE_PARTS: usize = 100_000;
 /// share add at most as many again. A lorry with a surface of 60 m² gets one every 17 mm.
 pub const MESH_GAUSSIANS: u32 = 200_000;
 
+/// Largest asset of an actor, in bytes: 2 million Gaussians of SH degree 3 in f32 are 472 MB, and the levels of
+/// detail as much again.
+pub const ACTOR_BYTES: u64 = 1 << 30;
+
+/// Largest header of an asset, in bytes. One has about 2 kB.
+pub const ACTOR_HEADER_BYTES: usize = 64 << 10;
+
 /// The most parts that the long triangles of a mesh are halved into. At 232 bytes each they take
 /// 100 MB.
 pub const MESH_PARTS: usize = 400_000;

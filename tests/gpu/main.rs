@@ -8,6 +8,8 @@ mod gpu;
 mod images;
 #[path = "../support/lenses.rs"]
 mod lenses;
+#[path = "../support/actors.rs"]
+mod placed;
 #[path = "../support/root.rs"]
 mod root;
 #[path = "../support/scene_files.rs"]
@@ -19,6 +21,7 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod actors;
 mod cameras;
 mod definition;
 mod determinism;

@@ -40,7 +40,7 @@ fn demo(focal_px: f32) -> Scene {
     let chunks = cells.iter().flat_map(|cell| {
         cell.blocks.iter().map(|(_, run)| block(cell, &order[run.clone()])).collect::<Vec<_>>()
     });
-    Scene { chunks: chunks.collect(), sky: None }
+    Scene { chunks: chunks.collect(), ..Scene::default() }
 }
 
 fn bytes_per_gaussian(scene: &Scene) -> f64 {
@@ -94,7 +94,7 @@ fn the_least_recently_drawn_chunks_are_evicted() {
     let (cells, profile) = (route(), RenderProfile::default());
     let window = |at: usize| {
         let chunks = cells[at..at + 3].iter().flat_map(|cell| cell.chunks.iter().cloned());
-        Scene { chunks: chunks.collect(), sky: None }
+        Scene { chunks: chunks.collect(), ..Scene::default() }
     };
     let view = |at: usize| {
         let eye_m = DVec3::new(64.0 * (at + 1) as f64, 0.0, 0.0);
@@ -128,7 +128,7 @@ fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
     // Each cell fits alone, but not all of them together.
     let cells = route();
     let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
-    let (small, large) = (&cells[0], &Scene { chunks: all.collect(), sky: None });
+    let (small, large) = (&cells[0], &Scene { chunks: all.collect(), ..Scene::default() });
     let limited =
         gpu_with_limits(MemoryLimits { mirror_bytes: 1_000_000, ..MemoryLimits::default() });
     let expected = render(&gpu(), small, &profile, &turning_views());

@@ -113,16 +113,21 @@ impl Truth {
     /// a Gaussian and the other project six points of it.
     fn far_from_cpu(&self, found: &StageOutputs) -> usize {
         let splats = definition::splats(found);
-        let mut next = splats.iter().peekable();
+        let mut rest = splats.as_slice();
         let mut far = 0;
         for truth in definition::splats(&self.cpu[0]) {
             let view = &self.views[truth.view];
-            match next.next_if(|splat| is_same(splat, &truth, view)) {
-                Some(splat) => far += usize::from(close(splat, &truth, view).is_err()),
-                None => far += usize::from(truth.inside_px(&view.camera).abs() > 0.01),
+            // At the edge of an image one of both may lack a splat.
+            let ahead = &rest[..rest.len().min(4)];
+            match ahead.iter().position(|splat| is_same(splat, &truth, view)) {
+                Some(index) => {
+                    far += index + usize::from(close(&rest[index], &truth, view).is_err());
+                    rest = &rest[index + 1..];
+                }
+                None => far += 1,
             }
         }
-        far + next.count()
+        far + rest.len()
     }
 
     /// Compares two lists in order. Expected splats within 0.01 px of an image's edge may be missing.
@@ -316,7 +321,7 @@ fn each_stage_does_what_its_twins_do() {
 #[test]
 fn a_mutation_of_a_lens_fails_its_projection() {
     assert_eq!(LENSES.wrong(&gpu()), []);
-    let most = EXPANDED.cpu[0].splats.len() / 1_000;
+    let most = EXPANDED.cpu[0].splats.len() / 500;
     let far = |gpu: &Gpu| {
         let found = gpu.run_through(&EXPANDED.frame(), None, Stage::Project).unwrap();
         EXPANDED.far_from_cpu(&found)

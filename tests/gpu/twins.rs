@@ -7,6 +7,7 @@ use naga::{Expression, Literal, Module, TypeInner};
 use wildcity_render::gpu::layout;
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::{MAX_VIEWS, constants};
+use wildcity_scene::actor::ContactShadow;
 use wildcity_scene::chunk;
 use wildcity_scene::sky::SKY_CUT;
 
@@ -27,7 +28,12 @@ fn constants_are_the_same() {
         ("MAX_SIGMA_PX", Literal::F32(constants::MAX_SIGMA_PX)),
         ("DEPTH_BITS", Literal::U32(constants::DEPTH_BITS)),
         ("MAX_VIEWS", Literal::U32(MAX_VIEWS as u32)),
+        ("VIEW_BITS", Literal::U32(layout::VIEW_BITS)),
         ("SKY_CUT", Literal::F32(SKY_CUT as f32)),
+        ("SHADOW_DEPTH", Literal::F32(ContactShadow::DEPTH)),
+        ("SHADOW_FADE_M", Literal::F32(ContactShadow::FADE_M)),
+        ("SHADOW_GROUND_M", Literal::F32(ContactShadow::GROUND_M)),
+        ("SHADOW_TOP_M", Literal::F32(ContactShadow::TOP_M)),
         ("CLUSTER", Literal::U32(chunk::CLUSTER as u32)),
         ("SOA_BLOCK", Literal::U32(layout::SOA_BLOCK)),
         ("GEOMETRY_WORDS", Literal::U32(layout::GEOMETRY_WORDS)),
@@ -93,7 +99,10 @@ fn layouts_are_the_same() {
             non_pinhole, pad0, coefficients, windshield_shift, remaining_exposure, moved_m, pad1,
             moved_world_m, pad2, axis_angle, expansion,
         }
+        ChunkLight { tint, first_shadow, shadows, pad0, pad1, pad2 }
+        ChunkShadow { actor_from_chunk, half_m, pad }
         ClusterView { line, chunk_view }
+        Owner { cluster_view, instance }
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }

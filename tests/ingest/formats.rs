@@ -1,6 +1,8 @@
 //! Scenes written by small writers of every format are read back, within the precision of the
 //! format.
 
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
 use wildcity_scene::Gaussians;
 use wildcity_twin::ingest;
 
@@ -236,6 +238,79 @@ fn nurec_comes_back_without_tracked_objects() {
             assert_alike(&read(&file).unwrap(), &g, within, "NuRec");
         }
     }
+}
+
+#[test]
+fn tracked_objects_of_nurec_are_split_by_track() {
+    let g = gaussians(50, 1, 20.0, 8);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.usdz");
+    std::fs::write(&path, usdz(nurec_plain(&g, true))).unwrap();
+    let (objects, hash) = ingest::read_tracked(&path, &mut |_, _| {}).unwrap();
+    assert_eq!(hash.len(), 64);
+    let names: Vec<&str> = objects.iter().map(|object| object.track.as_str()).collect();
+    assert_eq!(names, ["car 7", "car 9"]);
+    let within = Within { mean_m: 0.01, quat: 5e-4, opacity: 6e-4, dc: 5e-4, sh: 5e-4, ..EXACT };
+    for (first, object) in objects.iter().enumerate() {
+        let own = g.select((first..50).step_by(2));
+        assert_alike(&object.gaussians, &own, within, "NuRec");
+    }
+    std::fs::write(&path, usdz(nurec_plain(&g, false))).unwrap();
+    let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("there are none"), "{error}");
+}
+
+#[test]
+fn rigid_nodes_are_split_by_point_ids() {
+    let g = gaussians(30, 2, 20.0, 9);
+    let ids: Vec<u8> = (0..30_i64).flat_map(|i| (i % 3 * 10).to_le_bytes()).collect();
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("rigid.safetensors");
+    let write = |ids: Option<&[u8]>| {
+        let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let means: Vec<u8> =
+            g.means_m.as_flattened().iter().flat_map(|m| (*m as f32).to_le_bytes()).collect();
+        let sh = |from: usize, to: usize| -> Vec<u8> {
+            (0..30).flat_map(|i| floats_of(&g.sh_of(i)[from..to])).collect()
+        };
+        let tensors: Vec<(&str, Vec<usize>, Vec<u8>)> = vec![
+            ("means", vec![30, 3], means),
+            ("quats", vec![30, 4], floats(g.quats_wxyz.as_flattened())),
+            ("scales", vec![30, 3], floats(g.ln_scales.as_flattened())),
+            ("opacities", vec![30], floats(&g.logit_opacities)),
+            ("sh0", vec![30, 1, 3], sh(0, 3)),
+            ("shN", vec![30, 8, 3], sh(3, 27)),
+        ];
+        let mut views: Vec<(&str, TensorView<'_>)> = tensors
+            .iter()
+            .map(|(name, shape, data)| {
+                (*name, TensorView::new(Dtype::F32, shape.clone(), data).unwrap())
+            })
+            .collect();
+        if let Some(ids) = ids {
+            let shape = vec![ids.len() / 8, 1];
+            views.push(("point_ids", TensorView::new(Dtype::I64, shape, ids).unwrap()));
+        }
+        std::fs::write(&path, safetensors::serialize(views, None).unwrap()).unwrap();
+    };
+    write(Some(&ids));
+    let (objects, _) = ingest::read_tracked(&path, &mut |_, _| {}).unwrap();
+    let names: Vec<&str> = objects.iter().map(|object| object.track.as_str()).collect();
+    assert_eq!(names, ["0", "10", "20"]);
+    assert_eq!(objects[1].gaussians.logit_opacities, g.select((1..30).step_by(3)).logit_opacities);
+    assert_eq!(objects[2].gaussians.sh, g.select((2..30).step_by(3)).sh);
+    // As a scene, the file is read without the numbers.
+    assert_eq!(ingest::read(&path, &mut |_, _| {}).unwrap().len(), 30);
+    write(None);
+    let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("point_ids"), "{error}");
+    write(Some(&ids[..80]));
+    let error = ingest::read_tracked(&path, &mut |_, _| {}).unwrap_err().to_string();
+    assert!(error.contains("10 numbers for 30"), "{error}");
+}
+
+fn floats_of(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
 
 #[test]

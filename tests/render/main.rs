@@ -6,6 +6,8 @@ mod data;
 mod images;
 #[path = "../support/lenses.rs"]
 mod lenses;
+#[path = "../support/actors.rs"]
+mod placed;
 #[path = "../support/root.rs"]
 mod root;
 #[path = "../support/scene_files.rs"]
@@ -17,6 +19,7 @@ mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
 
+mod actors;
 mod appearance;
 mod cameras;
 mod determinism;

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use serde_json::{Value, json};
 use wildcity_render::Backend;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_session::{FrameRequest, RecordedEpisode, ReplayError, ReplayReport, ReplayUntil};
@@ -35,7 +36,13 @@ async fn what_was_recorded_is_rendered_again() {
     let report = replay(&server, &path, &Painter::default()).unwrap();
     assert_eq!(
         report,
-        ReplayReport { images: 24, changes: vec![], diverged: None, difference: None }
+        ReplayReport {
+            images: 24,
+            changes: vec![],
+            diverged: None,
+            difference: None,
+            wrong_value: None,
+        }
     );
 }
 
@@ -53,6 +60,33 @@ async fn the_first_differing_image_is_named() {
     tamper(&path, 11, 2);
     let found = replay(&server, &path, &Painter::default()).unwrap().difference.unwrap();
     assert_eq!((found.request, found.pose, &*found.camera), (FrameRequest::Observe, 1, "front"));
+}
+
+#[tokio::test]
+async fn every_altered_value_is_named() {
+    let (server, path) = recorded().await;
+    let whole = std::fs::read_to_string(&path).unwrap();
+    let lines = whole.lines().count();
+    let hash = "0".repeat(64);
+    for (line, field, value) in [
+        (3, "time_us", json!(200_001)),
+        (3, "step", json!(7)),
+        (4, "frame_hash", json!(hash)),
+        (12, "frame_hash", json!(hash)),
+        (lines, "steps", json!(11)),
+        (lines, "time_us", json!(1_000_001)),
+        (lines, "distance_m", json!(6.0)),
+        (lines, "outcome", json!("off_model")),
+    ] {
+        let mut changed: Vec<Value> =
+            whole.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        assert!(!changed[line - 1][field].is_null(), "line {line} has no {field}");
+        changed[line - 1][field] = value;
+        let text: Vec<String> = changed.iter().map(Value::to_string).collect();
+        std::fs::write(&path, text.join("\n") + "\n").unwrap();
+        let wrong = replay(&server, &path, &Painter::default()).unwrap().wrong_value.unwrap();
+        assert_eq!((wrong.line, wrong.field), (line, field), "{wrong}");
+    }
 }
 
 #[tokio::test]

@@ -117,6 +117,14 @@ enum Mutation {
     DuplicateInstance,
     /// An image below its native size is drawn with the blur of its own pixels.
     OwnBlur,
+    /// Actors are not drawn.
+    NoActors,
+    /// Actors are drawn 2 cm off.
+    ActorsOff,
+    /// Actors stand still during the exposure.
+    FrozenActors,
+    /// Actors are drawn on top of everything, with what hides them removed.
+    OnlyActors,
 }
 
 impl Backend for MutatedBackend<'_> {
@@ -162,6 +170,15 @@ impl Backend for MutatedBackend<'_> {
             Mutation::OwnBlur => {
                 views.iter_mut().for_each(|view| view.camera.native_size_px = None)
             }
+            Mutation::NoActors => scene.placed.clear(),
+            Mutation::OnlyActors => scene.chunks.clear(),
+            Mutation::ActorsOff => scene.placed.iter_mut().for_each(|placed| {
+                placed.world_from_actor.position_m.x += 0.02;
+                placed.world_from_actor_at_start.position_m.x += 0.02;
+            }),
+            Mutation::FrozenActors => scene.placed.iter_mut().for_each(|placed| {
+                placed.world_from_actor_at_start = placed.world_from_actor;
+            }),
             Mutation::GlobalShutter => {
                 views.iter_mut().for_each(|view| view.rolling_shutter = None)
             }
@@ -234,7 +251,7 @@ fn remade(scene: &Scene, edit: &mut dyn FnMut(DVec3, &mut Vec<Vec<f32>>)) -> Sce
         }
         Arc::new(again)
     });
-    Scene { chunks: again.collect(), sky: scene.sky.clone() }
+    Scene { chunks: again.collect(), ..scene.clone() }
 }
 
 /// Moves Gaussians so that a pinhole draws them where an OpenCV lens' polynomial puts them, beyond its fold
@@ -255,9 +272,10 @@ fn folded(scene: &Scene, view: &mut View) -> Scene {
 }
 
 use Mutation::{
-    Background, CapAndStop, CentredPrincipalPoint, CoarseCentres, Culled, DuplicateInstance,
-    Flicker, Folded, GlobalShutter, HalfNear, Mirror, MoreBlur, NoLens, Nondeterministic, OneByte,
-    OtherClamp, OwnBlur, Paler, PoseF32, Reversed, Unmasked, Unwritten,
+    ActorsOff, Background, CapAndStop, CentredPrincipalPoint, CoarseCentres, Culled,
+    DuplicateInstance, Flicker, Folded, FrozenActors, GlobalShutter, HalfNear, Mirror, MoreBlur,
+    NoActors, NoLens, Nondeterministic, OneByte, OnlyActors, OtherClamp, OwnBlur, Paler, PoseF32,
+    Reversed, Unmasked, Unwritten,
 };
 
 /// Mutations for each case, and the checks that must fail with each, by a part of their text.
@@ -320,7 +338,16 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T27", CoarseCentres, &["as f64"]),
     ("T27", Culled, &["it is covered"]),
     ("T28", Paler, &["the fog lets through", "as f64"]),
-    ("T29", OwnBlur, &["nearer to native by dB", "as f64"]),
+    ("T29", NoActors, &["around the camera: the actor is seen", "1,000 m away: the actor is seen"]),
+    ("T29", NoActors, &["overlapping: the actor is seen", "overlapping: as within the scene"]),
+    ("T29", ActorsOff, &["around the camera: as within the scene", "1,000 m away: as within the"]),
+    ("T29", ActorsOff, &["1,000 m away: as f64", "around the camera: as f64"]),
+    ("T29", OnlyActors, &["under the road: the actor is seen", "under the road: as within the"]),
+    ("T29", OnlyActors, &["under the road: as f64"]),
+    ("T29", ActorsOff, &["overlapping: as f64"]),
+    ("T30", FrozenActors, &["across: exact rays", "across: as f64", "along: as at rest"]),
+    ("T30", FrozenActors, &["along: as f64"]),
+    ("T31", OwnBlur, &["nearer to native by dB", "as f64"]),
 ];
 
 /// The check that no mutation of a backend affects: the bound of the record format. In the unit tests of

@@ -437,10 +437,16 @@ pub(crate) fn nurec_plain(g: &Gaussians, with_cars: bool) -> Vec<u8> {
         }
         entries
     };
-    let tracks = map(vec![("street", vec![0x90]), ("cars", [vec![0x91], text("car 7")].concat())]);
+    let tracks = map(vec![
+        ("street", vec![0x90]),
+        ("cars", [vec![0x92], text("car 7"), text("car 9")].concat()),
+    ]);
     let mut state = layer("street");
     if with_cars {
         state.extend(layer("cars"));
+        // Every other Gaussian is of the second track.
+        let ids = (0..g.len()).flat_map(|i| (i as i32 % 2).to_le_bytes()).collect();
+        state.push((".gaussians_nodes.cars.gaussian_cuboid_ids".to_owned(), bytes(ids)));
     }
     state.push(("._extra_state".to_owned(), map(vec![("obj_track_ids", tracks)])));
     let state = state.iter().map(|(key, value)| (key.as_str(), value.clone())).collect();

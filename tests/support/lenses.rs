@@ -68,7 +68,7 @@ pub(crate) fn rolling_view(camera: Camera, pose: Pose, direction: ShutterDirecti
         rotation: pose.rotation * DQuat::from_rotation_y(-0.01),
     };
     let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first });
-    View { camera, world_from_camera: pose, rolling_shutter }
+    View { rolling_shutter, ..View::new(camera, pose) }
 }
 
 /// A camera that looks to the side at 30 m/s. Its columns are exposed in 100 ms, in the direction against the

@@ -100,8 +100,8 @@ pub(crate) fn draw_seen(
         rgb8: Some(rgb8),
         depth_m: Some(depth_m),
         opacity: Some(opacity),
-        normals: None,
         appearance: Some(seen),
+        ..Target::default()
     };
     let frame = Frame { scene, profile: &RenderProfile::DEFAULT, views: &[view] };
     backend.render(&frame, &mut [target], &|_, _| {}).unwrap();

@@ -28,6 +28,8 @@ const FILES: &[&str] = &[
     "src/twin/residency/budget.rs",
     "src/twin/ingest",
     "src/session/record",
+    "src/episode",
+    "src/suite",
     "src/server/start.rs",
     "src/server/spool",
     "clients/rust/src/upload.rs",

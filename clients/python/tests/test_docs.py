@@ -15,7 +15,15 @@ import pytest
 from test_push import write_ply
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGES = ["README.md", "docs/agents.md", "docs/operators.md", "docs/pipelines.md", "docs/scenes.md"]
+PAGES = [
+    "README.md",
+    "docs/actors.md",
+    "docs/agents.md",
+    "docs/operators.md",
+    "docs/pipelines.md",
+    "docs/scenes.md",
+    "docs/suites.md",
+]
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

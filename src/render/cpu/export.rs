@@ -2,7 +2,7 @@
 
 use super::Scratch;
 use crate::layout::Cutoffs;
-use crate::stage::{Stage, StageOutputs, TileLists};
+use crate::stage::{SplatOwner, Stage, StageOutputs, TileLists};
 
 /// Copies the outputs of the stages up to and including `last`. Splats are numbered without the gaps at the
 /// ends of pages.
@@ -12,6 +12,11 @@ pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -
     // The number of the splat at each place.
     let mut index_of_place = vec![0; projected.places()];
     for unit in projected.units() {
+        let first_splat = outputs.splats.len() as u32;
+        let instance = unit.instance;
+        if outputs.owners.last().is_none_or(|last| last.instance != instance) {
+            outputs.owners.push(SplatOwner { first_splat, instance });
+        }
         for (place, splat) in projected.unit(unit) {
             index_of_place[place as usize] = outputs.splats.len() as u32;
             outputs.splats.push(*splat);

@@ -18,7 +18,7 @@ use super::background::Background;
 use super::bin::{Bins, Grid};
 use super::math::exp2;
 use super::project::Projected;
-use super::resolve::{self, BLOCKS, Band, TileSums};
+use super::resolve::{self, BLOCKS, Band, HalvedBy, NOT_HALVED, TileSums};
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::layout::{Cutoffs, Splat};
 use crate::{OnViewDone, Target, View};
@@ -91,6 +91,15 @@ struct Batch {
     blocks: [u16; BATCH],
     /// For each block, a bit for each splat that touches it.
     touching: [u64; BLOCKS],
+    /// The place of each splat. Only written if instances are wanted.
+    places: [u32; BATCH],
+}
+
+/// What is accumulated beside colours and transmittance.
+#[derive(Clone, Copy)]
+struct Wants {
+    depth: bool,
+    instances: bool,
 }
 
 impl Default for Batch {
@@ -100,8 +109,16 @@ impl Default for Batch {
             matched: [Matched::default(); BATCH],
             blocks: [0; BATCH],
             touching: [0; BLOCKS],
+            places: [0; BATCH],
         }
     }
+}
+
+/// Where one tile is accumulated.
+struct TileOutput<'a> {
+    sums: &'a mut TileSums,
+    halved_by: &'a mut HalvedBy,
+    wants: Wants,
 }
 
 /// Draws one row of tiles of one view, and resolves it into the target's band.
@@ -117,13 +134,19 @@ fn rasterize_band<S: Simd>(
     let mut batch = Batch::default();
     let background = input.backgrounds.get(view);
     let mut scratch = background.and_then(Background::scratch);
-    let wants_depth = band.wants_depth();
+    let wants = Wants { depth: band.wants_depth(), instances: band.wants_instances() };
+    let mut halved_by = NOT_HALVED;
     let mut evaluations = 0;
     for column in 0..columns {
         let tile = input.bins.tile(view, row * columns as usize + column as usize);
         let at_px = [column * TILE_PX, row as u32 * TILE_PX];
         let mut sums = TileSums::default();
-        evaluations += rasterize_tile(simd, input, tile, at_px, &mut batch, &mut sums, wants_depth);
+        let mut output = TileOutput { sums: &mut sums, halved_by: &mut halved_by, wants };
+        evaluations += rasterize_tile(simd, input, tile, at_px, &mut batch, &mut output);
+        if wants.instances {
+            band.write_instances(&halved_by, at_px[0], input.projected);
+            halved_by = NOT_HALVED;
+        }
         if let Some(background) = background {
             background.add(simd, at_px, &mut scratch, &mut sums);
         }
@@ -143,23 +166,37 @@ fn rasterize_tile<S: Simd>(
     tile: &[AtomicU32],
     at_px: [u32; 2],
     batch: &mut Batch,
-    sums: &mut TileSums,
-    wants_depth: bool,
+    output: &mut TileOutput<'_>,
 ) -> u64 {
     // A bit for each block in which some pixel has not stopped.
     let mut live = u16::MAX;
     let mut evaluations = 0;
     for places in tile.chunks(BATCH) {
         match_batch(simd, input, places, at_px, batch);
+        if output.wants.instances {
+            for (to, place) in batch.places.iter_mut().zip(places) {
+                *to = place.load(Relaxed);
+            }
+        }
         for block in 0..BLOCKS {
             let touching = batch.touching[block];
             if touching == 0 || live >> block & 1 == 0 {
                 continue;
             }
-            let (stopped, count) = if wants_depth {
-                blend::<S, true>(simd, &batch.matched, touching, block, input.cutoffs, sums)
-            } else {
-                blend::<S, false>(simd, &batch.matched, touching, block, input.cutoffs, sums)
+            let cutoffs = input.cutoffs;
+            let (stopped, count) = match output.wants {
+                Wants { depth: false, instances: false } => {
+                    blend::<S, false, false>(simd, batch, touching, block, cutoffs, output)
+                }
+                Wants { depth: true, instances: false } => {
+                    blend::<S, true, false>(simd, batch, touching, block, cutoffs, output)
+                }
+                Wants { depth: false, instances: true } => {
+                    blend::<S, false, true>(simd, batch, touching, block, cutoffs, output)
+                }
+                Wants { depth: true, instances: true } => {
+                    blend::<S, true, true>(simd, batch, touching, block, cutoffs, output)
+                }
             };
             live &= !(u16::from(stopped) << block);
             evaluations += count as u64 * LANES as u64;
@@ -251,14 +288,15 @@ fn match_batch<S: Simd>(
 /// before by a single multiply-add. The transmittance of the image is a separate value, which changes only
 /// where the test holds.
 #[inline(always)]
-fn blend<S: Simd, const DEPTH: bool>(
+fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     simd: S,
-    batch: &[Matched; BATCH],
+    batch: &Batch,
     mut touching: u64,
     block: usize,
     cutoffs: &Cutoffs,
-    sums: &mut TileSums,
+    output: &mut TileOutput<'_>,
 ) -> (bool, usize) {
+    let sums = &mut *output.sums;
     let splat = |value: f32| f32x16::splat(simd, value);
     let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
     let cap = splat(cutoffs.alpha_cap);
@@ -278,7 +316,8 @@ fn blend<S: Simd, const DEPTH: bool>(
     let mut stopped = false;
     while touching != 0 {
         count += 1;
-        let matched = &batch[touching.trailing_zeros() as usize % BATCH];
+        let index = touching.trailing_zeros() as usize % BATCH;
+        let matched = &batch.matched[index];
         touching &= touching - 1;
 
         // Alpha; 0 where it is below the cut.
@@ -299,6 +338,16 @@ fn blend<S: Simd, const DEPTH: bool>(
         b = weight.mul_add(splat(matched.rgb[2]), b);
         if DEPTH {
             depth = weight.mul_add(splat(matched.depth_m), depth);
+        }
+        if INSTANCES {
+            let half = splat(0.5);
+            let halves = counts & after.simd_le(half) & transmittance.simd_gt(half);
+            let mut lanes = halves.to_bitmask();
+            while lanes != 0 {
+                let lane = lanes.trailing_zeros() as usize % LANES;
+                output.halved_by[block][lane] = batch.places[index] + 1;
+                lanes &= lanes - 1;
+            }
         }
         transmittance = counts.select(after, transmittance);
         if counts.all_false() {

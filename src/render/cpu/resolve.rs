@@ -2,6 +2,7 @@
 
 use fearless_simd::{f32x16, prelude::*, u32x16};
 
+use super::project::Projected;
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::{Target, View};
 use wildcity_scene::appearance::Appearance;
@@ -16,6 +17,13 @@ pub(super) fn block_corner(block: usize) -> [u32; 2] {
     let per_row = TILE_PX / BLOCK_PX;
     [block as u32 % per_row * BLOCK_PX, block as u32 / per_row * BLOCK_PX]
 }
+
+/// For each pixel of a tile, the place of the splat that brings its transmittance to a half or less, plus 1; 0 if none
+/// has.
+pub(super) type HalvedBy = [[u32; LANES]; BLOCKS];
+
+/// Before any splat is blended.
+pub(super) const NOT_HALVED: HalvedBy = [[0; LANES]; BLOCKS];
 
 /// Accumulated values of the 256 pixels of a tile, block by block.
 #[derive(Debug)]
@@ -48,6 +56,7 @@ pub(super) struct Band<'a> {
     rgb8: Option<&'a mut [u8]>,
     depth_m: Option<&'a mut [f32]>,
     opacity: Option<&'a mut [f32]>,
+    instances: Option<&'a mut [u16]>,
     /// Exposure and overlay of the camera; `None` if they change nothing.
     pub(super) appearance: Option<&'a Appearance>,
 }
@@ -56,6 +65,33 @@ impl Band<'_> {
     /// Whether depth must be accumulated.
     pub(super) fn wants_depth(&self) -> bool {
         self.depth_m.is_some()
+    }
+
+    /// Whether the splats that halve the transmittance must be noted.
+    pub(super) fn wants_instances(&self) -> bool {
+        self.instances.is_some()
+    }
+
+    /// Writes the instances of one tile with its left edge at column `left`.
+    pub(super) fn write_instances(
+        &mut self,
+        halved_by: &HalvedBy,
+        left: u32,
+        projected: &Projected,
+    ) {
+        let Some(instances) = &mut self.instances else { return };
+        let edge = BLOCK_PX as usize;
+        for (block, halved_by) in halved_by.iter().enumerate() {
+            let [block_left, row] = block_corner(block).map(|px| px as usize);
+            let column = left as usize + block_left;
+            for y in 0..edge.min(self.rows.saturating_sub(row)) {
+                for x in 0..edge.min(self.width.saturating_sub(column)) {
+                    let pixel = (row + y) * self.width + column + x;
+                    let place = halved_by[y * edge + x].checked_sub(1);
+                    instances[pixel] = place.map_or(0, |place| projected.instance(place));
+                }
+            }
+        }
     }
 }
 
@@ -69,6 +105,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
     let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
     let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));
     let mut opacity = target.opacity.as_mut().map(|b| b.chunks_mut(pixels));
+    let mut instances = target.instances.as_mut().map(|b| b.chunks_mut(pixels));
     (0..height)
         .step_by(TILE_PX as usize)
         .map(|top| Band {
@@ -78,6 +115,7 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
             rgb8: rgb8.as_mut().and_then(Iterator::next),
             depth_m: depth_m.as_mut().and_then(Iterator::next),
             opacity: opacity.as_mut().and_then(Iterator::next),
+            instances: instances.as_mut().and_then(Iterator::next),
             appearance,
         })
         .collect()

@@ -173,6 +173,11 @@ impl<K, const N: usize> LazyShader<K, N> {
         let module = self.module.get_or_insert_with(|| module(device, self.shader));
         self.variants[variant].get_or_insert_with(|| compile(module))
     }
+
+    /// The kernels of a variant that was compiled before.
+    pub(super) fn compiled(&self, variant: usize) -> Option<&K> {
+        self.variants[variant].as_ref()
+    }
 }
 
 /// Records the stages of a frame and times them.

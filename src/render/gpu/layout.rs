@@ -7,7 +7,9 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
 use super::partition::{Region, TileRows};
-use crate::layout::{ChunkView as CpuChunkView, Cutoffs, PixelFilter};
+use crate::layout::{
+    ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Cutoffs, PixelFilter,
+};
 use crate::{MAX_VIEWS, View, constants};
 use wildcity_scene::RenderProfile;
 
@@ -38,6 +40,8 @@ pub const RASTER_BATCH: u32 = 128;
 /// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
 /// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
 pub const SOA_BLOCK: u32 = 32;
+/// Bits of [`ChunkView::view`] that are the view's index, in kernels for actors.
+pub const VIEW_BITS: u32 = 4;
 /// Words of a Gaussian without its colour: mean (3), scale (3), opacity (1), and quaternion (2).
 pub const GEOMETRY_WORDS: u32 = 9;
 
@@ -199,7 +203,8 @@ pub struct ChunkView {
     pub depth_low: [f32; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     pub camera_m: [f32; 3],
-    /// Index of the view.
+    /// Index of the view. In kernels for actors, the low [`VIEW_BITS`] bits are that index, and the others the index
+    /// of the [`Lens`].
     pub view: u32,
     /// Focal lengths, in pixels.
     pub focal_px: [f32; 2],
@@ -235,6 +240,43 @@ impl ChunkView {
     pub(super) fn with_distance_from(self, center_m: DVec3) -> Self {
         let exact = center_m.extend(0.0).to_array();
         Self { depth_high: exact.map(|high| high as f32), depth_low: exact.map(low), ..self }
+    }
+}
+
+/// What changes the colours of a chunk's Gaussians in a frame with actors (32 bytes).
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct ChunkLight {
+    /// Factor on red, green and blue.
+    pub tint: [f32; 3],
+    /// Index of the first contact shadow that falls on the chunk.
+    pub first_shadow: u32,
+    /// Number of shadows.
+    pub shadows: u32,
+    /// Zero.
+    pub pad0: u32,
+    /// Zero.
+    pub pad1: u32,
+    /// Zero.
+    pub pad2: u32,
+}
+
+/// A contact shadow relative to a chunk of the twin (64 bytes): the content of [`crate::layout::ChunkShadow`].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct ChunkShadow {
+    /// Rows of the rigid transform from the chunk to the actor's axes, translation last, in metres.
+    pub actor_from_chunk: [[f32; 4]; 3],
+    /// Half the length and half the width of the actor's box, in metres.
+    pub half_m: [f32; 2],
+    /// Zero.
+    pub pad: [f32; 2],
+}
+
+impl ChunkShadow {
+    pub(super) fn new(shadow: &CpuChunkShadow) -> Self {
+        let CpuChunkShadow { actor_from_chunk, half_m, .. } = *shadow;
+        Self { actor_from_chunk, half_m, pad: [0.0; 2] }
     }
 }
 
@@ -295,6 +337,16 @@ pub struct Lens {
     pub axis_angle: [f32; 4],
     /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order; 0 for always six points.
     pub expansion: [f32; 4],
+}
+
+/// Whose splats begin with a cluster view (8 bytes). The first record of a list holds its length as `instance`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+pub struct Owner {
+    /// Index of the cluster view.
+    pub cluster_view: u32,
+    /// As in [`Target::instances`](crate::Target::instances).
+    pub instance: u32,
 }
 
 /// One cluster in one view (8 bytes): the unit of work of stage project.

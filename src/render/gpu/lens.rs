@@ -17,6 +17,7 @@ use wgpu::{BindingResource, BufferUsages};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::layout::Lens;
+use crate::actor_views::ActorViews;
 use crate::expansion::ExpansionBound;
 use crate::unscented::max_center_angle_rad;
 use crate::view::ShutterMotion;
@@ -34,17 +35,25 @@ pub(super) struct Lenses {
 }
 
 impl Lenses {
-    /// Uploads the lenses of a frame's views; nothing if all are static pinholes.
-    pub(super) fn upload(&mut self, device: &Device, frame: &Frame<'_>) {
-        if frame.views.iter().all(View::is_static_pinhole) {
+    /// Uploads the lenses of a frame's views; nothing if all are static pinholes. The views of actors that move
+    /// relative to the camera while a shutter rolls follow, in the order of [`LensIndices`].
+    pub(super) fn upload(&mut self, device: &Device, frame: &Frame<'_>, actors: &ActorViews) {
+        let is_own = |(view, relative): &(&View, &View)| has_own_lens(view, relative);
+        let pairs = frame.views.iter().zip(actors.all());
+        let pairs =
+            pairs.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
+        let mut own =
+            pairs.filter(is_own).map(|(_, relative)| Lens::of(relative, frame.profile)).peekable();
+        if frame.views.iter().all(View::is_static_pinhole) && own.peek().is_none() {
             return;
         }
-        let mut lenses = [Lens::zeroed(); MAX_VIEWS];
+        let mut lenses = vec![Lens::zeroed(); MAX_VIEWS];
         for (lens, view) in lenses.iter_mut().zip(frame.views) {
             if !view.is_static_pinhole() {
                 *lens = Lens::of(view, frame.profile);
             }
         }
+        lenses.extend(own);
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let buffer =
             self.buffer.get_or_insert_with(|| GrowableBuffer::new(device, "lenses", usage));
@@ -55,6 +64,39 @@ impl Lenses {
     pub(super) fn bind(&self) -> Option<(u32, BindingResource<'_>)> {
         self.buffer.as_ref().map(|buffer| (12, buffer.bind()))
     }
+}
+
+/// The index of each actor's lens in each view: of its own after those of all views, or that of the view.
+#[derive(Debug, Default)]
+pub(super) struct LensIndices(Vec<Vec<u32>>);
+
+impl LensIndices {
+    pub(super) fn new(frame: &Frame<'_>, actors: &ActorViews) -> Self {
+        let mut next = MAX_VIEWS as u32;
+        let mut of_view = |(index, (view, relative)): (usize, (&View, &[View]))| {
+            let mut lens = |relative: &View| {
+                if !has_own_lens(view, relative) {
+                    return index as u32;
+                }
+                next += 1;
+                next - 1
+            };
+            relative.iter().map(&mut lens).collect()
+        };
+        Self(frame.views.iter().zip(actors.all()).enumerate().map(&mut of_view).collect())
+    }
+
+    /// The index of the lens with which a view sees a placed chunk.
+    pub(super) fn of(&self, view: usize, placed: usize) -> u32 {
+        self.0[view][placed]
+    }
+}
+
+/// Whether a view sees an actor with other lens parameters than the twin: those of a rolling shutter depend on the
+/// motion relative to the actor.
+fn has_own_lens(view: &View, relative: &View) -> bool {
+    let rolls = view.rolling_shutter.is_some() || relative.rolling_shutter.is_some();
+    rolls && !relative.is_static_pinhole()
 }
 
 impl Lens {

@@ -13,36 +13,46 @@
 //! Static pinhole cameras have their own kernels, which are identical to those of frames without other cameras.
 //! The kernels for lenses and rolling shutters are compiled with the first view that needs them.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
+use bytemuck::Zeroable;
 use glam::Vec3;
 use rayon::prelude::*;
-use wgpu::{BufferUsages, ComputePass, ShaderModule};
+use wgpu::{BindingResource, BufferUsages, ComputePass, ShaderModule};
 
 use super::device::Device;
 use super::growable_buffer::{GrowableBuffer, INTERMEDIATE};
 use super::kernel::{Groups, Kernel, LazyShader, slot_binding, span_slots};
-use super::layout::{ChunkView, ClusterView, Span, SplatColor, SplatShape};
-use super::lens::Lenses;
-use super::mirror::Mirror;
+use super::layout::{
+    ChunkLight, ChunkShadow, ChunkView, ClusterView, Span, SplatColor, SplatShape, VIEW_BITS,
+};
+use super::lens::{LensIndices, Lenses};
+use super::mirror::{Mirror, Place};
 use super::plan::{Plan, job};
 use super::scan::Scan;
-use crate::layout::{ChunkView as CpuChunkView, Frustum};
+use crate::actor_views::ActorViews;
+use crate::layout::{ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Frustum};
 use crate::unscented::UnscentedView;
-use crate::{Frame, View};
-use wildcity_scene::Chunk;
+use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::Cluster;
+use wildcity_scene::{Chunk, RenderProfile};
 
 /// The clusters that a region projects.
 #[derive(Debug, Default)]
 pub(super) struct ProjectWork {
-    sh_degree: u8,
     cluster_views: Vec<ClusterView>,
     /// Indices into `cluster_views`, page after page of the mirror, since one page is bound at a time.
     page_cluster_views: Vec<u32>,
     dispatches: Vec<ProjectDispatch>,
     chunk_views: Vec<ChunkView>,
+    /// One per chunk view if the frame has actors; empty otherwise.
+    lights: Vec<ChunkLight>,
+    shadows: Vec<ChunkShadow>,
+    /// Whose cluster views they are, in order.
+    owners: Vec<super::layout::Owner>,
 }
 
 /// The cluster views of one page that one kernel projects.
@@ -50,18 +60,47 @@ pub(super) struct ProjectWork {
 struct ProjectDispatch {
     /// Page of the mirror.
     page: usize,
-    projection: Projection,
+    variant: Variant,
     /// Range of `page_cluster_views`.
     span: Span,
 }
 
+/// Which kernels project a chunk in a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Variant {
+    projection: Projection,
+    /// Whether it is an actor's chunk, or one with an actor above it.
+    actors: bool,
+    sh_degree: u8,
+}
+
 /// How a view projects Gaussians.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Projection {
     /// A static pinhole camera: linearised at the centre.
     Pinhole,
     /// A lens or a rolling shutter: the unscented transform.
     Unscented,
+}
+
+/// A chunk in one view.
+#[derive(Clone, Copy, Debug)]
+struct ChunkInView<'a> {
+    chunk: &'a Arc<Chunk>,
+    /// Index of the view.
+    view: usize,
+    /// The view in the chunk's axes: the world's, or those of an actor.
+    relative: &'a View,
+    of: Owner<'a>,
+}
+
+/// Whose Gaussians a chunk has.
+#[derive(Clone, Copy, Debug)]
+enum Owner<'a> {
+    /// The twin, with the contact shadows that may fall on the chunk.
+    Twin { shadows: &'a [CpuChunkShadow] },
+    /// An actor, with the index of the lens that sees it.
+    Actor { placed: &'a PlacedChunk, lens: u32 },
 }
 
 /// A cluster in the mirror.
@@ -70,59 +109,76 @@ struct ClusterPlace {
     page: usize,
     /// First line on the page.
     line: u32,
+    /// Whether a contact shadow may fall on it.
+    shadowed: bool,
 }
 
 impl ProjectWork {
     /// Tests every cluster of the scene against some views, and keeps those that may be visible.
-    pub(super) fn new(frame: &Frame<'_>, views: Range<usize>, mirror: &Mirror) -> Self {
-        let pairs: Vec<(usize, &Arc<Chunk>)> = views
-            .flat_map(|view| frame.scene.chunks.iter().map(move |chunk| (view, chunk)))
-            .collect();
+    pub(super) fn new(
+        frame: &Frame<'_>,
+        views: Range<usize>,
+        actors: &ActorViews,
+        mirror: &Mirror,
+    ) -> Self {
+        // All chunks in each view, in order of global ids.
+        let lenses = LensIndices::new(frame, actors);
+        let shadows = CpuChunkShadow::by_chunk(frame.scene);
+        let in_view = |view: usize| {
+            let shadows = &shadows;
+            let twin = frame.scene.chunks.iter().enumerate().map(move |(index, chunk)| {
+                let shadows = shadows.get(index).map_or(&[][..], Vec::as_slice);
+                let relative = &frame.views[view];
+                ChunkInView { chunk, view, relative, of: Owner::Twin { shadows } }
+            });
+            let lenses = &lenses;
+            let placed = frame.scene.placed.iter().zip(actors.of(view)).enumerate();
+            let placed = placed.map(move |(index, (placed, relative))| {
+                let of = Owner::Actor { placed, lens: lenses.of(view, index) };
+                ChunkInView { chunk: &placed.chunk, view, relative, of }
+            });
+            twin.chain(placed)
+        };
+        let pairs: Vec<ChunkInView<'_>> = views.flat_map(in_view).collect();
+
+        // What each of them shows.
         let unscented: Vec<Option<UnscentedView<'_>>> =
             frame.views.iter().map(|view| UnscentedView::new(view, frame.profile)).collect();
         let visible: Vec<Vec<ClusterPlace>> = pairs
             .par_iter()
-            .map(|&(view, chunk)| match &unscented[view] {
-                Some(unscented) => visible_unscented(unscented, chunk, mirror),
-                None => visible_pinhole(frame, view, chunk, mirror),
-            })
+            .map(|pair| pair.visible(frame, unscented[pair.view].as_ref(), mirror))
             .collect();
 
-        // One chunk view per visible (chunk, view) pair, and the cluster views of each page by projection.
-        let mut work = Self { sh_degree: frame.scene.sh_degree(), ..Self::default() };
-        let mut pages = vec![[Vec::new(), Vec::new()]; mirror.pages()];
-        for ((view, chunk), clusters) in pairs.into_iter().zip(visible) {
-            if clusters.is_empty() {
-                continue;
+        // Chunk views, and the cluster views of each page by kernel.
+        let mut work = Self::default();
+        let has_actors = !frame.scene.placed.is_empty();
+        let mut by_kernel: BTreeMap<(usize, Variant), Vec<u32>> = BTreeMap::new();
+        for (pair, clusters) in pairs.into_iter().zip(visible) {
+            let mut chunk_views = [None; 2];
+            if !clusters.is_empty() {
+                work.add_owner(&pair);
             }
-            let chunk_view = work.chunk_views.len() as u32;
-            let View { camera, world_from_camera, .. } = &frame.views[view];
-            let relative = CpuChunkView::new(&frame.views[view], chunk, frame.profile);
-            let relative = ChunkView::new(view as u32, &relative);
-            work.chunk_views.push(match camera.depth_is_distance() {
-                false => relative,
-                true => {
-                    relative.with_distance_from(world_from_camera.position_m - chunk.origin_m())
-                }
-            });
-            let projection = usize::from(unscented[view].is_some());
-            for ClusterPlace { page, line } in clusters {
-                pages[page][projection].push(work.cluster_views.len() as u32);
+            for ClusterPlace { page, line, shadowed } in clusters {
+                let variant = pair.variant(shadowed);
+                let chunk_view = *chunk_views[usize::from(shadowed)].get_or_insert_with(|| {
+                    work.chunk_views.push(pair.chunk_view(variant, frame.profile));
+                    if has_actors {
+                        work.add_light(&pair, shadowed);
+                    }
+                    work.chunk_views.len() as u32 - 1
+                });
+                let cluster_view = work.cluster_views.len() as u32;
+                by_kernel.entry((page, variant)).or_default().push(cluster_view);
                 work.cluster_views.push(ClusterView { line, chunk_view });
             }
         }
 
-        // One dispatch per page and projection.
-        for (page, by_projection) in pages.into_iter().enumerate() {
-            let projections = [Projection::Pinhole, Projection::Unscented];
-            for (cluster_views, projection) in by_projection.into_iter().zip(projections) {
-                if !cluster_views.is_empty() {
-                    let first = work.page_cluster_views.len() as u32;
-                    let span = Span { first, count: cluster_views.len() as u32 };
-                    work.dispatches.push(ProjectDispatch { page, projection, span });
-                    work.page_cluster_views.extend(cluster_views);
-                }
-            }
+        // One dispatch per page and kernel.
+        for ((page, variant), cluster_views) in by_kernel {
+            let first = work.page_cluster_views.len() as u32;
+            let span = Span { first, count: cluster_views.len() as u32 };
+            work.dispatches.push(ProjectDispatch { page, variant, span });
+            work.page_cluster_views.extend(cluster_views);
         }
         work
     }
@@ -131,43 +187,114 @@ impl ProjectWork {
     pub(super) fn cluster_views(&self) -> u32 {
         self.cluster_views.len() as u32
     }
+
+    /// Whose cluster views they are, in order.
+    pub(super) fn owners(&self) -> &[super::layout::Owner] {
+        &self.owners
+    }
+
+    /// Adds the owner of the next cluster view, if it is another one than that of the last.
+    fn add_owner(&mut self, pair: &ChunkInView<'_>) {
+        let instance = match pair.of {
+            Owner::Twin { .. } => TWIN_INSTANCE.into(),
+            Owner::Actor { placed, .. } => (FIRST_ACTOR_INSTANCE + placed.actor).into(),
+        };
+        let cluster_view = self.cluster_views.len() as u32;
+        if self.owners.last().is_none_or(|last| last.instance != instance) {
+            self.owners.push(super::layout::Owner { cluster_view, instance });
+        }
+    }
+
+    /// Adds the light of the last chunk view.
+    fn add_light(&mut self, pair: &ChunkInView<'_>, shadowed: bool) {
+        let first_shadow = self.shadows.len() as u32;
+        let mut tint = [1.0; 3];
+        match pair.of {
+            Owner::Actor { placed, .. } => tint = placed.tint,
+            Owner::Twin { shadows } if shadowed => {
+                self.shadows.extend(shadows.iter().map(ChunkShadow::new));
+            }
+            Owner::Twin { .. } => {}
+        }
+        let shadows = self.shadows.len() as u32 - first_shadow;
+        self.lights.push(ChunkLight { tint, first_shadow, shadows, ..ChunkLight::zeroed() });
+    }
 }
 
-/// The clusters of a chunk that a static pinhole camera may see, in order.
-fn visible_pinhole(
-    frame: &Frame<'_>,
-    view: usize,
-    chunk: &Arc<Chunk>,
-    mirror: &Mirror,
-) -> Vec<ClusterPlace> {
-    let frustum = Frustum::new(&frame.views[view], chunk, frame.profile);
-    visible(chunk, mirror, |min_m, max_m, sigma_m| frustum.may_see(min_m, max_m, sigma_m))
-}
+impl ChunkInView<'_> {
+    /// The clusters that may be visible, in order. `unscented` is that of the frame's view.
+    fn visible(
+        &self,
+        frame: &Frame<'_>,
+        unscented: Option<&UnscentedView<'_>>,
+        mirror: &Mirror,
+    ) -> Vec<ClusterPlace> {
+        let Self { chunk, relative, of, .. } = *self;
+        if relative.is_static_pinhole() {
+            let frustum = Frustum::new(relative, chunk, frame.profile);
+            return self.visible_if(mirror, |min_m, max_m, sigma_m| {
+                frustum.may_see(min_m, max_m, sigma_m)
+            });
+        }
+        let moved = match (of, unscented) {
+            (Owner::Twin { .. }, unscented) => unscented.copied(),
+            (Owner::Actor { .. }, Some(unscented)) => Some(unscented.moved(relative)),
+            (Owner::Actor { .. }, None) => UnscentedView::new(relative, frame.profile),
+        };
+        self.visible_if(mirror, |min_m, max_m, sigma_m| {
+            moved.is_none_or(|view| view.may_see(chunk.origin_m(), min_m, max_m, sigma_m))
+        })
+    }
 
-/// The clusters of a chunk that a view with a lens or a rolling shutter may see, in order.
-fn visible_unscented(
-    view: &UnscentedView<'_>,
-    chunk: &Arc<Chunk>,
-    mirror: &Mirror,
-) -> Vec<ClusterPlace> {
-    visible(chunk, mirror, |min_m, max_m, sigma_m| {
-        view.may_see(chunk.origin_m(), min_m, max_m, sigma_m)
-    })
-}
+    /// The clusters of which `may_see` is true; its arguments are the smallest and largest centre, and the largest
+    /// standard deviation, in metres.
+    fn visible_if(
+        &self,
+        mirror: &Mirror,
+        may_see: impl Fn(Vec3, Vec3, f32) -> bool,
+    ) -> Vec<ClusterPlace> {
+        let shadows = match self.of {
+            Owner::Twin { shadows } => shadows,
+            Owner::Actor { .. } => &[],
+        };
+        let places = mirror.places(self.chunk).iter().zip(self.chunk.clusters());
+        let visible = places.filter(|(_, cluster)| {
+            let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
+            may_see(min_m, max_m, sigma_m)
+        });
+        let place = |(place, cluster): (&Place, &Cluster)| {
+            let touches = |s: &CpuChunkShadow| s.may_touch(cluster.min_m, cluster.max_m);
+            let shadowed = shadows.iter().any(touches);
+            ClusterPlace { page: place.page, line: place.lines.start, shadowed }
+        };
+        visible.map(place).collect()
+    }
 
-/// The clusters of a chunk of which `may_see` is true; its arguments are the smallest and largest centre,
-/// and the largest standard deviation, in metres.
-fn visible(
-    chunk: &Arc<Chunk>,
-    mirror: &Mirror,
-    may_see: impl Fn(Vec3, Vec3, f32) -> bool,
-) -> Vec<ClusterPlace> {
-    let places = mirror.places(chunk).iter().zip(chunk.clusters());
-    let visible = places.filter(|(_, cluster)| {
-        let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
-        may_see(min_m, max_m, sigma_m)
-    });
-    visible.map(|(place, _)| ClusterPlace { page: place.page, line: place.lines.start }).collect()
+    fn variant(&self, shadowed: bool) -> Variant {
+        let projection = match self.relative.is_static_pinhole() {
+            true => Projection::Pinhole,
+            false => Projection::Unscented,
+        };
+        let actors = shadowed || matches!(self.of, Owner::Actor { .. });
+        Variant { projection, actors, sh_degree: self.chunk.sh_degree() }
+    }
+
+    /// The view relative to the chunk.
+    fn chunk_view(&self, variant: Variant, profile: &RenderProfile) -> ChunkView {
+        let Self { chunk, relative, .. } = *self;
+        let view = self.view as u32;
+        let view = match self.of {
+            _ if !variant.actors => view,
+            Owner::Twin { .. } => view | view << VIEW_BITS,
+            Owner::Actor { lens, .. } => view | lens << VIEW_BITS,
+        };
+        let chunk_view = ChunkView::new(view, &CpuChunkView::new(relative, chunk, profile));
+        if !relative.camera.depth_is_distance() {
+            return chunk_view;
+        }
+        let position_m = relative.world_from_camera.position_m;
+        chunk_view.with_distance_from(position_m - chunk.origin_m())
+    }
 }
 
 /// The splats of a region, and the keys by which they are sorted.
@@ -217,6 +344,12 @@ pub(super) struct Project {
     pinhole: LazyShader<Kernels, 4>,
     /// By SH degree.
     unscented: LazyShader<Kernels, 4>,
+    /// By SH degree, for chunks of actors and those beneath them.
+    pinhole_actors: LazyShader<Kernels, 4>,
+    /// By SH degree, for chunks of actors and those beneath them.
+    unscented_actors: LazyShader<Kernels, 4>,
+    /// Made with the first frame that has actors.
+    lights: Option<Lights>,
     cluster_views: GrowableBuffer,
     page_cluster_views: GrowableBuffer,
     chunk_views: GrowableBuffer,
@@ -225,6 +358,26 @@ pub(super) struct Project {
     visible: GrowableBuffer,
     /// For each cluster view, the index of its first splat.
     offsets: GrowableBuffer,
+}
+
+/// What changes the colours of Gaussians in frames with actors.
+#[derive(Debug)]
+struct Lights {
+    /// One per chunk view.
+    lights: GrowableBuffer,
+    shadows: GrowableBuffer,
+}
+
+impl Lights {
+    fn new(device: &Device) -> Self {
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let buffer = |label| GrowableBuffer::new(device, label, usage);
+        Self { lights: buffer("chunk lights"), shadows: buffer("chunk shadows") }
+    }
+
+    fn bind(&self) -> [(u32, BindingResource<'_>); 2] {
+        [(13, self.lights.bind()), (14, self.shadows.bind())]
+    }
 }
 
 /// Both kernels of the stage for one projection and one SH degree.
@@ -250,6 +403,9 @@ impl Project {
         Self {
             pinhole: LazyShader::new("project").with_module(device),
             unscented: LazyShader::new("project_unscented"),
+            pinhole_actors: LazyShader::new("project_actors"),
+            unscented_actors: LazyShader::new("project_unscented_actors"),
+            lights: None,
             cluster_views: buffer("cluster views", storage),
             page_cluster_views: buffer("cluster views by page", storage),
             chunk_views: buffer("chunk views", storage),
@@ -272,8 +428,23 @@ impl Project {
         self.page_cluster_views.fill(device, bytemuck::cast_slice(&work.page_cluster_views));
         self.chunk_views.fill(device, bytemuck::cast_slice(&work.chunk_views));
         self.spans.fill(device, &spans);
+        if !work.lights.is_empty() {
+            let Lights { lights, shadows } = self.lights.get_or_insert_with(|| Lights::new(device));
+            lights.fill(device, bytemuck::cast_slice(&work.lights));
+            shadows.fill(device, bytemuck::cast_slice(&work.shadows));
+        }
         self.visible.reserve(device, 32 * u64::from(work.cluster_views()));
         self.offsets.reserve(device, 4 * u64::from(work.cluster_views()));
+    }
+
+    /// For each cluster view, the index of its first splat.
+    pub(super) fn first_splats(&self) -> &GrowableBuffer {
+        &self.offsets
+    }
+
+    /// Sets those indices, for splats that another backend projected.
+    pub(super) fn set_first_splats(&mut self, device: &Device, first_splats: &[u32]) {
+        self.offsets.fill(device, bytemuck::cast_slice(first_splats));
     }
 
     /// Projects the work that was uploaded.
@@ -286,23 +457,18 @@ impl Project {
         splats: &SplatBuffers,
     ) {
         let ProjectInputs { plan, scan, mirror, lenses } = inputs;
-        let degree = usize::from(work.sh_degree.min(3));
-        let needs = |projection| work.dispatches.iter().any(|d| d.projection == projection);
-        let compile = |module: &ShaderModule| Kernels::new(device, module, degree);
-        let pinhole =
-            needs(Projection::Pinhole).then(|| self.pinhole.variant(device, degree, compile));
-        let unscented =
-            needs(Projection::Unscented).then(|| self.unscented.variant(device, degree, compile));
+        // Compile the kernels that are missing.
+        for ProjectDispatch { variant, .. } in &work.dispatches {
+            let degree = variant.degree();
+            self.shader(*variant)
+                .variant(device, degree, |module| Kernels::new(device, module, degree));
+        }
 
         // The kernels and the input of each dispatch.
         let mut dispatches = Vec::with_capacity(work.dispatches.len());
         for (index, dispatch) in work.dispatches.iter().enumerate() {
-            let ProjectDispatch { page, projection, span } = *dispatch;
-            let kernels = match projection {
-                Projection::Pinhole => pinhole,
-                Projection::Unscented => unscented,
-            };
-            let Some(kernels) = kernels else { continue };
+            let ProjectDispatch { page, variant, span } = *dispatch;
+            let Some(kernels) = self.kernels(variant) else { continue };
             let Some(page) = mirror.page(page) else { continue };
             let mut resources = vec![
                 (0, plan.frame().as_entire_binding()),
@@ -314,19 +480,22 @@ impl Project {
                 (6, self.visible.bind()),
                 (7, self.offsets.bind()),
             ];
-            if projection == Projection::Unscented {
+            if variant.projection == Projection::Unscented {
                 resources.extend(lenses.bind());
             }
-            dispatches.push((kernels, Groups::Count(span.count), resources));
+            dispatches.push((kernels, variant, Groups::Count(span.count), resources));
         }
 
         // Cull, give each cluster view the index of its first splat, and project.
-        for (kernels, groups, resources) in &dispatches {
+        for (kernels, _, groups, resources) in &dispatches {
             kernels.cull.run(device, pass, *groups, resources);
         }
         scan.run(device, pass, plan.job(job::CLUSTER_VIEWS), self.offsets.buffer());
         plan.set_splats(device, pass, scan.block_sums());
-        for (kernels, groups, mut resources) in dispatches {
+        for (kernels, variant, groups, mut resources) in dispatches {
+            if variant.actors {
+                resources.extend(self.lights.iter().flat_map(Lights::bind));
+            }
             resources.extend([
                 (8, splats.shapes.bind()),
                 (9, splats.colors.bind()),
@@ -335,6 +504,34 @@ impl Project {
             ]);
             kernels.project.run(device, pass, groups, &resources);
         }
+    }
+}
+
+impl Variant {
+    fn degree(self) -> usize {
+        usize::from(self.sh_degree.min(3))
+    }
+}
+
+impl Project {
+    fn shader(&mut self, variant: Variant) -> &mut LazyShader<Kernels, 4> {
+        match (variant.projection, variant.actors) {
+            (Projection::Pinhole, false) => &mut self.pinhole,
+            (Projection::Unscented, false) => &mut self.unscented,
+            (Projection::Pinhole, true) => &mut self.pinhole_actors,
+            (Projection::Unscented, true) => &mut self.unscented_actors,
+        }
+    }
+
+    /// The kernels of a variant, if they were compiled.
+    fn kernels(&self, variant: Variant) -> Option<&Kernels> {
+        let shader = match (variant.projection, variant.actors) {
+            (Projection::Pinhole, false) => &self.pinhole,
+            (Projection::Unscented, false) => &self.unscented,
+            (Projection::Pinhole, true) => &self.pinhole_actors,
+            (Projection::Unscented, true) => &self.unscented_actors,
+        };
+        shader.compiled(variant.degree())
     }
 }
 

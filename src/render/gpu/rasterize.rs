@@ -13,7 +13,7 @@ use super::bin::Bin;
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::{Groups, Kernel, LazyShader, slot_binding, span_slots};
-use super::layout::Span;
+use super::layout::{Owner, Span};
 use super::lens::Lenses;
 use super::plan::Plan;
 use super::project::SplatBuffers;
@@ -33,6 +33,8 @@ pub(super) struct Rasterize {
     network: Shader,
     map_lens: Shader,
     network_lens: Shader,
+    /// For frames with instance ids; created with the first of them.
+    instances: Option<Instances>,
     /// For frames with a background or with appearances; created with the first of them.
     background: Option<Background>,
     /// The background of frames that have appearances only.
@@ -42,6 +44,37 @@ pub(super) struct Rasterize {
     spans: GrowableBuffer,
     /// Pixels, tile after tile, page after page.
     pages: Vec<GrowableBuffer>,
+}
+
+/// The kernels and the input of instance ids.
+#[derive(Debug)]
+struct Instances {
+    shaders: InstanceShaders,
+    owners: GrowableBuffer,
+}
+
+/// The stage with each kind of background and instance ids.
+#[derive(Debug)]
+struct InstanceShaders {
+    no_background: Shader,
+    map: Shader,
+    network: Shader,
+    map_lens: Shader,
+    network_lens: Shader,
+}
+
+impl Instances {
+    fn new(device: &Device) -> Self {
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let shaders = InstanceShaders {
+            no_background: Shader::new("instances"),
+            map: Shader::new("instances_map"),
+            network: Shader::new("instances_network"),
+            map_lens: Shader::new("instances_map_lens"),
+            network_lens: Shader::new("instances_network_lens"),
+        };
+        Self { shaders, owners: GrowableBuffer::new(device, "owners", usage) }
+    }
 }
 
 /// The part of the output that a region writes.
@@ -62,6 +95,10 @@ pub(super) struct RasterizeInputs<'a> {
     pub(super) splats: &'a SplatBuffers,
     pub(super) bin: &'a Bin,
     pub(super) lenses: &'a Lenses,
+    /// Whose splats they are, in order of cluster views.
+    pub(super) owners: &'a [Owner],
+    /// For each cluster view, the index of its first splat.
+    pub(super) first_splats: &'a GrowableBuffer,
 }
 
 impl Rasterize {
@@ -73,6 +110,7 @@ impl Rasterize {
             network: Shader::new("rasterize_network"),
             map_lens: Shader::new("rasterize_map_lens"),
             network_lens: Shader::new("rasterize_network_lens"),
+            instances: None,
             background: None,
             black: None,
             has_background: false,
@@ -134,22 +172,41 @@ impl Rasterize {
         inputs: RasterizeInputs<'_>,
         output: &TileOutput,
     ) {
-        let RasterizeInputs { plan, splats, bin, lenses } = inputs;
+        let RasterizeInputs { plan, splats, bin, lenses, owners, first_splats } = inputs;
         let TileOutput { planes, tiles, tiles_per_page } = output;
 
         // The kernel for this kind of background and these planes.
         let background = self.background.as_ref().filter(|_| self.has_background);
-        let shader = match background.map(Background::shader) {
-            None => &mut self.no_background,
-            Some(BackgroundShader::Map) => &mut self.map,
-            Some(BackgroundShader::Network) => &mut self.network,
-            Some(BackgroundShader::MapLens) => &mut self.map_lens,
-            Some(BackgroundShader::NetworkLens) => &mut self.network_lens,
+        if planes.has_instances() {
+            let instances = self.instances.get_or_insert_with(|| Instances::new(device));
+            let count = Owner { cluster_view: 0, instance: owners.len() as u32 };
+            let list: Vec<Owner> = [count].iter().chain(owners).copied().collect();
+            instances.owners.fill(device, bytemuck::cast_slice(&list));
+        }
+        let instances = self.instances.as_mut().filter(|_| planes.has_instances());
+        let (instances, owners) = match instances {
+            Some(Instances { shaders, owners }) => (Some(shaders), Some(&*owners)),
+            None => (None, None),
+        };
+        let shader = match (background.map(Background::shader), instances) {
+            (None, None) => &mut self.no_background,
+            (None, Some(own)) => &mut own.no_background,
+            (Some(BackgroundShader::Map), None) => &mut self.map,
+            (Some(BackgroundShader::Map), Some(own)) => &mut own.map,
+            (Some(BackgroundShader::Network), None) => &mut self.network,
+            (Some(BackgroundShader::Network), Some(own)) => &mut own.network,
+            (Some(BackgroundShader::MapLens), None) => &mut self.map_lens,
+            (Some(BackgroundShader::MapLens), Some(own)) => &mut own.map_lens,
+            (Some(BackgroundShader::NetworkLens), None) => &mut self.network_lens,
+            (Some(BackgroundShader::NetworkLens), Some(own)) => &mut own.network_lens,
         };
         let kernel = shader.variant(device, planes.variant(), |module| {
             Kernel::new(device, module, "main", &planes.constants())
         });
         let mut background_resources = Vec::new();
+        if let Some(owners) = owners {
+            background_resources.extend([(13, owners.bind()), (14, first_splats.bind())]);
+        }
         if let Some(background) = background {
             background_resources.extend(background.bind());
             if background.has_lenses() {

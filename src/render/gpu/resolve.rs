@@ -22,6 +22,7 @@ pub(super) struct Planes {
     rgb: bool,
     opacity: bool,
     depth: bool,
+    instances: bool,
 }
 
 /// The outputs that the targets of a frame request.
@@ -45,7 +46,7 @@ impl Outputs {
 
 impl Planes {
     /// Number of combinations.
-    pub(super) const VARIANTS: usize = 16;
+    pub(super) const VARIANTS: usize = 32;
 
     /// The values that these targets request.
     pub(super) fn of(targets: &[Target<'_>]) -> Self {
@@ -55,12 +56,13 @@ impl Planes {
             rgb: any(|t| t.rgba.is_some()),
             opacity: any(|t| t.rgba.is_some() || t.opacity.is_some()),
             depth: any(|t| t.depth_m.is_some()),
+            instances: any(|t| t.instances.is_some()),
         }
     }
 
     /// A number below [`Planes::VARIANTS`].
     pub(super) fn variant(self) -> usize {
-        let bits = [self.rgb8, self.rgb, self.opacity, self.depth];
+        let bits = [self.rgb8, self.rgb, self.opacity, self.depth, self.instances];
         bits.into_iter().fold(0, |number, bit| 2 * number + usize::from(bit))
     }
 
@@ -75,6 +77,11 @@ impl Planes {
         ]
     }
 
+    /// Whether instance ids are computed.
+    pub(super) fn has_instances(self) -> bool {
+        self.instances
+    }
+
     /// Bytes of the pixels of one tile, at least one plane, so that buffers are never empty.
     pub(super) fn tile_bytes(self) -> u64 {
         4 * (self.count().max(1) * PLANE) as u64
@@ -82,25 +89,28 @@ impl Planes {
 
     /// Number of planes.
     fn count(self) -> usize {
-        let [rgb8, rgb, opacity, depth] = self.starts();
-        [rgb8.map(|s| s + 1), rgb.map(|s| s + 3), opacity.map(|s| s + 1), depth.map(|s| s + 1)]
-            .into_iter()
-            .flatten()
-            .max()
-            .unwrap_or(0)
+        let [rgb8, rgb, opacity, depth, instances] = self.starts();
+        let ends = [(rgb8, 1), (rgb, 3), (opacity, 1), (depth, 1), (instances, 1)];
+        let ends = ends.into_iter().filter_map(|(start, planes)| Some(start? + planes));
+        ends.max().unwrap_or(0)
     }
 
-    /// First plane of rgb8, rgb, opacity, and depth; `None` if it is not requested.
-    fn starts(self) -> [Option<usize>; 4] {
+    /// First plane of rgb8, rgb, opacity, depth, and instances; `None` if it is not requested.
+    fn starts(self) -> [Option<usize>; 5] {
         let mut next = 0;
-        [(self.rgb8, 1), (self.rgb, 3), (self.opacity, 1), (self.depth, 1)].map(
-            |(requested, planes)| {
-                requested.then(|| {
-                    next += planes;
-                    next - planes
-                })
-            },
-        )
+        let planes = [
+            (self.rgb8, 1),
+            (self.rgb, 3),
+            (self.opacity, 1),
+            (self.depth, 1),
+            (self.instances, 1),
+        ];
+        planes.map(|(requested, planes)| {
+            requested.then(|| {
+                next += planes;
+                next - planes
+            })
+        })
     }
 }
 
@@ -119,7 +129,7 @@ impl Pixels<'_> {
     /// Copies the pixels of one view to its target.
     pub(super) fn copy_to(&self, view: &FrameView, target: &mut Target<'_>) {
         let row_pixels = (view.size_px[0] * TILE_PX) as usize;
-        let [rgb8, rgb, opacity, depth] = self.planes.starts();
+        let [rgb8, rgb, opacity, depth, instances] = self.planes.starts();
         if let (Some(to), Some(plane)) = (&mut target.rgb8, rgb8) {
             self.for_each_row(view, to.par_chunks_mut(3 * row_pixels), |to, at, tile, from| {
                 for (to, word) in to[3 * at..].chunks_exact_mut(3).zip(row(tile, plane, &from)) {
@@ -134,6 +144,13 @@ impl Pixels<'_> {
                     for (to, word) in to.zip(row(tile, plane, &from)) {
                         to[channel] = f32::from_bits(*word);
                     }
+                }
+            });
+        }
+        if let (Some(to), Some(plane)) = (&mut target.instances, instances) {
+            self.for_each_row(view, to.par_chunks_mut(row_pixels), |to, at, tile, from| {
+                for (to, word) in to[at..].iter_mut().zip(row(tile, plane, &from)) {
+                    *to = *word as u16;
                 }
             });
         }

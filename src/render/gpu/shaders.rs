@@ -47,6 +47,12 @@ const fn plain(name: &'static str) -> Variant {
     Variant { name, file: name, choices: &[] }
 }
 
+const PINHOLE: Choice = choice("PROJECTION", "pinhole");
+const UNSCENTED: Choice = choice("PROJECTION", "unscented");
+const NO_ACTORS: Choice = choice("ACTORS", "no_actors");
+const ACTORS: Choice = choice("ACTORS", "actors");
+const INSTANCES: Choice = choice("INSTANCES", "instances");
+const NO_INSTANCES: Choice = choice("INSTANCES", "no_instances");
 const BACKGROUND: Choice = choice("BACKGROUND", "background");
 const NO_BACKGROUND: Choice = choice("BACKGROUND", "no_background");
 const MAP: Choice = choice("SKY", "sky_map");
@@ -55,24 +61,32 @@ const RAY_PINHOLE: Choice = choice("RAYS", "ray_pinhole");
 const RAY_LENS: Choice = choice("RAYS", "ray_lens");
 
 const VARIANTS: &[Variant] = &[
-    variant("project", "project", &[choice("PROJECTION", "pinhole")]),
-    variant("project_unscented", "project", &[choice("PROJECTION", "unscented")]),
+    variant("project", "project", &[PINHOLE, NO_ACTORS]),
+    variant("project_unscented", "project", &[UNSCENTED, NO_ACTORS]),
+    variant("project_actors", "project", &[PINHOLE, ACTORS]),
+    variant("project_unscented_actors", "project", &[UNSCENTED, ACTORS]),
     plain("scan"),
     plain("plan"),
     plain("sort"),
     plain("bin"),
     plain("ranges"),
     plain("expand"),
-    variant("rasterize", "rasterize", &[NO_BACKGROUND]),
-    variant("rasterize_map", "rasterize", &[BACKGROUND, MAP, RAY_PINHOLE]),
-    variant("rasterize_map_lens", "rasterize", &[BACKGROUND, MAP, RAY_LENS]),
-    variant("rasterize_network", "rasterize", &[BACKGROUND, NETWORK, RAY_PINHOLE]),
-    variant("rasterize_network_lens", "rasterize", &[BACKGROUND, NETWORK, RAY_LENS]),
+    variant("rasterize", "rasterize", &[NO_INSTANCES, NO_BACKGROUND]),
+    variant("rasterize_map", "rasterize", &[NO_INSTANCES, BACKGROUND, MAP, RAY_PINHOLE]),
+    variant("rasterize_map_lens", "rasterize", &[NO_INSTANCES, BACKGROUND, MAP, RAY_LENS]),
+    variant("rasterize_network", "rasterize", &[NO_INSTANCES, BACKGROUND, NETWORK, RAY_PINHOLE]),
+    variant("rasterize_network_lens", "rasterize", &[NO_INSTANCES, BACKGROUND, NETWORK, RAY_LENS]),
+    variant("instances", "rasterize", &[INSTANCES, NO_BACKGROUND]),
+    variant("instances_map", "rasterize", &[INSTANCES, BACKGROUND, MAP, RAY_PINHOLE]),
+    variant("instances_map_lens", "rasterize", &[INSTANCES, BACKGROUND, MAP, RAY_LENS]),
+    variant("instances_network", "rasterize", &[INSTANCES, BACKGROUND, NETWORK, RAY_PINHOLE]),
+    variant("instances_network_lens", "rasterize", &[INSTANCES, BACKGROUND, NETWORK, RAY_LENS]),
     plain("roofline"),
 ];
 
 /// Name and content of the files in `shaders` and `shaders/shared`.
 const FILES: &[(&str, &str)] = &[
+    ("actors", include_str!("../../../shaders/actors.wgsl")),
     ("angle", include_str!("../../../shaders/shared/angle.wgsl")),
     ("appearance", include_str!("../../../shaders/appearance.wgsl")),
     ("background", include_str!("../../../shaders/background.wgsl")),
@@ -80,9 +94,12 @@ const FILES: &[(&str, &str)] = &[
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
     ("expansion", include_str!("../../../shaders/expansion.wgsl")),
     ("expand", include_str!("../../../shaders/expand.wgsl")),
+    ("instances", include_str!("../../../shaders/instances.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),
     ("lens", include_str!("../../../shaders/lens.wgsl")),
     ("math", include_str!("../../../shaders/shared/math.wgsl")),
+    ("no_actors", include_str!("../../../shaders/shared/no_actors.wgsl")),
+    ("no_instances", include_str!("../../../shaders/shared/no_instances.wgsl")),
     ("no_background", include_str!("../../../shaders/shared/no_background.wgsl")),
     ("pinhole", include_str!("../../../shaders/pinhole.wgsl")),
     ("plan", include_str!("../../../shaders/plan.wgsl")),

@@ -14,6 +14,8 @@ pub(super) struct Pixel {
     pub(super) transmittance: f64,
     /// Depth weighted by contribution, in metres.
     pub(super) depth_m: f64,
+    /// Whose splat brought the transmittance to a half or less; 0 if none has.
+    pub(super) instance: u16,
 }
 
 /// One row of pixels, from the left.
@@ -43,7 +45,8 @@ fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
 
 impl Pixel {
     /// Before any splat is blended.
-    pub(super) const EMPTY: Self = Self { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0 };
+    pub(super) const EMPTY: Self =
+        Self { rgb: DVec3::ZERO, transmittance: 1.0, depth_m: 0.0, instance: 0 };
 
     /// Blends the next splat, with its alpha before the cap. Returns false if the pixel stops before it.
     pub(super) fn add(&mut self, alpha: f64, splat: &Splat, profile: &RenderProfile) -> bool {
@@ -59,6 +62,9 @@ impl Pixel {
         let weight = self.transmittance * alpha;
         self.rgb += weight * splat.rgb;
         self.depth_m += weight * splat.depth_m;
+        if self.transmittance > 0.5 && after <= 0.5 {
+            self.instance = splat.instance;
+        }
         self.transmittance = after;
         true
     }

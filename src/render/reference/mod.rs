@@ -47,7 +47,11 @@ impl Backend for Reference {
             project::sort(&mut splats);
             let gaussians = match frame.profile.rays {
                 Rays::Splats => Vec::new(),
-                Rays::Exact => rays::world_gaussians(frame.scene, &splats),
+                Rays::Exact => rays::gaussians(frame.scene, &splats),
+            };
+            let views = match frame.profile.rays {
+                Rays::Splats => Vec::new(),
+                Rays::Exact => rays::relative_views(frame.scene, view),
             };
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
@@ -61,7 +65,7 @@ impl Backend for Reference {
                 .flat_map_iter(|row| {
                     let mut pixels = match frame.profile.rays {
                         Rays::Splats => blend::row(&splats, row, width, frame.profile),
-                        Rays::Exact => rays::row(&splats, &gaussians, row, view, frame.profile),
+                        Rays::Exact => rays::row(&splats, &gaussians, row, &views, frame.profile),
                     };
                     background::add(frame, view, row, &mut pixels);
                     if let Some(appearance) = appearance {
@@ -118,6 +122,9 @@ fn write(pixels: &[blend::Pixel], target: &mut Target<'_>) {
         }
         if let Some(to) = &mut target.opacity {
             to[i] = opacity as f32;
+        }
+        if let Some(to) = &mut target.instances {
+            to[i] = pixel.instance;
         }
     }
 }

@@ -6,9 +6,10 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
-use crate::View;
 use crate::layout::{Filtered, PixelFilter};
 use crate::unscented::max_center_angle_rad;
+use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE, View};
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::column;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
@@ -16,8 +17,11 @@ use wildcity_scene::{Chunk, RenderProfile, Scene, sh};
 /// A Gaussian on the image.
 #[derive(Clone, Copy, Debug)]
 pub struct Splat {
-    /// The Gaussian: index of its chunk, and index within the chunk.
+    /// The Gaussian: index of its chunk, counting through those of the twin and then through those of actors, and
+    /// index within the chunk.
     pub gaussian: [usize; 2],
+    /// Whose Gaussian it is, as in [`Target::instances`](crate::Target::instances).
+    pub instance: u16,
     /// Depth of the centre, in metres, by which splats are sorted.
     pub depth_m: f64,
     /// Centre, in pixels.
@@ -35,15 +39,36 @@ pub struct Splat {
 /// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image or beside
 /// it, in order of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
-    let chunks = scene.chunks.par_iter().enumerate();
-    chunks
-        .flat_map_iter(|(number, chunk)| {
-            let splat = move |i| {
-                Some(Splat { gaussian: [number, i], ..project_one(chunk, i, profile, view)? })
-            };
-            (0..chunk.len()).filter_map(splat)
-        })
-        .collect()
+    let twin = scene.chunks.par_iter().enumerate().flat_map_iter(|(number, chunk)| {
+        let splat = move |i| {
+            let splat = project_one(chunk, i, profile, view)?;
+            let rgb = splat.rgb * shadow_factor(scene, mean_and_axes(chunk, i).0);
+            Some(Splat { gaussian: [number, i], rgb, ..splat })
+        };
+        (0..chunk.len()).filter_map(splat)
+    });
+    let actors = scene.placed.par_iter().enumerate().flat_map_iter(|(number, placed)| {
+        let view = view.seen_from(placed);
+        let tint = DVec3::from_array(placed.tint.map(f64::from));
+        let splat = move |i| {
+            let splat = project_one(&placed.chunk, i, profile, &view)?;
+            let number = scene.chunks.len() + number;
+            let instance = FIRST_ACTOR_INSTANCE + placed.actor;
+            Some(Splat { gaussian: [number, i], instance, rgb: splat.rgb * tint, ..splat })
+        };
+        (0..placed.chunk.len()).filter_map(splat)
+    });
+    twin.chain(actors).collect()
+}
+
+/// The product of all actors' contact shadows at a point of the twin, in the world.
+fn shadow_factor(scene: &Scene, at_m: DVec3) -> f64 {
+    let factor = |placed: &PlacedChunk| {
+        let from_actor_m = at_m - placed.world_from_actor.position_m;
+        let in_actor_m = placed.world_from_actor.rotation.inverse() * from_actor_m;
+        placed.shadow.map_or(1.0, |shadow| shadow.factor(in_actor_m))
+    };
+    scene.placed.iter().map(factor).product()
 }
 
 /// Sorts by depth rounded to f32; ties keep the order of global ids. The rounding is part of the definition,
@@ -73,6 +98,7 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
     let visible = opacity >= profile.alpha_cut;
     visible.then(|| Splat {
         gaussian: [0, index],
+        instance: TWIN_INSTANCE,
         depth_m,
         mean_px,
         conic: DVec3::new(yy, -xy, xx) / det,

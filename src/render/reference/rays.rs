@@ -14,9 +14,11 @@ use crate::View;
 use crate::layout::{Filtered, PixelFilter};
 use wildcity_scene::{RenderProfile, Scene};
 
-/// A Gaussian in the world.
+/// A Gaussian in the world, or one of an actor in the actor's axes.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct WorldGaussian {
+pub(super) struct UnprojectedGaussian {
+    /// The view that sees it, as an index into those of [`relative_views`].
+    view: usize,
     mean_m: DVec3,
     /// Its axes times their standard deviations, in metres.
     axes_m: DMat3,
@@ -26,37 +28,49 @@ pub(super) struct WorldGaussian {
     opacity: f64,
 }
 
+/// A view in the world, then from the axes of each placed chunk.
+pub(super) fn relative_views(scene: &Scene, view: &View) -> Vec<View> {
+    let from_actors = scene.placed.iter().map(|placed| view.seen_from(placed));
+    std::iter::once(*view).chain(from_actors).collect()
+}
+
 /// The Gaussians of splats.
-pub(super) fn world_gaussians(scene: &Scene, splats: &[Splat]) -> Vec<WorldGaussian> {
-    let world_gaussian = |splat: &Splat| {
-        let [chunk, index] = splat.gaussian;
-        let chunk = &scene.chunks[chunk];
+pub(super) fn gaussians(scene: &Scene, splats: &[Splat]) -> Vec<UnprojectedGaussian> {
+    let gaussian = |splat: &Splat| {
+        let [number, index] = splat.gaussian;
+        let placed = number.checked_sub(scene.chunks.len());
+        let chunk = match placed {
+            None => &scene.chunks[number],
+            Some(placed) => &scene.placed[placed].chunk,
+        };
+        let view = placed.map_or(0, |placed| placed + 1);
         let (mean_m, axes_m) = mean_and_axes(chunk, index);
         let lengths_m = [axes_m.x_axis, axes_m.y_axis, axes_m.z_axis].map(DVec3::length);
         let sigma_m = lengths_m.into_iter().fold(0.0, f64::max);
         let log2_opacity = chunk.value(index, wildcity_scene::chunk::column::LOG2_OPACITY);
-        WorldGaussian { mean_m, axes_m, sigma_m, opacity: f64::from(log2_opacity).exp2() }
+        let opacity = f64::from(log2_opacity).exp2();
+        UnprojectedGaussian { view, mean_m, axes_m, sigma_m, opacity }
     };
-    splats.iter().map(world_gaussian).collect()
+    splats.iter().map(gaussian).collect()
 }
 
 /// One row of pixels, from the left. Splats, in order of depth, give colours and depths, and `gaussians` the
-/// shapes.
+/// shapes. `views` are those of [`relative_views`].
 pub(super) fn row(
     splats: &[Splat],
-    gaussians: &[WorldGaussian],
+    gaussians: &[UnprojectedGaussian],
     row: u32,
-    view: &View,
+    views: &[View],
     profile: &RenderProfile,
 ) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
     let pixel = |column: u32| {
         let mut pixel = Pixel::EMPTY;
         let at_px = DVec2::new(f64::from(column) + 0.5, y_px);
-        let Some(ray) = Ray::of(view, at_px, profile) else {
-            return pixel;
-        };
+        let rays: Vec<Option<Ray>> =
+            views.iter().map(|view| Ray::of(view, at_px, profile)).collect();
         for (splat, gaussian) in splats.iter().zip(gaussians) {
+            let Some(ray) = &rays[gaussian.view] else { continue };
             let alpha = ray.alpha(gaussian, profile);
             if alpha > 0.0 && !pixel.add(alpha, splat, profile) {
                 break;
@@ -64,7 +78,7 @@ pub(super) fn row(
         }
         pixel
     };
-    (0..view.camera.width_px).map(pixel).collect()
+    (0..views[0].camera.width_px).map(pixel).collect()
 }
 
 /// The ray of a pixel, and how the pixels around it depend on direction.
@@ -114,7 +128,7 @@ impl Ray {
     }
 
     /// Alpha before the cap; 0 where it surely is below the cut, or the closest point lies behind the camera.
-    fn alpha(&self, gaussian: &WorldGaussian, profile: &RenderProfile) -> f64 {
+    fn alpha(&self, gaussian: &UnprojectedGaussian, profile: &RenderProfile) -> f64 {
         let to_mean_m = gaussian.mean_m - self.origin_m;
         let along_m = to_mean_m.dot(self.direction);
         // Skip a Gaussian that is far off the ray whatever its shape: the blur, in metres, is widest at its

@@ -19,7 +19,7 @@ pub struct RoundTrip {
 
 /// Encodes every chunk of a scene in parts and decodes them again.
 pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
-    let empty = Scene { chunks: Vec::new(), sky: scene.sky.clone() };
+    let empty = Scene { chunks: Vec::new(), ..scene.clone() };
     let mut all = RoundTrip { scene: empty, coded_bytes: 0, clamped: 0 };
     for chunk in &scene.chunks {
         let mut lanes = vec![Lanes([0.0; LANES]); chunk.len().div_ceil(LANES) * width(chunk)];

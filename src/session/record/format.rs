@@ -7,9 +7,12 @@
 //! {"kind":"version", ...}  the following frames are rendered from another version of the twin
 //! {"kind":"end", ...}      how the episode went; missing if the server was killed
 //! ```
+//!
+//! A scenario adds the lines of [`wildcity_episode`]: `scenario`, `actors`, `event` and `result`.
 
 use serde::{Deserialize, Serialize};
 
+use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{RenderProfile, Rig};
 use wildcity_sim::ego::{Action, TimedPose};
@@ -150,6 +153,14 @@ pub(crate) enum Line {
     Frame(FrameRecord),
     /// Between two frames.
     Version(RecordedVersion),
+    /// After the header.
+    Scenario(Box<ScenarioLine>),
+    /// Before the frame of a step.
+    Actors(ActorsLine),
+    /// What happened in a step.
+    Event(EventLine),
+    /// Verdict and scores, before the end.
+    Result(EpisodeResult),
     /// The last line.
     End(EpisodeSummary),
 }

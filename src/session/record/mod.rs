@@ -11,3 +11,4 @@ pub(crate) mod recorded_episode;
 pub(crate) mod recorder;
 pub(crate) mod replay;
 pub(crate) mod replay_report;
+mod values;

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
+use wildcity_episode::{ActorsLine, ScenarioLine};
 use wildcity_scene::appearance::Overlay;
 
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
@@ -25,6 +26,14 @@ pub struct RecordedEpisode {
     pub frames: Vec<FrameRecord>,
     /// Versions that the session switched to, each with the number of frames before it.
     pub versions: Vec<(usize, RecordedVersion)>,
+    /// The scenario, if there was one.
+    pub scenario: Option<Box<ScenarioLine>>,
+    /// The actors, each with the number of frames before it: those of the next frame.
+    pub actors: Vec<(usize, ActorsLine)>,
+    /// Lines of the file, from 1, at which the frames are.
+    pub frame_lines: Vec<usize>,
+    /// Line of the file, from 1, at which the end is; 0 without one.
+    pub end_line: usize,
     /// How it went; absent if the server was killed or is still running.
     pub end: Option<EpisodeSummary>,
 }
@@ -40,6 +49,10 @@ impl RecordedEpisode {
         let mut header: Option<EpisodeHeader> = None;
         let mut frames = Vec::new();
         let mut versions = Vec::new();
+        let mut scenario = None;
+        let mut actors = Vec::new();
+        let mut frame_lines = Vec::new();
+        let mut end_line = 0;
         let mut end = None;
         for number in 1.. {
             let wrong =
@@ -77,18 +90,26 @@ impl RecordedEpisode {
                     let cameras = header.as_ref().map_or(0, |header| header.rig.cameras.len());
                     check_images(&frame, cameras).map_err(wrong)?;
                     frames.push(frame);
+                    frame_lines.push(number);
                 }
+                Line::Scenario(line) if number > 1 => scenario = Some(line),
+                Line::Actors(line) if number > 1 => actors.push((frames.len(), line)),
+                Line::Event(_) | Line::Result(_) if number > 1 => {}
                 Line::Version(version) if number > 1 => versions.push((frames.len(), version)),
-                Line::End(summary) if number > 1 => end = Some(summary),
+                Line::End(summary) if number > 1 => {
+                    end = Some(summary);
+                    end_line = number;
+                }
                 Line::Episode(_) => return Err(wrong("a second header".to_owned())),
-                Line::Frame(_) | Line::Version(_) | Line::End(_) => {
+                _ => {
                     return Err(wrong("the episode's header is missing".to_owned()));
                 }
             }
         }
         let empty =
             || ReplayError::Line { path: path.to_owned(), line: 1, reason: "empty".to_owned() };
-        Ok(Self { header: header.ok_or_else(empty)?, frames, versions, end })
+        let header = header.ok_or_else(empty)?;
+        Ok(Self { header, frames, versions, scenario, actors, frame_lines, end_line, end })
     }
 }
 

@@ -14,6 +14,7 @@ use super::recorded_episode::RecordedEpisode;
 use super::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
+use super::values;
 use crate::viewpoint::viewpoints;
 
 /// Opens a version of the episode's twin, by its number.
@@ -44,12 +45,17 @@ impl RecordedEpisode {
             }
             replay.drive(frame, index)?;
             if until == ReplayUntil::FirstDifference && replay.report.diverged.is_some() {
-                break;
+                return Ok(replay.report);
             }
+            replay.check_values(frame, index);
             replay.render(frame, index, until, visit)?;
             if until == ReplayUntil::FirstDifference && replay.report.difference.is_some() {
-                break;
+                return Ok(replay.report);
             }
+        }
+        if let Some(end) = &self.end {
+            let wrong = values::wrong_in_end(end, replay.ego.episode(), self.end_line);
+            replay.report.wrong_value = replay.report.wrong_value.or(wrong);
         }
         Ok(replay.report)
     }
@@ -62,9 +68,8 @@ struct Replay<'a> {
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
     ego: EgoReplay,
-    /// Lines of the file that are no frames, up to the current frame, counted from 1: the header and the
-    /// switches of version. So the current frame's line is its index plus this.
-    first_line: usize,
+    /// Lines of the file, from 1, at which the frames are.
+    frame_lines: &'a [usize],
     /// The RGB buffer of each camera.
     pixels: Vec<Vec<u8>>,
     report: ReplayReport,
@@ -98,16 +103,21 @@ impl<'a> Replay<'a> {
             resident,
             profile: &header.profile,
             ego: EgoReplay::new(header),
-            first_line: 2,
+            frame_lines: &episode.frame_lines,
             pixels: cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect(),
-            report: ReplayReport { images: 0, changes, diverged: None, difference: None },
+            report: ReplayReport {
+                images: 0,
+                changes,
+                diverged: None,
+                difference: None,
+                wrong_value: None,
+            },
         }
     }
 
     fn switch_version(&mut self, resident: Arc<Resident>, to: &'a RecordedVersion) {
         self.resident = resident;
         self.profile = &to.profile;
-        self.first_line += 1;
         let recorded = RecordedHashes { version: &to.version_hash, profile: &to.profile_hash };
         let changes = &mut self.report.changes;
         add_scene_changes(changes, &recorded, &self.resident, self.profile);
@@ -118,12 +128,21 @@ impl<'a> Replay<'a> {
         let ground = Ground::from_drives(&self.resident.version.manifest.trajectories);
         let diverged = self
             .ego
-            .drive(frame, index + self.first_line, &ground)
+            .drive(frame, self.frame_lines[index], &ground)
             .map_err(|cause| ReplayError::Ego { step: frame.step, cause: Box::new(cause) })?;
         if self.report.diverged.is_none() {
             self.report.diverged = diverged;
         }
         Ok(())
+    }
+
+    /// Compares what a frame says beside poses and images.
+    fn check_values(&mut self, frame: &FrameRecord, index: usize) {
+        let line = self.frame_lines[index];
+        let wrong = values::wrong_in_frame(frame, self.ego.episode(), self.cameras.len(), line);
+        if self.report.wrong_value.is_none() {
+            self.report.wrong_value = wrong;
+        }
     }
 
     /// Renders the poses of a frame, shows each image to `visit` and compares it.
@@ -158,7 +177,7 @@ impl<'a> Replay<'a> {
                 let now = blake3::hash(image.rgb8).to_hex().to_string();
                 if now != *recorded && self.report.difference.is_none() {
                     self.report.difference = Some(ImageDifference {
-                        line: index + self.first_line,
+                        line: self.frame_lines[index],
                         request: frame.request,
                         step: frame.step,
                         pose,

@@ -22,6 +22,21 @@ pub struct ReplayReport {
     pub diverged: Option<DivergedStep>,
     /// The first image that differs.
     pub difference: Option<ImageDifference>,
+    /// The first other value of the record that does not follow from the rest of it.
+    pub wrong_value: Option<WrongValue>,
+}
+
+/// A value of the record, beside poses and images, that is not what the replay computes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct WrongValue {
+    /// Line of the episode's file, from 1.
+    pub line: usize,
+    /// The field: `step`, `time_us`, `frame_hash`, or one of the end: `outcome`, `steps`, `distance_m` ..
+    pub field: &'static str,
+    /// As recorded.
+    pub recorded: String,
+    /// As computed now.
+    pub now: String,
 }
 
 /// Where a replay stops.
@@ -151,5 +166,12 @@ impl std::fmt::Display for ImageDifference {
             write!(f, ", pose {pose} of observe")?;
         }
         write!(f, " (line {line}): recorded {recorded}, now {now}")
+    }
+}
+
+impl std::fmt::Display for WrongValue {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { line, field, recorded, now } = self;
+        write!(f, "{field} (line {line}): recorded {recorded}, now {now}")
     }
 }

@@ -8,6 +8,7 @@ use zip::result::ZipError;
 use crate::limits;
 use wildcity_scene::Gaussians;
 
+use super::objects::TrackedObject;
 use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
@@ -32,6 +33,14 @@ pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
     let folder = name.rfind('/').map_or("", |slash| &name[..=slash]).to_owned();
     let json = archive.read(&name, limits::SCENE_JSON_BYTES)?;
     sog::read(&json, &folder, &mut archive)
+}
+
+/// Reads the tracked objects of a NuRec archive; none of another one.
+pub(super) fn read_tracked(bytes: Vec<u8>) -> Result<Vec<TrackedObject>, IngestError> {
+    let mut archive = Archive::open(bytes)?;
+    let Some(name) = archive.find(|name| name.ends_with(".nurec")) else { return Ok(Vec::new()) };
+    let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
+    nurec::read_tracked(&payload, archive.budget())
 }
 
 /// An archive in memory.

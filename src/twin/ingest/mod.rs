@@ -20,6 +20,7 @@ mod gltf;
 mod hash_reader;
 mod ksplat;
 mod nurec;
+mod objects;
 mod ply;
 mod progress;
 mod safetensors;
@@ -28,6 +29,7 @@ pub mod sky;
 mod sog;
 mod splat;
 mod spz;
+mod tracked;
 mod unpack_budget;
 
 use std::fs::File;
@@ -40,7 +42,9 @@ use wildcity_scene::Gaussians;
 pub use axes::Axes;
 pub use error::IngestError;
 pub use file::{FileError, read_whole};
+pub use objects::TrackedObject;
 pub use progress::Progress;
+pub use tracked::read_tracked;
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use error::check_count;
@@ -71,11 +75,28 @@ pub fn read_hashed(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Gaussians, String), IngestError> {
+    read_with(path, limits::MESH_GAUSSIANS, progress)
+}
+
+/// As [`read_hashed`], with about `mesh_gaussians` Gaussians for the triangles of a mesh; triangles smaller than one
+/// Gaussian's share add more. Scenes of Gaussians keep theirs.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_with(
+    path: &Path,
+    mesh_gaussians: u32,
+    progress: Progress<'_>,
+) -> Result<(Gaussians, String), IngestError> {
     let (file, file_bytes) = file::open(path)?;
     let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file));
     let gaussians = match Format::of(input.fill_buf()?)? {
-        Format::Json => return read_parts(path, input, progress, MultiFileFormat::Json),
-        Format::Glb => return read_parts(path, input, progress, MultiFileFormat::Glb),
+        Format::Json => {
+            return read_parts(path, input, progress, MultiFileFormat::Json, mesh_gaussians);
+        }
+        Format::Glb => {
+            return read_parts(path, input, progress, MultiFileFormat::Glb, mesh_gaussians);
+        }
         Format::Ply => ply::read(&mut input, file_bytes, progress)?,
         Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
         Format::Spz => {
@@ -111,6 +132,7 @@ fn read_parts(
     mut input: BufReader<HashReader<File>>,
     progress: Progress<'_>,
     format: MultiFileFormat,
+    mesh_gaussians: u32,
 ) -> Result<(Gaussians, String), IngestError> {
     let limit_bytes = match format {
         MultiFileFormat::Json => limits::SCENE_JSON_BYTES,
@@ -118,6 +140,7 @@ fn read_parts(
     };
     let first = file::read_at_most(&mut input, limit_bytes)?;
     let mut folder = Folder::new(path, first.len() as u64, input.into_inner().finish(), progress);
+    folder = folder.with_mesh_gaussians(mesh_gaussians);
     let gaussians = match format {
         MultiFileFormat::Glb => gltf::read_glb(&first, &mut folder)?,
         MultiFileFormat::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut folder)?,

@@ -54,6 +54,35 @@ pub(super) fn read(
     Ok(gaussians)
 }
 
+/// Reads Gaussians with the number of the object that each belongs to: the tensor `point_ids`, [N] or [N,1], I32 or
+/// I64.
+pub(super) fn read_tracked(
+    input: &mut impl Read,
+    file_bytes: u64,
+    progress: Progress<'_>,
+) -> Result<(Gaussians, Vec<i64>), IngestError> {
+    // Tensors may be in any order, so the whole file is held, as that of a scene in parts.
+    let mut bytes = Vec::new();
+    input.take(limits::SCENE_PART_BYTES).read_to_end(&mut bytes)?;
+    let gaussians = read(&bytes[..], file_bytes, progress)?;
+    let (metadata, body_start) = read_metadata(&mut &bytes[..], file_bytes)?;
+    let place = "tensor point_ids";
+    let info = metadata.info("point_ids").ok_or_else(|| bad(place, "is missing".into()))?;
+    let (start, end) = info.data_offsets;
+    let body = bytes.get(body_start as usize + start..body_start as usize + end);
+    let body = body.ok_or_else(|| bad(place, "reaches beyond the file".into()))?;
+    let ids: Vec<i64> = match info.dtype {
+        Dtype::I32 => body.as_chunks().0.iter().map(|id| i32::from_le_bytes(*id).into()).collect(),
+        Dtype::I64 => body.as_chunks().0.iter().map(|id| i64::from_le_bytes(*id)).collect(),
+        other => return Err(bad(place, format!("is {other:?}; I32 or I64 is read"))),
+    };
+    if ids.len() != gaussians.len() {
+        let reason = format!("has {} numbers for {} Gaussians", ids.len(), gaussians.len());
+        return Err(bad(place, reason));
+    }
+    Ok((gaussians, ids))
+}
+
 /// Reads the header and checks it against the size of the file. Offsets and shapes were checked
 /// against each other by the crate.
 fn read_metadata(input: &mut impl Read, file_bytes: u64) -> Result<(Metadata, u64), IngestError> {

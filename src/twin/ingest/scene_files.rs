@@ -17,6 +17,11 @@ pub(super) trait SceneFiles {
 
     /// How much the scene may unpack.
     fn budget(&mut self) -> &mut UnpackBudget;
+
+    /// Number of Gaussians that cover the triangles of a mesh.
+    fn mesh_gaussians(&self) -> u32 {
+        limits::MESH_GAUSSIANS
+    }
 }
 
 /// The folder of the file given first.
@@ -27,6 +32,7 @@ pub(super) struct Folder<'a> {
     read_bytes: u64,
     progress: Progress<'a>,
     budget: UnpackBudget,
+    mesh_gaussians: u32,
 }
 
 impl<'a> Folder<'a> {
@@ -39,9 +45,15 @@ impl<'a> Folder<'a> {
             read_bytes: 0,
             progress,
             budget: UnpackBudget::default(),
+            mesh_gaussians: limits::MESH_GAUSSIANS,
         };
         folder.add(bytes);
         folder
+    }
+
+    /// The same with another number of Gaussians for meshes.
+    pub(super) fn with_mesh_gaussians(self, mesh_gaussians: u32) -> Self {
+        Self { mesh_gaussians, ..self }
     }
 
     /// The hash of one file, or the hash of the hashes of several.
@@ -82,5 +94,9 @@ impl SceneFiles for Folder<'_> {
 
     fn budget(&mut self) -> &mut UnpackBudget {
         &mut self.budget
+    }
+
+    fn mesh_gaussians(&self) -> u32 {
+        self.mesh_gaussians
     }
 }

@@ -14,6 +14,7 @@ use parking_lot::{Condvar, Mutex};
 use crate::limits;
 use crate::store::Version;
 use wildcity_scene::Scene;
+use wildcity_scene::actor::PlacedChunk;
 
 use super::demand::SectionRef;
 use super::load_times::LoadTimes;
@@ -198,6 +199,13 @@ impl std::ops::Deref for PinnedScene {
 
     fn deref(&self) -> &Scene {
         &self.scene
+    }
+}
+
+impl PinnedScene {
+    /// Draws these actors, too, in place of those given before.
+    pub fn place(&mut self, placed: Vec<PlacedChunk>) {
+        self.scene.placed = placed;
     }
 }
 

@@ -383,7 +383,11 @@ impl<C> Requests<C> {
     ) -> (C, Result<CompleteFrame, ResidencyError>) {
         let chunks = requested.ids.iter().filter_map(|&id| self.table.get(id).cloned());
         let complete = CompleteFrame {
-            scene: Scene { chunks: chunks.collect(), sky: requested.sky.clone() },
+            scene: Scene {
+                chunks: chunks.collect(),
+                placed: Vec::new(),
+                sky: requested.sky.clone(),
+            },
             waited_for: frame.waited_for,
             waited: match frame.waited_for {
                 0 => Duration::ZERO,

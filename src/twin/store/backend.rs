@@ -135,6 +135,9 @@ pub(super) trait Staging: Debug + Send {
         record: &[u8],
     ) -> Result<(), StoreError>;
 
+    /// Makes objects visible that no log record names: assets. The caller has called [`Staging::lock_publishing`].
+    fn place_objects(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError>;
+
     /// Replaces objects of an existing version, which repairs damaged and missing ones, and syncs its
     /// record to the disk. The caller has called [`Staging::lock_publishing`].
     fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError>;

@@ -51,6 +51,13 @@ pub(super) struct PackedSection {
     bounds: Bounds,
 }
 
+impl PackedSection {
+    /// Its bytes in the object.
+    pub(super) fn into_bytes(self) -> Vec<u8> {
+        self.bytes
+    }
+}
+
 /// What every section of a chunk object shares.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ChunkHeader {

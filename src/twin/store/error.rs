@@ -91,6 +91,36 @@ pub enum StoreError {
         /// The format that can be read.
         supported: u32,
     },
+    /// No asset of an actor has this name or hash, or several have it.
+    #[error(
+        "{} actor of name or hash {text:?} in {}; {}",
+        if *found == 0 { "there is no" } else { "there is more than one" },
+        dir.display(),
+        known_actors(known)
+    )]
+    NoActor {
+        /// The requested name or hash.
+        text: String,
+        /// The directory or URL of twins.
+        dir: PathBuf,
+        /// How many have it.
+        found: usize,
+        /// Those that have it, or else all that exist.
+        known: Vec<String>,
+    },
+    /// A box contains no Gaussian of the twin, or all of a cell's.
+    #[error(
+        "{}",
+        match cell {
+            None => "no Gaussian lies in the box, from 5 cm above its bottom on: check its place with `wildcity \
+                     inspect`".to_owned(),
+            Some([x, y]) => format!("no Gaussian would stay in cell ({x}, {y}): choose a smaller box"),
+        }
+    )]
+    NothingToCut {
+        /// Grid cell (x, y) of which none would stay.
+        cell: Option<[i32; 2]>,
+    },
     /// Another commit took the same number first.
     #[error("version {number} of twin {name:?} was committed by another import; try again")]
     Conflict {
@@ -251,6 +281,13 @@ impl StoreError {
 fn known_twins(known: &[String]) -> String {
     match known {
         [] => "it holds none".to_owned(),
+        names => format!("it holds {}", names.join(", ")),
+    }
+}
+
+fn known_actors(known: &[String]) -> String {
+    match known {
+        [] => "make one with `wildcity actor import`".to_owned(),
         names => format!("it holds {}", names.join(", ")),
     }
 }

@@ -7,6 +7,9 @@ use crate::limits;
 
 use super::StoreError;
 
+/// The folder of assets of actors, in place of a twin's name; no twin can have it.
+pub(super) const ACTORS: &str = ".actors";
+
 /// Path of a log record below the root. The number has ten digits, so that names sort as numbers
 /// do.
 pub(super) fn record_key(name: &str, number: u64) -> String {

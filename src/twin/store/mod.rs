@@ -7,6 +7,7 @@
 //! <twins>/<name>/gc/candidates          objects that no kept version needs, and since when
 //! <twins>/<name>/gc/collected           versions that were removed
 //!
+//! <twins>/.actors/objects/3f/3f9c...     assets of actors, which all twins share
 //! <twins>/.staging/<name>@<commit>/     objects of a commit in preparation, invisible to readers
 //! <twins>/.staging/<name>@<commit>/lock locked by the commit's process as long as the process lives
 //! <twins>/.staging/<name>.lock          locked while a version is published
@@ -45,10 +46,12 @@
 //! **The disk cache compares every part with its hash on every read**, which takes less time than
 //! decoding it. So the cache needs neither fsync nor recovery, and a damaged part is fetched again.
 
+mod actors;
 mod backend;
 mod catalog;
 mod chunk_file;
 mod commit;
+mod cut;
 mod diff;
 mod error;
 mod fsck;
@@ -64,8 +67,10 @@ mod remote;
 mod settings;
 mod sky;
 
+pub use actors::{StoredActor, StoredLevel};
 pub use catalog::{Catalog, DiskCacheSettings, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
+pub use cut::{CUT_ABOVE_M, Cut};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
 pub use fsck::{DamagedObject, FsckReport, VerifyReport};

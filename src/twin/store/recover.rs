@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::io::{self, ErrorKind};
 
+use super::layout::ACTORS;
 use super::{Catalog, StoreError};
 
 impl Catalog {
@@ -13,8 +14,12 @@ impl Catalog {
     pub(super) fn remove_abandoned_commits(&self) -> Result<(), StoreError> {
         for name in self.objects.unfinished_commits()? {
             // If a version is damaged, it is unknown which objects it named, so every object is
-            // kept.
-            match self.objects.remove_abandoned(&name, &|| self.named_by_all(&name).ok()) {
+            // kept. No version names assets, and all of them are kept.
+            let named = || match &*name {
+                ACTORS => None,
+                name => self.named_by_all(name).ok(),
+            };
+            match self.objects.remove_abandoned(&name, &named) {
                 Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
                 removed => removed?,
             }

@@ -2,9 +2,11 @@
 
     python -m wildcity.convert ckpt_29999.pt street.safetensors
     python -m wildcity.convert checkpoint_final.pth street.safetensors --model Background
+    python -m wildcity.convert checkpoint_final.pth cars.safetensors --model RigidNodes
 
 A checkpoint's sky network is written to the same file: `wildcity import street.safetensors --sky
-street.safetensors` reads both. Supported are the checkpoints of gsplat (`splats`), drivestudio (`models`, of which
+street.safetensors` reads both. The last of these commands writes the moving objects, with the number of the object
+that each Gaussian belongs to: `wildcity actor import cars.safetensors --tracked` makes an asset of each. Supported are the checkpoints of gsplat (`splats`), drivestudio (`models`, of which
 one is converted), nerfstudio's splatfacto and INRIA (a tuple). Conversion needs numpy but not PyTorch, and runs no
 code from the file.
 """
@@ -34,6 +36,7 @@ _FIELD_NAMES = {
     "opacities": ("opacities", "opacity"),
     "sh0": ("sh0", "features_dc"),
     "shN": ("shN", "features_rest"),
+    "point_ids": ("point_ids", "points_ids"),
 }
 """gsplat's names of the fields, and all names of the same field in other checkpoints."""
 
@@ -60,7 +63,7 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
     """The Gaussians of a checkpoint, with gsplat's names and shapes.
 
     means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (natural logarithm), opacities [N] (logit), sh0 [N,1,3],
-    shN [N,K,3]. Raises `CheckpointError` if there is no such model, or several and `model` is None.
+    shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian. Raises `CheckpointError` if there is no such model, or several and `model` is None.
     """
     found = models(source)
     if model is None:
@@ -132,7 +135,7 @@ def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _A
         elif isinstance(key, str):
             yield from _candidates(item, key, depth + 1)
     for prefix, arrays in groups.items():
-        if _FIELD_NAMES.keys() - {"shN"} <= arrays.keys():
+        if _FIELD_NAMES.keys() - {"shN", "point_ids"} <= arrays.keys():
             yield ".".join(part for part in (name, prefix) if part), arrays
 
 
@@ -160,6 +163,11 @@ def _shaped(arrays: _Arrays) -> _Arrays:
         shaped[name] = values.reshape(shape).astype("<f8" if is_double else "<f4")
     if shaped["shN"].shape[1] == 0:
         del shaped["shN"]
+    ids = arrays.get("point_ids")
+    if ids is not None:
+        if ids.size != n or not np.issubdtype(ids.dtype, np.integer):
+            raise CheckpointError(f"point_ids is {ids.dtype} {ids.shape}, not {n} whole numbers")
+        shaped["point_ids"] = ids.reshape(n).astype("<i8")
     return shaped
 
 
@@ -168,7 +176,7 @@ def _write_safetensors(target: str | PathLike[str], tensors: _Arrays) -> None:
     offset = 0
     for name, values in tensors.items():
         header[name] = {
-            "dtype": f"F{8 * values.itemsize}",
+            "dtype": f"{'I' if values.dtype.kind == 'i' else 'F'}{8 * values.itemsize}",
             "shape": list(values.shape),
             "data_offsets": [offset, offset + values.nbytes],
         }

@@ -134,6 +134,15 @@ impl LensProjection {
         Some(Self { shutter, windshield, center_px, model })
     }
 
+    /// The same camera in other motion; `None` as for [`LensProjection::new`].
+    pub(super) fn moved(&self, view: &View) -> Option<Self> {
+        let shutter = match view.shutter_motion() {
+            None => None,
+            Some(motion) => Some(SimdShutter::new(&motion)?),
+        };
+        Some(Self { shutter, ..self.clone() })
+    }
+
     /// Projects points of the camera's frame at the end of the exposure.
     ///
     /// With a rolling shutter the image row decides when a point is exposed, that decides where the camera

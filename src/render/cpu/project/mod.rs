@@ -21,6 +21,7 @@
 
 mod axes;
 mod color;
+mod light;
 mod pinhole;
 mod splat_block;
 mod unscented;
@@ -31,11 +32,13 @@ use fearless_simd::{Level, dispatch, prelude::*};
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
+use self::light::Light;
 use self::unscented::UnscentedChunkView;
 use super::lens::LensProjection;
-use crate::Frame;
-use crate::layout::{ChunkView, Cutoffs, Frustum, Splat};
+use crate::actor_views::ActorViews;
+use crate::layout::{ChunkShadow, ChunkView, Cutoffs, Frustum, Splat};
 use crate::unscented::UnscentedView;
+use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::{CLUSTER, Cluster, LANES};
 
@@ -69,6 +72,8 @@ pub(super) struct Unit {
     pub(super) len: usize,
     /// Index of its first page.
     first_page: usize,
+    /// Whose splats they are, as in [`Target::instances`](crate::Target::instances).
+    pub(super) instance: u16,
 }
 
 /// A view that is not a static pinhole.
@@ -84,6 +89,17 @@ struct Job<'a> {
     chunk: &'a Chunk,
     clusters: Range<usize>,
     projection: ChunkProjection<'a>,
+    light: Light<'a>,
+    /// As of [`Unit`].
+    instance: u16,
+}
+
+/// What the jobs of one chunk in one view share.
+#[derive(Clone, Copy)]
+struct JobOwner<'a> {
+    view: usize,
+    light: Light<'a>,
+    instance: u16,
 }
 
 /// How one view projects the Gaussians of one chunk.
@@ -102,10 +118,18 @@ impl Projected {
         let Self { pages, units, free } = self;
         free.get_mut().append(pages);
 
-        // Prepare what is the same for all chunks of a view, then one job per visible unit.
+        // Prepare what is the same for all chunks of a view or of an actor, then one job per visible unit.
         let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
             frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
-        let jobs = jobs(frame, &non_pinhole);
+        let actor_views = ActorViews::new(frame);
+        let from_actors = non_pinhole_from_actors(frame, &actor_views, &non_pinhole);
+        let shadows = ChunkShadow::by_chunk(frame.scene);
+        let mut jobs = Vec::new();
+        for (index, non_pinhole) in non_pinhole.iter().enumerate() {
+            add_twin(index, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
+            let from_actors = from_actors.get(index).map_or(&[][..], Vec::as_slice);
+            add_actors(index, frame, actor_views.of(index), from_actors, &mut jobs);
+        }
 
         // In parallel: each job fills pages of its own.
         let filled: Vec<(usize, Vec<Page>)> = jobs
@@ -120,7 +144,8 @@ impl Projected {
         // In the order of the jobs: list the pages.
         units.clear();
         for (job, (len, mut filled)) in jobs.iter().zip(filled) {
-            units.push(Unit { view: job.view, len, first_page: pages.len() });
+            let Job { view, instance, .. } = *job;
+            units.push(Unit { view, len, first_page: pages.len(), instance });
             pages.append(&mut filled);
         }
     }
@@ -147,6 +172,13 @@ impl Projected {
         (first..).zip(pages.iter().flat_map(|page| page.iter()).take(unit.len))
     }
 
+    /// Whose splat is at a place, as in [`Target::instances`](crate::Target::instances).
+    pub(super) fn instance(&self, place: u32) -> u16 {
+        let page = (place >> PAGE_BITS) as usize;
+        let after = self.units.partition_point(|unit| unit.first_page <= page);
+        self.units[after - 1].instance
+    }
+
     /// The splat at a place: the high bits are the page, the low 8 bits the splat of the page.
     #[inline(always)]
     pub(super) fn splat(&self, place: u32) -> &Splat {
@@ -156,13 +188,41 @@ impl Projected {
 
 impl<'a> NonPinholeView<'a> {
     /// `None` for a static pinhole.
-    fn new(view: &'a crate::View, frame: &Frame<'_>) -> Option<Self> {
+    fn new(view: &'a View, frame: &Frame<'_>) -> Option<Self> {
         let unscented = UnscentedView::new(view, frame.profile)?;
         Some(Self { unscented, lens: LensProjection::new(view) })
     }
+
+    /// The same camera elsewhere, or in other motion.
+    fn moved<'b>(&self, view: &'b View) -> NonPinholeView<'b> {
+        let lens = self.lens.as_ref().and_then(|lens| lens.moved(view));
+        NonPinholeView { unscented: self.unscented.moved(view), lens }
+    }
 }
 
-impl ChunkProjection<'_> {
+impl<'a> ChunkProjection<'a> {
+    /// How a view projects a chunk. Both are in the same axes: the world's, or those of an actor.
+    fn new(
+        view: &View,
+        chunk: &Chunk,
+        non_pinhole: Option<&'a NonPinholeView<'a>>,
+        frame: &Frame<'_>,
+    ) -> Self {
+        match non_pinhole {
+            Some(NonPinholeView { unscented, lens }) => Self::Unscented(UnscentedChunkView::new(
+                view,
+                chunk,
+                frame.profile,
+                unscented,
+                lens.as_ref(),
+            )),
+            None => Self::Pinhole {
+                chunk_view: ChunkView::new(view, chunk, frame.profile),
+                frustum: Frustum::new(view, chunk, frame.profile),
+            },
+        }
+    }
+
     /// Whether a Gaussian of the cluster can touch the image; `true` when in doubt.
     #[inline(always)]
     fn may_see(&self, chunk: &Chunk, cluster: &Cluster) -> bool {
@@ -189,30 +249,77 @@ fn copy_to_pages(splats: &[Splat], free: &Mutex<Vec<Page>>) -> Vec<Page> {
     pages
 }
 
-/// All jobs of a frame, in order of (view, global id). A unit that a view cannot see has no job; it costs one
-/// visibility test per cluster.
-fn jobs<'a>(frame: &Frame<'a>, non_pinhole: &'a [Option<NonPinholeView<'a>>]) -> Vec<Job<'a>> {
-    let mut jobs = Vec::new();
-    for (index, (view, non_pinhole)) in frame.views.iter().zip(non_pinhole).enumerate() {
-        for chunk in &frame.scene.chunks {
-            let projection = match non_pinhole {
-                Some(NonPinholeView { unscented, lens }) => ChunkProjection::Unscented(
-                    UnscentedChunkView::new(view, chunk, frame.profile, unscented, lens.as_ref()),
-                ),
-                None => ChunkProjection::Pinhole {
-                    chunk_view: ChunkView::new(view, chunk, frame.profile),
-                    frustum: Frustum::new(view, chunk, frame.profile),
-                },
-            };
-            add_jobs(index, projection, chunk, &mut jobs);
+/// The views from actors' axes that are no static pinholes. What depends on the lens is taken from `own`, the frame's
+/// own views.
+fn non_pinhole_from_actors<'a>(
+    frame: &Frame<'_>,
+    actor_views: &'a ActorViews,
+    own: &[Option<NonPinholeView<'_>>],
+) -> Vec<Vec<Option<NonPinholeView<'a>>>> {
+    let of_view = |(relative, own): (&'a [View], &Option<NonPinholeView<'_>>)| {
+        // A static pinhole has no lens yet, and sees actors in motion through its rolling shutter.
+        let mut first: Option<NonPinholeView<'a>> = None;
+        let mut views = Vec::with_capacity(relative.len());
+        for view in relative {
+            views.push(match (own, &first) {
+                _ if view.is_static_pinhole() => None,
+                (Some(own), _) => Some(own.moved(view)),
+                (None, Some(first)) => Some(first.moved(view)),
+                (None, None) => {
+                    first = NonPinholeView::new(view, frame);
+                    first.as_ref().map(|first| first.moved(view))
+                }
+            });
         }
+        views
+    };
+    actor_views.all().zip(own).map(of_view).collect()
+}
+
+/// Adds the jobs of one view and the twin, in order of global ids. A unit that a view cannot see has no job; it costs
+/// one visibility test per cluster.
+fn add_twin<'a>(
+    index: usize,
+    frame: &Frame<'a>,
+    non_pinhole: Option<&'a NonPinholeView<'a>>,
+    shadows: &'a [Vec<ChunkShadow>],
+    jobs: &mut Vec<Job<'a>>,
+) {
+    for (number, chunk) in frame.scene.chunks.iter().enumerate() {
+        let projection = ChunkProjection::new(&frame.views[index], chunk, non_pinhole, frame);
+        let light = match shadows.get(number).map_or(&[][..], Vec::as_slice) {
+            [] => Light::AsStored,
+            shadows => Light::Shadowed(shadows),
+        };
+        let owner = JobOwner { view: index, light, instance: TWIN_INSTANCE };
+        add_jobs(owner, projection, chunk, jobs);
     }
-    jobs
+}
+
+/// Adds the jobs of one view and all actors, in order of global ids. `relative` are the view from the axes of each
+/// actor.
+fn add_actors<'a>(
+    index: usize,
+    frame: &Frame<'a>,
+    relative: &[View],
+    non_pinhole: &'a [Option<NonPinholeView<'a>>],
+    jobs: &mut Vec<Job<'a>>,
+) {
+    for ((placed, view), non_pinhole) in frame.scene.placed.iter().zip(relative).zip(non_pinhole) {
+        let projection = ChunkProjection::new(view, &placed.chunk, non_pinhole.as_ref(), frame);
+        let light = match placed.tint {
+            [1.0, 1.0, 1.0] => Light::AsStored,
+            tint => Light::Tinted(tint),
+        };
+        let instance = FIRST_ACTOR_INSTANCE + placed.actor;
+        let owner = JobOwner { view: index, light, instance };
+        add_jobs(owner, projection, &placed.chunk, jobs);
+    }
 }
 
 /// Adds the jobs of one view and one chunk.
 fn add_jobs<'a>(
-    view: usize,
+    JobOwner { view, light, instance }: JobOwner<'a>,
     projection: ChunkProjection<'a>,
     chunk: &'a Chunk,
     jobs: &mut Vec<Job<'a>>,
@@ -223,7 +330,8 @@ fn add_jobs<'a>(
     };
     let count = chunk.clusters().len();
     let ranges = (0..count).step_by(UNIT_CLUSTERS).map(|k| k..(k + UNIT_CLUSTERS).min(count));
-    jobs.extend(ranges.filter(visible).map(|clusters| Job { view, chunk, clusters, projection }));
+    let job = |clusters| Job { view, chunk, clusters, projection, light, instance };
+    jobs.extend(ranges.filter(visible).map(job));
 }
 
 /// Projects the visible clusters of a job, one block of 16 Gaussians after the other.
@@ -234,6 +342,7 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
         if !job.projection.may_see(job.chunk, cluster) {
             continue;
         }
+        let light = job.light.on(cluster);
         let first = k * CLUSTER / LANES;
         for block in first..(first + CLUSTER / LANES).min(blocks) {
             let columns = job.chunk.lane_group(block);
@@ -246,7 +355,8 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
                     unscented::project_block(simd, columns, degree, view, cutoffs)
                 }
             };
-            if let Some(projected) = projected {
+            if let Some(mut projected) = projected {
+                light.apply(simd, columns, &mut projected);
                 projected.append_visible(splats);
             }
         }

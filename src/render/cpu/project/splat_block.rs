@@ -235,6 +235,15 @@ impl SplatBlock {
         self.visible |= other.visible;
     }
 
+    #[inline(always)]
+    pub(super) fn colors<S: Simd>(&self, simd: S) -> Vec3x16<S> {
+        Vec3x16 {
+            x: f32x16::load_array_ref(simd, &self.red),
+            y: f32x16::load_array_ref(simd, &self.green),
+            z: f32x16::load_array_ref(simd, &self.blue),
+        }
+    }
+
     /// Appends the visible splats, in order of lanes and so of global ids.
     #[inline(always)]
     pub(super) fn append_visible(&self, splats: &mut Vec<Splat>) {

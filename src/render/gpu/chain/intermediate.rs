@@ -6,6 +6,7 @@ use rayon::ThreadPool;
 use wgpu::{Buffer, CommandEncoderDescriptor};
 
 use super::{Chain, Source};
+use crate::actor_views::ActorViews;
 use crate::gpu::kernel::Recorder;
 use crate::gpu::layout::{Counters, Frame as GpuFrame, SplatColor, SplatShape};
 use crate::gpu::partition::Capacity;
@@ -29,7 +30,7 @@ impl Chain {
         outputs: &Outputs,
     ) -> Result<MappedFrame, RenderError> {
         self.make_room(done)?;
-        let mut current = self.begin(frame, outputs)?;
+        let mut current = self.begin(frame, &ActorViews::new(frame), outputs)?;
         let tiles = 0..current.parameters.tiles;
         let needs = self.draw_region(Source::Stages(done), tiles, &mut current)?;
         self.check_room(needs)?;
@@ -57,8 +58,9 @@ impl Chain {
             None => {
                 let views = 0..frame.views.len();
                 cull.install(|| self.mirror.make_resident(&self.device, frame.scene))?;
-                work = cull.install(|| ProjectWork::new(frame, views, &self.mirror));
-                self.lenses.upload(&self.device, frame);
+                let actors = ActorViews::new(frame);
+                work = cull.install(|| ProjectWork::new(frame, views, &actors, &self.mirror));
+                self.lenses.upload(&self.device, frame, &actors);
                 self.project.upload(&self.device, &work);
                 Source::Gaussians(&work)
             }

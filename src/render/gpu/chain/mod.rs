@@ -29,6 +29,7 @@ use super::read_back::{MappedFrame, ReadBack, ReadBackPool};
 use super::resolve::{Outputs, Planes};
 use super::scan::Scan;
 use super::sort::Sort;
+use crate::actor_views::ActorViews;
 use crate::constants::TILE_PX;
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
@@ -92,6 +93,14 @@ impl Source<'_> {
             Self::Stages(_) => 0,
         }
     }
+}
+
+/// What is drawn.
+#[derive(Clone, Copy, Debug)]
+struct DrawInput<'a> {
+    frame: &'a Frame<'a>,
+    actors: &'a ActorViews,
+    rows: &'a TileRows,
 }
 
 /// A frame that is being drawn.
@@ -162,17 +171,19 @@ impl Chain {
     ) -> Result<MappedFrame, RenderError> {
         let start = Instant::now();
         cull.install(|| self.mirror.make_resident(&self.device, frame.scene))?;
-        let mut current = self.begin(frame, outputs)?;
+        let actors = ActorViews::new(frame);
+        let mut current = self.begin(frame, &actors, outputs)?;
         add_time(&mut current.stats, "prepare", start.elapsed());
 
         // The regions that remain, in reverse order, so that the parts of a region take its place.
         let key = PartitionKey::of(frame);
         let rows = TileRows::of(frame);
+        let input = DrawInput { frame, actors: &actors, rows: &rows };
         let mut remaining = self.partitions.get(&key, &rows);
         remaining.reverse();
         let mut drawn = Vec::with_capacity(remaining.len());
         while let Some(region) = remaining.pop() {
-            match self.draw_or_split(frame, &rows, &region, cull, &mut current)? {
+            match self.draw_or_split(input, &region, cull, &mut current)? {
                 RegionOutcome::Drawn(needs) => {
                     drawn.push((region, needs));
                     if !remaining.is_empty() {
@@ -191,12 +202,12 @@ impl Chain {
     /// read-back buffers are mapped.
     fn draw_or_split(
         &mut self,
-        frame: &Frame<'_>,
-        rows: &TileRows,
+        input: DrawInput<'_>,
         region: &Region,
         cull: &ThreadPool,
         current: &mut CurrentFrame,
     ) -> Result<RegionOutcome, RenderError> {
+        let DrawInput { frame, actors, rows } = input;
         // The tiles of one view.
         let views = rows.views(region);
         let tiles_of = |view: usize| {
@@ -213,7 +224,7 @@ impl Chain {
 
         // The clusters that the host does not cull.
         let start = Instant::now();
-        let work = cull.install(|| ProjectWork::new(frame, views.clone(), &self.mirror));
+        let work = cull.install(|| ProjectWork::new(frame, views.clone(), actors, &self.mirror));
         let limit = Project::limit(&self.device);
         let count = u64::from(work.cluster_views()).div_ceil(limit);
         if count > 1 {
@@ -239,9 +250,14 @@ impl Chain {
     }
 
     /// Uploads what the whole frame shares, and makes room for its pixels.
-    fn begin(&mut self, frame: &Frame<'_>, outputs: &Outputs) -> Result<CurrentFrame, RenderError> {
+    fn begin(
+        &mut self,
+        frame: &Frame<'_>,
+        actors: &ActorViews,
+        outputs: &Outputs,
+    ) -> Result<CurrentFrame, RenderError> {
         let planes = outputs.planes;
-        self.lenses.upload(&self.device, frame);
+        self.lenses.upload(&self.device, frame, actors);
         self.rasterize.upload_background(&self.device, frame, &outputs.appearances)?;
         let parameters = GpuFrame::new(frame.views, frame.profile);
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, parameters.tiles);

@@ -8,7 +8,7 @@ use super::{Chain, CurrentFrame, Source, add_time};
 use crate::FrameStats;
 use crate::constants::DEPTH_BITS;
 use crate::gpu::kernel::{Recorder, TIMESTAMP_BYTES};
-use crate::gpu::layout::{Counters, Frame as GpuFrame};
+use crate::gpu::layout::{Counters, Frame as GpuFrame, Owner};
 use crate::gpu::plan::{Counts, job};
 use crate::gpu::project::ProjectInputs;
 use crate::gpu::rasterize::{RasterizeInputs, TileOutput};
@@ -27,10 +27,27 @@ impl Chain {
     ) -> (Vec<&'static str>, SubmissionIndex) {
         let mut recorder = Recorder::new(&self.device, self.queries.clone());
         self.record(&mut recorder, source, &current.parameters, Stage::Bin);
-        let Self { device, plan, splats, bin, lenses, timestamps, .. } = self;
+        let Self { device, plan, project, splats, bin, lenses, timestamps, .. } = self;
+
+        // Whose splats they are. Only instance ids read it.
+        let mut resumed = Vec::new();
+        let owners = match source {
+            Source::Gaussians(work) => work.owners(),
+            Source::Stages(outputs) if output.planes.has_instances() => {
+                let first_splats = outputs.owners.iter().map(|owner| owner.first_splat);
+                project.set_first_splats(device, &first_splats.collect::<Vec<u32>>());
+                resumed.extend(outputs.owners.iter().zip(0..).map(|(owner, cluster_view)| Owner {
+                    cluster_view,
+                    instance: owner.instance.into(),
+                }));
+                &resumed[..]
+            }
+            Source::Stages(_) => &resumed[..],
+        };
+        let first_splats = project.first_splats();
 
         let mut pass = recorder.stage("rasterize");
-        let inputs = RasterizeInputs { plan, splats, bin, lenses };
+        let inputs = RasterizeInputs { plan, splats, bin, lenses, owners, first_splats };
         self.rasterize.run(device, &mut pass, inputs, output);
         drop(pass);
 

@@ -100,7 +100,7 @@ impl Mirror {
             self.by_last_frame.clear();
             self.pages.clear();
             self.add_missing(device, scene).map_err(|Full| RenderError::DeviceMemory {
-                needed_bytes: scene.chunks.iter().map(|chunk| lines_of(chunk)).sum::<u64>()
+                needed_bytes: scene.distinct_chunks().map(|chunk| lines_of(chunk)).sum::<u64>()
                     * LINE_BYTES,
                 limit_bytes: self.limit_bytes,
             })?;
@@ -118,11 +118,6 @@ impl Mirror {
         self.pages.get(page)?.as_ref().map(|page| &page.buffer)
     }
 
-    /// Number of pages, including freed ones.
-    pub(super) fn pages(&self) -> usize {
-        self.pages.len()
-    }
-
     /// Device memory of all pages, in bytes.
     pub(super) fn bytes(&self) -> u64 {
         self.pages.iter().flatten().map(|page| page.buffer.size()).sum()
@@ -132,7 +127,7 @@ impl Mirror {
     fn add_missing(&mut self, device: &Device, scene: &Scene) -> Result<(), Full> {
         // First mark all resident chunks, so that none of them is evicted for a missing one.
         let mut missing = Vec::new();
-        for chunk in &scene.chunks {
+        for chunk in scene.distinct_chunks() {
             match self.resident.get_mut(&address(chunk)) {
                 Some(resident) => {
                     self.by_last_frame.remove(&(resident.last_frame, address(chunk)));

@@ -57,7 +57,7 @@ pub(super) fn read(
             "the scene has neither splats nor triangles with an area".into(),
         ));
     }
-    let share_m2 = area_m2 / f64::from(limits::MESH_GAUSSIANS);
+    let share_m2 = area_m2 / f64::from(parts.mesh_gaussians());
     let longest_m = LONGEST * share_m2.sqrt();
     // A triangle without area is invisible, however long it is.
     let seen = triangles.into_iter().filter(|triangle| triangle.area_m2() > 0.0);

@@ -4,7 +4,9 @@
 //! `.gaussians_nodes.LAYER`, arrays of f16 or f32 with their shapes: positions, rotations (w, x, y,
 //! z), scales (ln), densities (logit), features_albedo (degree 0) and features_specular (the higher
 //! degrees, coefficient-major, then red, green, blue), of which n_active_features degrees count. A
-//! layer of tracked objects is skipped, because it has no fixed place. Positions are in the
+//! layer of tracked objects is skipped, because it has no fixed place ([`read_tracked`] reads it:
+//! gaussian_cuboid_ids names the track of each Gaussian, and positions are relative to the middle
+//! of the track's cuboid). Positions are in the
 //! payload's axes; the USD layers around it, which may rotate and move it, are not read.
 
 mod msgpack;
@@ -16,6 +18,7 @@ use half::f16;
 
 use wildcity_scene::{Gaussians, sh};
 
+use super::objects::{self, TrackedObject};
 use super::unpack_budget::{self, UnpackBudget};
 use super::validate::{self, Field};
 use super::{IngestError, check_count};
@@ -26,25 +29,14 @@ const LAYERS: &str = ".gaussians_nodes.";
 
 /// Reads a payload.
 pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
-    let limit = unpack_budget::limit_bytes(payload.len() as u64);
-    let mut bytes = Vec::new();
-    let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
-    read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
-    budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
-    let missing = |name: &str| bad(name, "is missing".into());
-    let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
-    let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
-    let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
-    let names = state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
-    let is_static = |layer: &&str| match tracks.and_then(|tracks| tracks.get(layer)) {
-        Some(Value::Array(ids)) => ids.is_empty(),
-        _ => true,
-    };
+    let Payload { data, state } = Payload::of(&root)?;
     let mut all = Gaussians::default();
-    let mut layers = names.filter(is_static).peekable();
+    let is_static = |layer: &&str| tracks_of(state, layer).is_empty();
+    let mut layers = layers_of(state).filter(is_static).peekable();
     if layers.peek().is_none() {
-        return Err(missing("a layer of static Gaussians"));
+        return Err(bad("a layer of static Gaussians", "is missing".into()));
     }
     for name in layers {
         check_activations(data, name)?;
@@ -54,6 +46,75 @@ pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussian
     }
     validate::check(&all, &Field::plain_name)?;
     Ok(all)
+}
+
+/// Reads the tracked objects of a payload: layers with tracks, split by track.
+pub(super) fn read_tracked(
+    payload: &[u8],
+    budget: &mut UnpackBudget,
+) -> Result<Vec<TrackedObject>, IngestError> {
+    let bytes = unpack(payload, budget)?;
+    let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
+    let Payload { data, state } = Payload::of(&root)?;
+    let mut found = Vec::new();
+    for name in layers_of(state) {
+        let tracks = tracks_of(state, name);
+        if tracks.is_empty() {
+            continue;
+        }
+        check_activations(data, name)?;
+        let layer = Layer { state, name };
+        let gaussians = layer.read()?;
+        check_count(gaussians.len() as u64)?;
+        validate::check(&gaussians, &Field::plain_name)?;
+        let ids = layer.cuboid_ids(gaussians.len(), tracks.len())?;
+        let track = |id: i64| match tracks.get(usize::try_from(id).ok()?)? {
+            Value::Text(track) => Some((*track).to_owned()),
+            Value::Count(number) => Some(number.to_string()),
+            _ => Some(id.to_string()),
+        };
+        found.extend(objects::split(&gaussians, &ids, track));
+    }
+    Ok(found)
+}
+
+/// The bytes of a gzip stream.
+fn unpack(payload: &[u8], budget: &mut UnpackBudget) -> Result<Vec<u8>, IngestError> {
+    let limit = unpack_budget::limit_bytes(payload.len() as u64);
+    let mut bytes = Vec::new();
+    let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
+    read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
+    budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    Ok(bytes)
+}
+
+/// The two maps of a payload that are read.
+struct Payload<'a> {
+    data: &'a Value<'a>,
+    state: &'a Value<'a>,
+}
+
+impl<'a> Payload<'a> {
+    fn of(root: &'a Value<'a>) -> Result<Self, IngestError> {
+        let missing = |name: &str| bad(name, "is missing".into());
+        let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
+        let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
+        Ok(Self { data, state })
+    }
+}
+
+/// The names of all layers of Gaussians.
+fn layers_of<'a>(state: &'a Value<'a>) -> impl Iterator<Item = &'a str> {
+    state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"))
+}
+
+/// The tracks of a layer; none for a static one.
+fn tracks_of<'a>(state: &'a Value<'a>, layer: &str) -> &'a [Value<'a>] {
+    let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
+    match tracks.and_then(|tracks| tracks.get(layer)) {
+        Some(Value::Array(ids)) => ids,
+        _ => &[],
+    }
 }
 
 /// Checks that parameters have the activations that this reader assumes.
@@ -110,6 +171,28 @@ impl Layer<'_> {
             g.sh.extend((0..3 * (sh::coefficients(sh_degree) - 1)).map(|k| specular.value(i, k)));
         }
         Ok(g)
+    }
+
+    /// The index of each Gaussian's track, stored as i32 or i64.
+    fn cuboid_ids(&self, rows: usize, tracks: usize) -> Result<Vec<i64>, IngestError> {
+        let key = self.key("gaussian_cuboid_ids");
+        let Some(Value::Bytes(bytes)) = self.state.get(&key) else {
+            return Err(bad(&key, "is not an array of bytes".into()));
+        };
+        let ids: Vec<i64> = if bytes.len() == 4 * rows {
+            bytes.as_chunks().0.iter().map(|id| i32::from_le_bytes(*id).into()).collect()
+        } else if bytes.len() == 8 * rows {
+            bytes.as_chunks().0.iter().map(|id| i64::from_le_bytes(*id)).collect()
+        } else {
+            let reason =
+                format!("{} bytes, which is not the size of {rows} i32 or i64", bytes.len());
+            return Err(bad(&key, reason));
+        };
+        let beyond = ids.iter().find(|&&id| usize::try_from(id).is_ok_and(|id| id >= tracks));
+        match beyond {
+            Some(id) => Err(bad(&key, format!("{id} is a track; there are {tracks}"))),
+            None => Ok(ids),
+        }
     }
 
     fn key(&self, field: &str) -> String {

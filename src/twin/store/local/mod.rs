@@ -17,7 +17,7 @@ use wildcity_scene::rig::is_name;
 
 use super::StoreError;
 use super::backend::{ListedObject, ObjectBackend, Staging};
-use super::layout::{check_hash, check_side_file, is_hash, log_numbers};
+use super::layout::{ACTORS, check_hash, check_side_file, is_hash, log_numbers};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
@@ -136,7 +136,7 @@ impl ObjectBackend for Local {
         let mut names = Vec::new();
         for entry in entries(&self.root.join(STAGING))? {
             let name = entry.split_once(SEPARATOR).map(|(name, _)| name);
-            names.extend(name.filter(|name| is_name(name)).map(str::to_owned));
+            names.extend(name.filter(|name| is_name(name) || *name == ACTORS).map(str::to_owned));
         }
         names.dedup();
         Ok(names)

@@ -116,6 +116,12 @@ impl Staging for LocalStaging {
         sync_parent(&path).map_err(|error| self.not_synced(number, error))
     }
 
+    fn place_objects(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
+        self.place(hashes)?;
+        self.placed.clear();
+        Ok(())
+    }
+
     fn restore(&mut self, hashes: &BTreeSet<&str>, number: u64) -> Result<(), StoreError> {
         self.place(hashes)?;
         self.placed.clear();

@@ -133,6 +133,10 @@ impl Staging for RemoteStaging {
         }
     }
 
+    fn place_objects(&mut self, _hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
+        self.wait_for_uploads()
+    }
+
     fn restore(&mut self, _hashes: &BTreeSet<&str>, _number: u64) -> Result<(), StoreError> {
         self.wait_for_uploads()
     }

@@ -1,0 +1,49 @@
+// Instance ids: whose splat brings a pixel's transmittance to a half or less. The other choice of `INSTANCES`
+// is `no_instances.wgsl`. Twin of `Wants::instances` in `src/render/cpu/rasterize.rs`.
+//
+// Splats are in order of (view, global id), so the chunks of each owner are one range of them. A pixel keeps
+// the index of the splat in its tile's list, and looks up the owner once, at its end.
+
+const INSTANCE_PLANES: u32 = 1u;
+
+@group(0) @binding(13) var<storage, read> owners: array<Owner>;
+// For each cluster view, the index of its first splat.
+@group(0) @binding(14) var<storage, read> first_splats: array<u32>;
+
+// Index in the tile's list, plus 1, of the splat that halves the transmittance; 0 if none has.
+var<private> halved_by: vec4u;
+
+// Notes the splat with this index if it brings the transmittance of pixels to a half or less.
+fn note_owner(list_index: u32, before: vec4f, after: vec4f, counts: vec4<bool>) {
+    let halves = counts & (before > vec4f(0.5)) & (after <= vec4f(0.5));
+    halved_by = select(halved_by, vec4u(list_index + 1u), halves);
+}
+
+// The instances of four pixels: 0 none, 1 the twin, k + 2 actor k.
+fn instances() -> vec4u {
+    return vec4u(
+        instance_of(halved_by.x),
+        instance_of(halved_by.y),
+        instance_of(halved_by.z),
+        instance_of(halved_by.w),
+    );
+}
+
+fn instance_of(halved_by: u32) -> u32 {
+    if halved_by == 0u {
+        return 0u;
+    }
+    let splat = instance_splats[halved_by - 1u];
+    // The last owner whose first splat is not after this one.
+    var low = 0u;
+    var high = owners[0].instance;
+    while low + 1u < high {
+        let middle = (low + high) / 2u;
+        if first_splats[owners[middle + 1u].cluster_view] <= splat {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    return owners[low + 1u].instance;
+}

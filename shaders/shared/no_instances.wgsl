@@ -1,0 +1,9 @@
+// Frames without instance ids. The other choice of `INSTANCES` is `instances.wgsl`.
+
+const INSTANCE_PLANES: u32 = 0u;
+
+fn note_owner(list_index: u32, before: vec4f, after: vec4f, counts: vec4<bool>) {}
+
+fn instances() -> vec4u {
+    return vec4u(0u);
+}

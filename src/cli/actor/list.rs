@@ -1,0 +1,45 @@
+//! `wildcity actor list`.
+
+use std::io::{self, Write};
+
+use wildcity_scene::ActorBox;
+
+use crate::cli::directories::Twins;
+
+/// List the assets of actors: name, class, size, Gaussians, and hash.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity actor list
+  wildcity actor list --twins s3://city/twins")]
+pub(super) struct List {
+    #[command(flatten)]
+    twins: Twins,
+}
+
+impl List {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let actors = catalog.actors()?;
+        let mut out = io::stdout().lock();
+        if actors.is_empty() {
+            writeln!(
+                out,
+                "no actors in {}: make one with `wildcity actor import`",
+                catalog.dir().display()
+            )?;
+        }
+        for actor in actors {
+            let ActorBox { length_m, width_m, height_m } = actor.description.box_;
+            writeln!(
+                out,
+                "{:<20} {:<10} {length_m:.2} x {width_m:.2} x {height_m:.2} m {:>9} Gaussians  {}",
+                actor.description.name,
+                actor.description.class.name(),
+                actor.gaussians(),
+                actor.hash,
+            )?;
+        }
+        Ok(())
+    }
+}

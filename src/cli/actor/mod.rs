@@ -1,0 +1,44 @@
+//! `wildcity actor`.
+
+mod cut;
+mod generate;
+mod import;
+mod list;
+mod picture;
+mod show;
+
+/// Make, list and look at assets of actors: what other vehicles and pedestrians are drawn from.
+///
+/// Assets lie beside the twins and are shared by all of them. An asset is identified by the BLAKE3 of its content.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity actor import car.glb --axes '0 0 1 1 0 0 0 1 0'
+  wildcity actor generate
+  wildcity actor list
+  wildcity actor show car --picture car.png")]
+pub(super) struct Actor {
+    #[command(subcommand)]
+    subcommand: Subcommand,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Subcommand {
+    Import(import::Import),
+    Generate(generate::Generate),
+    List(list::List),
+    Show(show::Show),
+    Cut(cut::Cut),
+}
+
+impl Actor {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        match self.subcommand {
+            Subcommand::Import(import) => import.run(),
+            Subcommand::Generate(generate) => generate.run(),
+            Subcommand::List(list) => list.run(),
+            Subcommand::Show(show) => show.run(),
+            Subcommand::Cut(cut) => cut.run(),
+        }
+    }
+}

@@ -1,0 +1,44 @@
+//! `wildcity episode diff`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use wildcity_episode::diff;
+
+use crate::cli::directories::Episodes;
+
+/// Compare two episodes: the first step at which command, ego, actor or image differ.
+///
+/// The exit code is 0 if they are alike, 1 if they differ.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Diff {
+    /// One episode: its file, or its name as `wildcity episode list` prints it.
+    #[arg(value_name = "A")]
+    a: PathBuf,
+
+    /// The other.
+    #[arg(value_name = "B")]
+    b: PathBuf,
+
+    #[command(flatten)]
+    episodes: Episodes,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity episode diff agent-1 agent-2
+  wildcity episode diff yesterday/episodes/cut-in-0.jsonl today/episodes/cut-in-0.jsonl";
+
+impl Diff {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let a = super::read(&self.a, &self.episodes)?;
+        let b = super::read(&self.b, &self.episodes)?;
+        if let Some(difference) = diff(&a, &b) {
+            anyhow::bail!("the episodes differ at {difference}");
+        }
+        let steps = a.driven().last().map_or(0, |frame| frame.step);
+        writeln!(io::stdout().lock(), "alike       {steps} steps")?;
+        Ok(())
+    }
+}

@@ -1,0 +1,69 @@
+//! `wildcity episode score`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use serde_json::json;
+
+use wildcity_episode::{EpisodeFile, EpisodeResult, result};
+
+use crate::cli::directories::Episodes;
+
+/// Score recorded episodes, from their records alone: no renderer, no twin.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Score {
+    /// The episodes: their files, or their names as `wildcity episode list` prints them.
+    #[arg(value_name = "EPISODE", required = true)]
+    episodes_to_score: Vec<PathBuf>,
+
+    /// Print one JSON object per episode, with what each score was computed from.
+    #[arg(long)]
+    json: bool,
+
+    #[command(flatten)]
+    episodes: Episodes,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity episode score agent-1
+  wildcity episode score --json run/episodes/*.jsonl";
+
+impl Score {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let mut out = io::stdout().lock();
+        for path in &self.episodes_to_score {
+            let episode = super::read(path, &self.episodes)?;
+            let name = EpisodeFile::name_of(path);
+            let scored = result(&episode)
+                .ok_or_else(|| anyhow::anyhow!("{name} has no frame: nothing was driven"))?;
+            if self.json {
+                writeln!(out, "{}", json!({ "episode": name, "result": scored }))?;
+            } else {
+                table(&mut out, &name, &scored)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn table(out: &mut impl Write, name: &str, scored: &EpisodeResult) -> io::Result<()> {
+    writeln!(out, "{name}: {}", scored.verdict)?;
+    for fault in &scored.faults {
+        let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
+        writeln!(out, "  fault   {}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6)?;
+    }
+    for reason in &scored.not_judged {
+        writeln!(out, "  not judged: {reason}")?;
+    }
+    for (score, line) in &scored.scores {
+        match (line.value, &line.reason) {
+            (Some(value), _) => writeln!(out, "  {score:<36} {value:.4}")?,
+            (None, reason) => {
+                writeln!(out, "  {score:<36} none: {}", reason.as_deref().unwrap_or("unknown"))?;
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,164 @@
+//! An episode as the scores see it.
+
+use glam::{DVec2, DVec3};
+
+use wildcity_scene::geometry::Pose;
+use wildcity_score::{
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
+    Track, TrackSample,
+};
+use wildcity_sim::contact::Body;
+use wildcity_sim::ego::EgoModel;
+
+use crate::file::EpisodeFile;
+use crate::lines::{ActorsLine, Event, ScenarioLine};
+
+/// The numbers of an episode that scores are made of; `None` if it has no frame.
+pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
+    let frames = episode.driven();
+    let poses: Vec<Pose> = frames.iter().filter_map(|frame| frame.poses.last().copied()).collect();
+    if poses.is_empty() {
+        return None;
+    }
+    let scenario = episode.scenario.as_ref();
+    let steps: Vec<u64> = frames.iter().map(|frame| frame.step).collect();
+    let contacts = episode.events.iter().filter_map(|line| match &line.event {
+        Event::Contact(event) => Some(event.contact(line.time_us)),
+        _ => None,
+    });
+    let with_twin = episode.events.iter().filter_map(|line| match line.event {
+        Event::StaticContact { impact_mps, .. } => {
+            Some(StaticContact { time_us: line.time_us, impact_mps })
+        }
+        _ => None,
+    });
+    let checks_static = scenario.is_some_and(|scenario| scenario.checks_static);
+    Some(DriveRecord {
+        dt_us: episode.header.dt_us,
+        shape: scenario.map(|scenario| EgoShape {
+            length_m: scenario.ego.size[0],
+            width_m: scenario.ego.size[1],
+            center_x_m: scenario.ego.center_x,
+        }),
+        ego: samples(&poses, episode.header.dt_us as f64 * 1e-6),
+        is_driven: episode.header.dynamics.model != EgoModel::Teleport,
+        tracks: scenario.map(|scenario| tracks(scenario, &episode.actors, &steps)),
+        contacts: contacts.collect(),
+        static_contacts: checks_static.then(|| with_twin.collect()),
+        reference: scenario.and_then(reference),
+        limit_us: scenario.and_then(|scenario| scenario.limit_us),
+        map: scenario.and_then(lanes),
+        least_progress: scenario
+            .map_or(wildcity_score::own::LEAST_PROGRESS, |scenario| scenario.least_progress),
+        off_model_us: off_model_us(episode),
+    })
+}
+
+/// When the ego first left the trained area, in microseconds. A record without events says only that it did: then it
+/// counts from the start.
+pub fn off_model_us(episode: &EpisodeFile) -> Option<i64> {
+    let event = episode.events.iter().find(|line| matches!(line.event, Event::OffModel { .. }));
+    let at_end = episode.end.as_ref().is_some_and(|end| end.outcome == "off_model");
+    event.map(|line| line.time_us).or(at_end.then_some(0))
+}
+
+/// The ego from its poses: velocities and accelerations are differences over two steps, at the ends over one.
+fn samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
+    let places: Vec<DVec2> = poses.iter().map(|pose| pose.position_m.truncate()).collect();
+    let mut turned = 0.0;
+    let mut before: Option<f64> = None;
+    let yaws: Vec<f64> = poses
+        .iter()
+        .map(|pose| {
+            let forward = pose.rotation * DVec3::X;
+            let yaw = forward.y.atan2(forward.x);
+            if let Some(before) = before {
+                turned += ((yaw - before) / std::f64::consts::TAU).round_ties_even();
+            }
+            before = Some(yaw);
+            yaw - std::f64::consts::TAU * turned
+        })
+        .collect();
+    let velocities = slopes(&places, step_s);
+    let accelerations = slopes(&velocities, step_s);
+    let rates = slopes(&yaws, step_s);
+    let yaw_accelerations = slopes(&rates, step_s);
+    (0..poses.len())
+        .map(|k| {
+            let to_car = DVec2::from_angle(-yaws[k]);
+            EgoSample {
+                origin_m: places[k],
+                yaw_rad: yaws[k],
+                velocity_mps: to_car.rotate(velocities[k]),
+                acceleration_mps2: to_car.rotate(accelerations[k]),
+                yaw_rate_radps: rates[k],
+                yaw_acceleration_radps2: yaw_accelerations[k],
+            }
+        })
+        .collect()
+}
+
+/// Differences per second.
+fn slopes<T>(values: &[T], step_s: f64) -> Vec<T>
+where
+    T: Copy + std::ops::Sub<Output = T> + std::ops::Div<f64, Output = T>,
+{
+    let last = values.len() - 1;
+    let slope = |k: usize| {
+        let from = k.saturating_sub(1);
+        let to = (k + 1).min(last);
+        (values[to] - values[from]) / ((to - from).max(1) as f64 * step_s)
+    };
+    (0..values.len()).map(slope).collect()
+}
+
+fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<Track> {
+    // Where a session went back, the last line of a step holds.
+    let at_step = |step: u64| lines.iter().rev().find(|line| line.step == step);
+    let mut tracks: Vec<Track> = scenario
+        .actors
+        .iter()
+        .map(|actor| Track {
+            name: actor.name.clone(),
+            class: actor.class,
+            samples: vec![None; steps.len()],
+        })
+        .collect();
+    let by_order = lines.len() == steps.len()
+        && lines.iter().zip(steps).all(|(line, &step)| line.step == step);
+    for (k, &step) in steps.iter().enumerate() {
+        let line = if by_order { lines.get(k) } else { at_step(step) };
+        let Some(line) = line else { continue };
+        for state in line.actors.iter().filter_map(|state| state.state()) {
+            let index = usize::from(state.index);
+            let (Some(track), Some(actor)) = (tracks.get_mut(index), scenario.actors.get(index))
+            else {
+                continue;
+            };
+            track.samples[k] = Some(TrackSample {
+                footprint: Body::new(&state.world_from_actor, &actor.box_of(), 0.0).footprint,
+                velocity_mps: state.velocity_mps.truncate(),
+            });
+        }
+    }
+    tracks
+}
+
+fn reference(scenario: &ScenarioLine) -> Option<ReferenceDrive> {
+    let points = scenario.route.iter().map(|point| DVec2::new(point.1[0], point.1[1]));
+    let line = Polyline::new(points.collect())?;
+    Some(ReferenceDrive { line, times_us: scenario.route.iter().map(|point| point.0).collect() })
+}
+
+fn lanes(scenario: &ScenarioLine) -> Option<LaneMap> {
+    if scenario.lanes.is_empty() {
+        return None;
+    }
+    let centerline = reference(scenario)?.line;
+    let lanes = scenario.lanes.iter().map(|lane| Lane {
+        outline_m: lane.outline.iter().map(|&point| DVec2::from_array(point)).collect(),
+        is_on_route: lane.route,
+        is_intersection: lane.intersection,
+    });
+    Some(LaneMap { lanes: lanes.collect(), centerline, red: Vec::new() })
+}

@@ -1,0 +1,291 @@
+//! Reads an episode's file.
+
+use std::borrow::Cow;
+use std::fs::File;
+use std::io::{self, BufRead as _, BufReader, Read as _};
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::Dynamics;
+
+use crate::limits;
+use crate::lines::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
+
+/// What an episode was driven with: the fields of its first line that need no renderer.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct Header {
+    /// Version of the format.
+    pub format: u32,
+    /// The build that recorded it.
+    pub build: String,
+    /// Name of the session.
+    pub session: String,
+    /// Name of the twin.
+    pub twin: String,
+    /// Its version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+    /// Name of the backend.
+    pub backend: String,
+    /// The cameras.
+    pub rig: RigHead,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// How the ego moved.
+    #[serde(default)]
+    pub dynamics: Dynamics,
+    /// `world_from_rig` at time zero.
+    pub start: Pose,
+    /// Simulated time of a step, in microseconds.
+    pub dt_us: i64,
+}
+
+/// A rig by its names.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct RigHead {
+    /// Name of the rig.
+    pub name: String,
+    /// Its cameras, in the order of the images.
+    pub cameras: Vec<CameraHead>,
+}
+
+/// A camera by its name.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct CameraHead {
+    /// Its name.
+    pub name: String,
+}
+
+/// An answer with images.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct Frame {
+    /// `reset`, `step` or `observe`.
+    pub request: String,
+    /// Steps done, this one included.
+    pub step: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// The rendered poses, `world_from_rig`; the last one of a reset or a step is the ego's.
+    pub poses: Vec<Pose>,
+    /// The command, unless it was the pose itself.
+    #[serde(default)]
+    pub command: Option<serde_json::Value>,
+    /// Whether the agent ended the episode with this step.
+    #[serde(default)]
+    pub terminated: bool,
+    /// BLAKE3 of the shown images' hashes, in hex.
+    pub frame_hash: String,
+    /// BLAKE3 of each rendered image, in hex.
+    #[serde(default)]
+    pub images: Vec<String>,
+}
+
+/// How an episode went, as the session says.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+pub struct EndLine {
+    /// Why it ended: `completed`, `off_model`, `agent_error` ..
+    pub outcome: String,
+    /// Steps done.
+    pub steps: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// Distance driven, in metres.
+    pub distance_m: f64,
+    /// The least mean trust of an observation.
+    #[serde(default)]
+    pub least_trust: Option<f64>,
+}
+
+/// Where a file stops being readable.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cut {
+    /// The line, from 1.
+    pub line: usize,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+/// A recorded episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EpisodeFile {
+    /// What it was driven with.
+    pub header: Header,
+    /// The scenario, if there was one.
+    pub scenario: Option<ScenarioLine>,
+    /// All answers with images, in order.
+    pub frames: Vec<Frame>,
+    /// The actors, step by step.
+    pub actors: Vec<ActorsLine>,
+    /// What happened, in order.
+    pub events: Vec<EventLine>,
+    /// The result that the session wrote.
+    pub result: Option<EpisodeResult>,
+    /// How it went; absent if the server was killed, or still drives.
+    pub end: Option<EndLine>,
+    /// Where the file stops being readable, if it does.
+    pub cut: Option<Cut>,
+}
+
+/// Why an episode's file could not be read at all.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The file cannot be opened or read.
+    #[error("cannot read {}: {cause}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// The first line is no header.
+    #[error("{}: the first line is no header of an episode: {reason}", path.display())]
+    Header {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// A line's kind. It is read before the line, since a tagged enum copies every value of it first: a third of the time.
+#[derive(Deserialize)]
+struct Kind<'a> {
+    #[serde(borrow)]
+    kind: Cow<'a, str>,
+}
+
+enum Line {
+    Episode(Box<Header>),
+    Scenario(Box<ScenarioLine>),
+    Actors(ActorsLine),
+    Event(EventLine),
+    Frame(Frame),
+    Result(EpisodeResult),
+    End(EndLine),
+    /// Versions, notes, and what later builds add.
+    Other,
+}
+
+impl EpisodeFile {
+    /// The format that this build reads.
+    pub const FORMAT: u32 = 0;
+
+    /// Reads an episode's file. A damaged or incomplete line ends the reading: all before it is returned, and
+    /// [`EpisodeFile::cut`] says where and why.
+    ///
+    /// # Errors
+    /// The file cannot be read, or its first line is no header.
+    pub fn read(path: &Path) -> Result<Self, ReadError> {
+        let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
+        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let no_header = |reason: String| ReadError::Header { path: path.to_owned(), reason };
+        let mut text = Vec::new();
+        let first = read_line(&mut reader, limits::HEAD_BYTES, &mut text).map_err(failed)?;
+        let header = match first.and_then(|_| parse(&text)) {
+            Ok(Line::Episode(header)) if header.format == Self::FORMAT => *header,
+            Ok(Line::Episode(header)) => {
+                let reason = format!("format {}; this build reads {}", header.format, Self::FORMAT);
+                return Err(no_header(reason));
+            }
+            Ok(_) => return Err(no_header("it is of another kind".to_owned())),
+            Err(reason) => return Err(no_header(reason)),
+        };
+        let mut episode = Self {
+            header,
+            scenario: None,
+            frames: Vec::new(),
+            actors: Vec::new(),
+            events: Vec::new(),
+            result: None,
+            end: None,
+            cut: None,
+        };
+        for number in 2.. {
+            let line = read_line(&mut reader, limits::LINE_BYTES, &mut text).map_err(failed)?;
+            let added = match line {
+                Ok(false) => break,
+                Ok(true) => parse(&text).and_then(|line| episode.add(line)),
+                Err(reason) => Err(reason),
+            };
+            if let Err(reason) = added {
+                episode.cut = Some(Cut { line: number, reason });
+                break;
+            }
+        }
+        Ok(episode)
+    }
+
+    fn add(&mut self, line: Line) -> Result<(), String> {
+        if self.end.is_some() {
+            return Err("it follows the end of the episode".to_owned());
+        }
+        match line {
+            Line::Episode(_) => return Err("a second header".to_owned()),
+            Line::Frame(_) if self.frames.len() >= limits::STEPS => {
+                return Err(format!("more than {} frames", limits::STEPS));
+            }
+            Line::Scenario(scenario) => self.scenario = Some(*scenario),
+            Line::Actors(actors) => self.actors.push(actors),
+            Line::Event(event) => self.events.push(event),
+            Line::Frame(frame) => self.frames.push(frame),
+            Line::Result(result) => self.result = Some(result),
+            Line::End(end) => self.end = Some(end),
+            Line::Other => {}
+        }
+        Ok(())
+    }
+
+    /// The frames that the ego drove: the start and each step, in order. Where a session went back to an earlier
+    /// step, the later ones replace it.
+    pub fn driven(&self) -> Vec<&Frame> {
+        let mut driven: Vec<&Frame> = Vec::new();
+        let moves = |frame: &&Frame| frame.request != "observe" && !frame.poses.is_empty();
+        for frame in self.frames.iter().filter(moves) {
+            let kept = driven.partition_point(|before| before.step < frame.step);
+            driven.truncate(kept);
+            driven.push(frame);
+        }
+        driven
+    }
+
+    /// The name of the episode: that of its file without the extension.
+    pub fn name_of(path: &Path) -> String {
+        path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+}
+
+/// Reads a line into `text`. Returns whether there was one; or what is wrong with it.
+fn read_line(
+    reader: &mut BufReader<File>,
+    limit: usize,
+    text: &mut Vec<u8>,
+) -> io::Result<Result<bool, String>> {
+    text.clear();
+    reader.by_ref().take(limit as u64).read_until(b'\n', text)?;
+    Ok(match text.last() {
+        None => Ok(false),
+        Some(b'\n') => Ok(true),
+        Some(_) if text.len() == limit => Err(format!("longer than {limit} bytes")),
+        Some(_) => Err("incomplete: it has no line break".to_owned()),
+    })
+}
+
+fn parse(text: &[u8]) -> Result<Line, String> {
+    fn line<'a, T: Deserialize<'a>>(text: &'a [u8]) -> Result<T, String> {
+        serde_json::from_slice(text).map_err(|error| error.to_string())
+    }
+    let Kind { kind } = line(text)?;
+    Ok(match &*kind {
+        "episode" => Line::Episode(line(text)?),
+        "scenario" => Line::Scenario(line(text)?),
+        "actors" => Line::Actors(line(text)?),
+        "event" => Line::Event(line(text)?),
+        "frame" => Line::Frame(line(text)?),
+        "result" => Line::Result(line(text)?),
+        "end" => Line::End(line(text)?),
+        _ => Line::Other,
+    })
+}

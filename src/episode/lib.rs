@@ -1,0 +1,32 @@
+//! Recorded episodes, without renderer and twin: reading, comparing and scoring them.
+//!
+//! The session writes an episode's file while it drives. This package has the lines that a scenario adds to it, and
+//! reads the file afterwards: with whatever fields later builds add, and up to the place where a file was cut.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | `lines` | the lines of a scenario: `scenario`, `actors`, `event`, `result` |
+//! | `file` | reading an episode's file |
+//! | `drive` | an episode as the scores see it |
+//! | `outcome` | the result of an episode |
+//! | `diff` | where two episodes part |
+//! | `listing` | the episodes of a directory |
+//! | [`limits`] | limits |
+
+mod diff;
+mod drive;
+mod file;
+pub mod limits;
+mod lines;
+mod listing;
+mod outcome;
+
+pub use diff::{Difference, What, diff};
+pub use drive::{drive_record, off_model_us};
+pub use file::{CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead};
+pub use lines::{
+    ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
+    EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
+};
+pub use listing::{Listed, list};
+pub use outcome::result;

@@ -1,0 +1,14 @@
+//! Limits of this package, with the arithmetic behind each.
+
+/// Longest line of an episode's file after the first, in bytes: 256 actors of 200 bytes and 256 image hashes of 67
+/// take 70 kB; the route of a scenario with a keyframe every 0.5 m takes 80 bytes a point, 8 MB for 50 km.
+pub const LINE_BYTES: usize = 16 << 20;
+
+/// Longest first line, in bytes, as the session writes it: the overlays of a rig.
+pub const HEAD_BYTES: usize = 96 << 20;
+
+/// Most steps of an episode: a day at 10 Hz.
+pub const STEPS: usize = 1 << 20;
+
+/// Most episodes of a list.
+pub const LISTED: usize = 10_000;

@@ -1,0 +1,343 @@
+//! The lines that a scenario adds to an episode's file.
+//!
+//! ```text
+//! {"kind":"scenario", ...}  after the header: the resolved scenario, the ego's size, the route
+//! {"kind":"actors", ...}    one before each frame that a step rendered: where the actors are
+//! {"kind":"event", ...}     contacts, and why the episode ended
+//! {"kind":"result", ...}    before the end: verdict and scores
+//! ```
+//!
+//! A session without a scenario writes none of them.
+
+use std::collections::BTreeMap;
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::{ActorBox, ActorClass};
+use wildcity_sim::contact::{CollisionType, Contact};
+use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox};
+
+/// The scenario that an episode drives.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScenarioLine {
+    /// Its name.
+    pub name: String,
+    /// BLAKE3 of the resolved scenario's JSON, in hex: the identity of the episode beside its seed.
+    pub hash: String,
+    /// The resolved scenario: every value of the sweep put in, jitter drawn.
+    pub scenario: serde_json::Value,
+    /// The ego's size.
+    pub ego: EgoLine,
+    /// The actors, in order of their index.
+    #[serde(default)]
+    pub actors: Vec<ActorLine>,
+    /// The recorded drive from where the episode starts; empty if there is none to follow.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub route: Vec<RoutePoint>,
+    /// When the episode ends at the latest, in microseconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub limit_us: Option<i64>,
+    /// Progress that a pass takes, 0 to 1.
+    pub least_progress: f64,
+    /// The lanes of a map near the route; none without a map.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub lanes: Vec<LaneLine>,
+    /// Whether contact with the twin's Gaussians is looked for.
+    #[serde(default)]
+    pub checks_static: bool,
+}
+
+/// The ego's box.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EgoLine {
+    /// Length, width and height, in metres.
+    pub size: [f64; 3],
+    /// From the rear axle forward to the centre, in metres.
+    pub center_x: f64,
+}
+
+/// What does not change about an actor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActorLine {
+    /// Its name.
+    pub name: String,
+    /// Its kind.
+    pub class: ActorClass,
+    /// Length, width and height, in metres.
+    pub size: [f64; 3],
+    /// BLAKE3 of its asset, in hex; absent if it is not drawn.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub asset: Option<String>,
+}
+
+/// A point of the recorded drive: time since the episode's start in microseconds, and place in metres.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RoutePoint(pub i64, pub [f64; 3]);
+
+/// A lane.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LaneLine {
+    /// Its outline, in metres, without repeating the first point.
+    pub outline: Vec<[f64; 2]>,
+    /// Whether it belongs to the route.
+    #[serde(default)]
+    pub route: bool,
+    /// Whether it is an intersection.
+    #[serde(default)]
+    pub intersection: bool,
+}
+
+/// Where the actors are at a step.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActorsLine {
+    /// Steps done.
+    pub step: u64,
+    /// Time, in microseconds.
+    pub time_us: i64,
+    /// Those that are there, by rising index.
+    pub actors: Vec<ActorStateLine>,
+}
+
+/// An actor at a step: index, pose, velocity in m/s along world axes, yaw rate in rad/s.
+///
+/// The pose has all digits, since images depend on it. Velocity and yaw rate are f32: half of their digits would be
+/// noise, and they are a third of a record.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ActorStateLine(pub u16, pub [f64; 3], pub [f64; 4], pub [f32; 3], pub f32);
+
+/// Something that happened at a step.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EventLine {
+    /// Steps done when it was over.
+    pub step: u64,
+    /// When it happened, in microseconds.
+    pub time_us: i64,
+    /// What happened.
+    #[serde(flatten)]
+    pub event: Event,
+}
+
+/// What happened.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// A contact with an actor began.
+    Contact(ContactEvent),
+    /// A contact with the twin's Gaussians began.
+    StaticContact {
+        /// The area that was met, in m².
+        area_m2: f64,
+        /// The ego's speed, in m/s.
+        impact_mps: f64,
+    },
+    /// The trust of an observation fell below its limit.
+    OffModel {
+        /// Its mean trust.
+        trust: f64,
+    },
+    /// A trigger of an actor's script fired.
+    Triggered {
+        /// The actor.
+        actor: u16,
+        /// Index of the trigger in its script.
+        trigger: u32,
+    },
+    /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`, `stuck`, `off_model`.
+    Ended {
+        /// The rule.
+        rule: String,
+    },
+}
+
+/// A contact with an actor.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ContactEvent {
+    /// Index of the actor.
+    pub actor: u16,
+    /// Kind of contact, as `active_front`.
+    pub collision: Collision,
+    /// Whether the boxes overlapped when the episode began, or when the actor appeared.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub at_start: bool,
+    /// Whether the ego is at fault (`wildcity.fault@1`).
+    pub ego_at_fault: bool,
+    /// Unit vector from the ego to the actor.
+    pub normal: [f64; 2],
+    /// Speed against each other, in m/s.
+    pub impact_mps: f64,
+    /// The ego's velocity, in m/s.
+    pub ego_velocity: [f64; 2],
+    /// The actor's velocity, in m/s.
+    pub actor_velocity: [f64; 2],
+}
+
+/// [`CollisionType`] in JSON.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[expect(missing_docs, reason = "the names are those of CollisionType")]
+pub enum Collision {
+    StoppedEgo,
+    StoppedTrack,
+    ActiveRear,
+    ActiveFront,
+    ActiveLateral,
+}
+
+/// Verdict and scores of an episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeResult {
+    /// `passed`, `failed`, `off_model` or `not_judged`.
+    pub verdict: String,
+    /// The faults, by time.
+    pub faults: Vec<FaultLine>,
+    /// What was not judged, and why.
+    pub not_judged: Vec<String>,
+    /// The scores, each with its name and version.
+    pub scores: BTreeMap<String, ScoreLine>,
+}
+
+/// A fault of the ego.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FaultLine {
+    /// Its name, as `contact.at_fault`.
+    pub fault: String,
+    /// When, in microseconds.
+    pub time_us: i64,
+    /// Name of the actor, for a contact with one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actor: Option<String>,
+}
+
+/// A score: its value, or null and the reason.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ScoreLine {
+    /// The value.
+    pub value: Option<f64>,
+    /// Why there is none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// What it was computed from; null what it lacks.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub parts: BTreeMap<String, Option<f64>>,
+}
+
+impl From<CollisionType> for Collision {
+    fn from(kind: CollisionType) -> Self {
+        match kind {
+            CollisionType::StoppedEgo => Self::StoppedEgo,
+            CollisionType::StoppedTrack => Self::StoppedTrack,
+            CollisionType::ActiveRear => Self::ActiveRear,
+            CollisionType::ActiveFront => Self::ActiveFront,
+            CollisionType::ActiveLateral => Self::ActiveLateral,
+        }
+    }
+}
+
+impl From<Collision> for CollisionType {
+    fn from(kind: Collision) -> Self {
+        match kind {
+            Collision::StoppedEgo => Self::StoppedEgo,
+            Collision::StoppedTrack => Self::StoppedTrack,
+            Collision::ActiveRear => Self::ActiveRear,
+            Collision::ActiveFront => Self::ActiveFront,
+            Collision::ActiveLateral => Self::ActiveLateral,
+        }
+    }
+}
+
+impl ContactEvent {
+    /// The event of a contact.
+    pub fn new(contact: &Contact) -> Self {
+        Self {
+            actor: contact.actor,
+            collision: contact.kind.into(),
+            at_start: contact.at_start,
+            ego_at_fault: contact.ego_at_fault,
+            normal: contact.normal.to_array(),
+            impact_mps: contact.impact_mps,
+            ego_velocity: contact.ego_velocity_mps.to_array(),
+            actor_velocity: contact.actor_velocity_mps.to_array(),
+        }
+    }
+
+    /// The contact of an event at a time, in microseconds.
+    pub fn contact(&self, time_us: i64) -> Contact {
+        Contact {
+            actor: self.actor,
+            time_us,
+            at_start: self.at_start,
+            kind: self.collision.into(),
+            ego_at_fault: self.ego_at_fault,
+            normal: DVec2::from_array(self.normal),
+            impact_mps: self.impact_mps,
+            ego_velocity_mps: DVec2::from_array(self.ego_velocity),
+            actor_velocity_mps: DVec2::from_array(self.actor_velocity),
+        }
+    }
+}
+
+impl EventLine {
+    /// The line of a contact.
+    pub fn contact(step: u64, contact: &Contact) -> Self {
+        let event = Event::Contact(ContactEvent::new(contact));
+        Self { step, time_us: contact.time_us, event }
+    }
+}
+
+impl EgoLine {
+    /// The line of a box.
+    pub fn new(ego: &EgoBox) -> Self {
+        let ActorBox { length_m, width_m, height_m } = ego.box_;
+        Self { size: [length_m, width_m, height_m], center_x: ego.center_x_m }
+    }
+}
+
+impl ActorLine {
+    /// The line of an actor.
+    pub fn new(spec: &ActorSpec) -> Self {
+        let ActorBox { length_m, width_m, height_m } = spec.box_;
+        let size = [length_m, width_m, height_m];
+        Self { name: spec.name.clone(), class: spec.class, size, asset: spec.asset.clone() }
+    }
+
+    /// Its box.
+    pub fn box_of(&self) -> ActorBox {
+        let [length_m, width_m, height_m] = self.size;
+        ActorBox { length_m, width_m, height_m }
+    }
+}
+
+impl ActorsLine {
+    /// The line of the actors that are there.
+    pub fn new(step: u64, time_us: i64, states: &[ActorState]) -> Self {
+        let there = states.iter().filter(|state| state.present);
+        Self { step, time_us, actors: there.map(ActorStateLine::new).collect() }
+    }
+}
+
+impl ActorStateLine {
+    fn new(state: &ActorState) -> Self {
+        let Pose { position_m, .. } = state.world_from_actor;
+        Self(
+            state.index,
+            position_m.to_array(),
+            state.world_from_actor.q_wxyz(),
+            state.velocity_mps.as_vec3().to_array(),
+            state.yaw_rate_radps as f32,
+        )
+    }
+
+    /// The state; `None` if the pose is none.
+    pub fn state(&self) -> Option<ActorState> {
+        let Self(index, xyz_m, q_wxyz, velocity_mps, yaw_rate_radps) = *self;
+        Some(ActorState {
+            index,
+            world_from_actor: Pose::checked(xyz_m, q_wxyz).ok()?,
+            velocity_mps: DVec3::from_array(velocity_mps.map(f64::from)),
+            yaw_rate_radps: f64::from(yaw_rate_radps),
+            present: true,
+        })
+    }
+}

@@ -1,0 +1,41 @@
+//! The result of an episode: verdict and scores.
+
+use wildcity_score::own::{self, Judgement};
+use wildcity_score::score;
+
+use crate::drive::drive_record;
+use crate::file::EpisodeFile;
+use crate::lines::{EpisodeResult, FaultLine, ScoreLine};
+
+/// Judges an episode and scores it. `None` if it has no frame.
+///
+/// The same function serves the end of a session and `wildcity episode score`: a record is all that it needs.
+pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
+    let record = drive_record(episode)?;
+    let verdict = own::verdict(&record);
+    let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
+    let fault = |fault: &own::FaultAt| FaultLine {
+        fault: fault.fault.name().to_owned(),
+        time_us: fault.time_us,
+        actor: fault
+            .actor
+            .and_then(|actor| actors.get(usize::from(actor)))
+            .map(|actor| actor.name.clone()),
+    };
+    let line = |score: wildcity_score::Score| {
+        let parts = score.parts.into_iter().map(|(name, part)| (name.to_owned(), part)).collect();
+        (score.name.to_owned(), ScoreLine { value: score.value, reason: score.reason, parts })
+    };
+    let judgement = match verdict.judgement {
+        Judgement::Passed => "passed",
+        Judgement::Failed => "failed",
+        Judgement::OffModel => "off_model",
+        Judgement::NotJudged => "not_judged",
+    };
+    Some(EpisodeResult {
+        verdict: judgement.to_owned(),
+        faults: verdict.faults.iter().map(fault).collect(),
+        not_judged: verdict.not_judged.iter().map(|&reason| reason.to_owned()).collect(),
+        scores: score(&record).into_iter().map(line).collect(),
+    })
+}

@@ -1,0 +1,100 @@
+//! Vehicles and a pedestrian as assets of actors: the street's parked cars in more detail, and a person.
+//!
+//! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not. What they look like
+//! beside the parked cars was judged on pictures.
+
+use glam::DVec3;
+
+use wildcity_scene::{ActorBox, ActorClass, Gaussians};
+
+use super::car_kinds::{HATCHBACK, SEDAN, VAN};
+use super::cars::Car;
+use super::light::Light;
+use super::pedestrian;
+use super::surface::{Paint, Painter};
+
+/// Cells along an edge, as a multiple of those of a parked car: spacings of 2 to 4 cm.
+const DETAIL: usize = 4;
+
+/// An actor that is made by a program and not scanned.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ActorModel {
+    /// The name of its asset.
+    pub name: &'static str,
+    /// Its kind.
+    pub class: ActorClass,
+    /// Its box.
+    pub box_: ActorBox,
+    /// Its Gaussians, of SH degree 1, in its own axes: the origin is on the ground, x points forward and z up.
+    pub gaussians: Gaussians,
+}
+
+impl ActorModel {
+    /// The names of all models.
+    pub const NAMES: [&'static str; 4] = ["hatchback", "sedan", "van", "pedestrian"];
+}
+
+/// Counts changes of the models: assets of another revision are made again.
+pub const ACTOR_REVISION: u32 = 1;
+
+/// All models: a red hatchback, a silver sedan, a white van, and a pedestrian in mid-stride.
+pub fn actor_models() -> Vec<ActorModel> {
+    let cars = [
+        ("hatchback", &HATCHBACK, Paint::matt(0.62, 0.12, 0.11)),
+        ("sedan", &SEDAN, Paint::matt(0.60, 0.62, 0.65)),
+        ("van", &VAN, Paint::matt(0.86, 0.87, 0.88)),
+    ];
+    let light = Light::overhead();
+    let mut models: Vec<ActorModel> = Vec::new();
+    for (name, kind, paint) in cars {
+        let car = Car::model(kind, paint);
+        let mut painter = Painter::detailed(&light, DETAIL);
+        car.paint_model(&mut painter);
+        let DVec3 { x: length_m, y: width_m, z: height_m } = car.size_m();
+        models.push(ActorModel {
+            name,
+            class: ActorClass::Vehicle,
+            box_: ActorBox { length_m, width_m, height_m },
+            gaussians: painter.gaussians,
+        });
+    }
+    let mut painter = Painter::detailed(&light, 1);
+    pedestrian::paint(&mut painter);
+    models.push(ActorModel {
+        name: "pedestrian",
+        class: ActorClass::Pedestrian,
+        box_: ActorBox::PEDESTRIAN,
+        gaussians: painter.gaussians,
+    });
+    models
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_model_fills_its_box() {
+        let models = actor_models();
+        let names: Vec<&str> = models.iter().map(|model| model.name).collect();
+        assert_eq!(names, ActorModel::NAMES);
+        for ActorModel { name, box_, gaussians, .. } in models {
+            box_.check().unwrap();
+            let half_m = 0.5 * DVec3::new(box_.length_m, box_.width_m, box_.height_m);
+            let (mut low_m, mut high_m) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
+            for &mean_m in &gaussians.means_m {
+                low_m = low_m.min(DVec3::from_array(mean_m));
+                high_m = high_m.max(DVec3::from_array(mean_m));
+            }
+            // Door mirrors reach beyond a car's width, as they do beyond the width in its papers.
+            let beyond_m = DVec3::new(0.12, 0.2, 0.05);
+            let wanted_low_m = DVec3::new(-half_m.x, -half_m.y, 0.0);
+            let wanted_high_m = DVec3::new(half_m.x, half_m.y, 2.0 * half_m.z);
+            assert!(low_m.cmpge(wanted_low_m - beyond_m).all(), "{name}: {low_m}");
+            assert!(high_m.cmple(wanted_high_m + beyond_m).all(), "{name}: {high_m}");
+            let fills = (high_m - low_m) / (wanted_high_m - wanted_low_m);
+            assert!(fills.cmpge(DVec3::splat(0.8)).all(), "{name} fills {fills} of its box");
+            assert!((4_000..120_000).contains(&gaussians.len()), "{name}: {}", gaussians.len());
+        }
+    }
+}

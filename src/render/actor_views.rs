@@ -1,0 +1,33 @@
+//! How the views of a frame see its actors: each view from the axes of each placed chunk.
+
+use wildcity_scene::actor::PlacedChunk;
+
+use crate::{Frame, View};
+
+/// The views of a frame from the axes of each actor. A frame without actors has none.
+#[derive(Debug, Default)]
+pub(crate) struct ActorViews {
+    /// One list per view of the frame, in order of [`Scene::placed`](wildcity_scene::Scene::placed).
+    relative: Vec<Vec<View>>,
+}
+
+impl ActorViews {
+    pub(crate) fn new(frame: &Frame<'_>) -> Self {
+        let placed: &[PlacedChunk] = &frame.scene.placed;
+        if placed.is_empty() {
+            return Self::default();
+        }
+        let of_view = |view: &View| placed.iter().map(|placed| view.seen_from(placed)).collect();
+        Self { relative: frame.views.iter().map(of_view).collect() }
+    }
+
+    /// One view of the frame from the axes of each placed chunk, in order.
+    pub(crate) fn of(&self, view: usize) -> &[View] {
+        self.relative.get(view).map_or(&[], Vec::as_slice)
+    }
+
+    /// For each view of the frame, the view from the axes of each placed chunk.
+    pub(crate) fn all(&self) -> impl Iterator<Item = &[View]> {
+        self.relative.iter().map(Vec::as_slice)
+    }
+}

@@ -1,0 +1,41 @@
+//! Scores of driven episodes.
+//!
+//! Everything here is a pure function of a [`DriveRecord`]: no renderer, no twin, no clock. A score of another
+//! project is copied with its faults, under the name and the commit of that project; ours, under `wildcity.*@N`, are
+//! corrected. A score that lacks an input has no value but a reason, never 0.
+//!
+//! | module | source |
+//! |---|---|
+//! | [`alpasim`] | NVlabs/alpasim 3032e0c |
+//! | [`navsim`] | autonomousvision/navsim 0a380a9, motional/nuplan-devkit e924167 |
+//! | [`hugsim`] | hyzhou404/HUGSIM 62c690d |
+//! | [`neuroncap`] | atonderski/neuro-ncap ecdcf28 |
+//! | [`bench2drive`] | Thinklab-SJTU/Bench2Drive 7ec25d1 |
+//! | [`own`] | the verdict of this project |
+//! | [`statistics`] | rates and means over many episodes, with their confidence intervals |
+//! | `record` | what an episode is to a score |
+//! | `map`, `polyline` | lanes and lines on the ground |
+//! | `savgol` | the Savitzky-Golay filter of the comfort scores |
+
+mod all;
+pub mod alpasim;
+pub mod bench2drive;
+pub mod hugsim;
+mod map;
+pub mod navsim;
+pub mod neuroncap;
+pub mod own;
+mod polyline;
+mod record;
+mod savgol;
+mod scored;
+pub mod statistics;
+
+pub use all::score;
+pub use map::{Lane, LaneMap, RedArea};
+pub use polyline::Polyline;
+pub use record::{
+    DriveRecord, EgoSample, EgoShape, ReferenceDrive, StaticContact, Track, TrackSample,
+};
+pub use savgol::savgol;
+pub use scored::{Measured, Missing, Score};

@@ -1,0 +1,123 @@
+//! Lanes, as scores need them.
+
+use glam::DVec2;
+
+use wildcity_sim::contact::{Footprint, LanePosition};
+
+use super::polyline::Polyline;
+
+/// A lane, or an intersection, seen from above.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lane {
+    /// Its outline, without repeating the first point. An open set: what lies on the outline is not in it.
+    pub outline_m: Vec<DVec2>,
+    /// Whether it belongs to the ego's route.
+    pub is_on_route: bool,
+    /// Whether it is an intersection.
+    pub is_intersection: bool,
+}
+
+/// A connector that is closed by a red light for some samples.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RedArea {
+    /// Its outline.
+    pub outline_m: Vec<DVec2>,
+    /// The first sample at which it is red, and the first at which it is no more.
+    pub samples: std::ops::Range<usize>,
+}
+
+/// What scores know of the road. Drivable is what lies in any lane.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LaneMap {
+    /// Its lanes.
+    pub lanes: Vec<Lane>,
+    /// The middle of the lanes of the ego's route.
+    pub centerline: Polyline,
+    /// What red lights close.
+    pub red: Vec<RedArea>,
+}
+
+impl Lane {
+    /// Whether a point lies within the lane.
+    pub fn contains(&self, point_m: DVec2) -> bool {
+        contains(&self.outline_m, point_m)
+    }
+}
+
+impl LaneMap {
+    /// Where the corners of a box lie.
+    pub fn position(&self, ego: &Footprint) -> LanePosition {
+        let corners = ego.corners_m();
+        let mut lanes_with_corners = 0;
+        let mut one_holds_all = false;
+        let mut in_any = [false; 4];
+        for lane in &self.lanes {
+            let inside = corners.map(|corner| lane.contains(corner));
+            let count = inside.iter().filter(|&&inside| inside).count();
+            lanes_with_corners += usize::from(count > 0);
+            one_holds_all |= count == 4;
+            for (any, inside) in in_any.iter_mut().zip(inside) {
+                *any |= inside;
+            }
+        }
+        LanePosition {
+            in_multiple_lanes: lanes_with_corners > 1 && !one_holds_all,
+            off_drivable: in_any.contains(&false),
+        }
+    }
+
+    /// Whether a point lies neither in a lane of the route nor in an intersection.
+    pub fn is_off_route(&self, point_m: DVec2) -> bool {
+        let accepted = |lane: &&Lane| lane.is_on_route || lane.is_intersection;
+        !self.lanes.iter().filter(accepted).any(|lane| lane.contains(point_m))
+    }
+
+    /// Whether a point lies in an intersection.
+    pub fn is_in_intersection(&self, point_m: DVec2) -> bool {
+        self.lanes.iter().any(|lane| lane.is_intersection && lane.contains(point_m))
+    }
+
+    /// Whether a box touches an area that is red at a sample.
+    pub fn touches_red(&self, ego: &Footprint, sample: usize) -> bool {
+        let is_red = |area: &&RedArea| area.samples.contains(&sample);
+        self.red.iter().filter(is_red).any(|area| touches(&area.outline_m, ego))
+    }
+}
+
+/// Whether a point lies strictly within an outline: even-odd rule, without the outline itself.
+fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
+    let mut inside = false;
+    for (a, b) in edges(outline_m) {
+        let across = (b - a).perp_dot(point_m - a);
+        let beside = (point_m - a).dot(point_m - b);
+        if across == 0.0 && beside <= 0.0 {
+            return false;
+        }
+        let crosses = (a.y > point_m.y) != (b.y > point_m.y);
+        if crosses && (across > 0.0) == (b.y > a.y) {
+            inside = !inside;
+        }
+    }
+    inside
+}
+
+/// Whether a box and an outline have a point in common; both are closed sets.
+fn touches(outline_m: &[DVec2], ego: &Footprint) -> bool {
+    let corner_inside = ego.corners_m().into_iter().any(|corner| contains(outline_m, corner));
+    let edge_touches = edges(outline_m).any(|(a, b)| {
+        let way = b - a;
+        let edge = Footprint {
+            center_m: 0.5 * (a + b),
+            forward: way.try_normalize().unwrap_or(DVec2::X),
+            length_m: way.length(),
+            width_m: 0.0,
+        };
+        ego.touches(&edge)
+    });
+    corner_inside || edge_touches
+}
+
+fn edges(outline_m: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {
+    let next = outline_m.iter().cycle().skip(1);
+    outline_m.iter().copied().zip(next.copied())
+}

@@ -1,0 +1,247 @@
+//! `wildcity.verdict@1`: whether an episode passed.
+//!
+//! It passes without a contact at fault (`wildcity.fault@1`), with a pedestrian, or with the twin (`wildcity.static@1`),
+//! on the drivable area, and with enough progress. What the record lacks is not judged, and the verdict says so. An
+//! episode that left the trained area before its first fault neither passes nor fails: its images were not reliable.
+
+use serde::Serialize;
+
+use wildcity_scene::ActorClass;
+use wildcity_sim::contact::{Moving, STANDING_MPS, time_to_contact_s};
+
+use super::record::{DriveRecord, EgoSample, Track};
+use super::scored::{Missing, Score};
+
+/// The name of the score: 1 passed, 0 failed.
+pub const NAME: &str = "wildcity.verdict@1";
+
+/// Least progress of a pass, unless the scenario says otherwise.
+pub const LEAST_PROGRESS: f64 = 0.8;
+/// A recording that moves less says nothing of progress, in metres.
+const LEAST_WAY_M: f64 = 2.0;
+
+/// The result.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Judgement {
+    /// No fault.
+    Passed,
+    /// At least one fault.
+    Failed,
+    /// The ego left the trained area before any fault.
+    OffModel,
+    /// The record lacks what a verdict needs.
+    NotJudged,
+}
+
+/// Why an episode failed. Its name is the `type` of the failure in JUnit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub enum Fault {
+    /// A contact with an actor that is the ego's fault.
+    #[serde(rename = "contact.at_fault")]
+    ContactAtFault,
+    /// A contact of a moving ego with a pedestrian.
+    #[serde(rename = "contact.pedestrian")]
+    Pedestrian,
+    /// A contact with the twin.
+    #[serde(rename = "contact.static")]
+    Static,
+    /// A corner of the ego outside of all lanes.
+    #[serde(rename = "off_road")]
+    OffRoad,
+    /// Too little progress.
+    #[serde(rename = "progress")]
+    Progress,
+}
+
+/// A fault and when it happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct FaultAt {
+    /// The fault.
+    pub fault: Fault,
+    /// Its time, in microseconds.
+    pub time_us: i64,
+    /// The actor, for a contact with one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub actor: Option<u16>,
+}
+
+/// The verdict of an episode, with what it was made from.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Verdict {
+    /// The result.
+    pub judgement: Judgement,
+    /// All faults, by time.
+    pub faults: Vec<FaultAt>,
+    /// What was not judged, each with the reason.
+    pub not_judged: Vec<&'static str>,
+    /// Way along the recorded drive over that of the recording in the same time.
+    pub progress: Option<f64>,
+    /// Progress that it takes.
+    pub least_progress: f64,
+    /// The least time to contact with an actor, in seconds.
+    pub least_ttc_s: Option<f64>,
+    /// The greatest speed of an impact, in m/s.
+    pub impact_mps: Option<f64>,
+    /// Largest accelerations, in m/s²: along the car, and v·ω across it. Not of a teleported ego.
+    pub accelerations_mps2: Option<[f64; 2]>,
+}
+
+impl Fault {
+    /// The name in results.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::ContactAtFault => "contact.at_fault",
+            Self::Pedestrian => "contact.pedestrian",
+            Self::Static => "contact.static",
+            Self::OffRoad => "off_road",
+            Self::Progress => "progress",
+        }
+    }
+}
+
+/// Judges an episode.
+pub fn verdict(record: &DriveRecord) -> Verdict {
+    let mut not_judged = Vec::new();
+    let mut faults = contact_faults(record);
+    if record.tracks.is_none() {
+        not_judged.push("contacts: the record has no scenario");
+    }
+    match &record.static_contacts {
+        None => not_judged.push("contact with the twin: it was not looked for"),
+        Some(contacts) => faults.extend(contacts.iter().map(|contact| FaultAt {
+            fault: Fault::Static,
+            time_us: contact.time_us,
+            actor: None,
+        })),
+    }
+    match (&record.map, &record.shape) {
+        (Some(map), Some(shape)) => {
+            let off = |sample| map.position(&shape.footprint(sample)).off_drivable;
+            let first = record.ego.iter().position(off);
+            faults.extend(first.map(|step| FaultAt {
+                fault: Fault::OffRoad,
+                time_us: step as i64 * record.dt_us,
+                actor: None,
+            }));
+        }
+        _ => not_judged.push("drivable area: there is no map"),
+    }
+    let progress = progress(record);
+    match progress {
+        None => not_judged.push("progress: there is no recorded drive to follow"),
+        Some(progress) if progress < record.least_progress => {
+            faults.push(FaultAt { fault: Fault::Progress, time_us: record.end_us(), actor: None });
+        }
+        Some(_) => {}
+    }
+    faults.sort_by_key(|fault| fault.time_us);
+    let impacts = record.contacts.iter().filter(|contact| !contact.at_start);
+    Verdict {
+        judgement: judgement(record, &faults, progress),
+        faults,
+        not_judged,
+        progress,
+        least_progress: record.least_progress,
+        least_ttc_s: least_ttc_s(record),
+        impact_mps: impacts.map(|contact| contact.impact_mps).reduce(f64::max),
+        accelerations_mps2: accelerations_mps2(record),
+    }
+}
+
+fn judgement(record: &DriveRecord, faults: &[FaultAt], progress: Option<f64>) -> Judgement {
+    let first_us = faults.first().map(|fault| fault.time_us);
+    let off_model =
+        record.off_model_us.is_some_and(|off_us| first_us.is_none_or(|fault_us| off_us < fault_us));
+    match (off_model, faults.is_empty(), progress) {
+        (true, ..) => Judgement::OffModel,
+        (false, false, _) => Judgement::Failed,
+        (false, true, None) => Judgement::NotJudged,
+        (false, true, Some(_)) => Judgement::Passed,
+    }
+}
+
+/// Contacts at fault, and those of a moving ego with a pedestrian. Boxes that overlapped at the start are not judged.
+fn contact_faults(record: &DriveRecord) -> Vec<FaultAt> {
+    let tracks = record.tracks.as_deref().unwrap_or_default();
+    let judged = record.contacts.iter().filter(|contact| !contact.at_start);
+    judged
+        .filter_map(|contact| {
+            let class = tracks.get(usize::from(contact.actor)).map(|track| track.class);
+            let moves = contact.ego_velocity_mps.length() > STANDING_MPS;
+            let fault = match (class, contact.ego_at_fault) {
+                (Some(ActorClass::Pedestrian), _) if moves => Fault::Pedestrian,
+                (_, true) => Fault::ContactAtFault,
+                (_, false) => return None,
+            };
+            Some(FaultAt { fault, time_us: contact.time_us, actor: Some(contact.actor) })
+        })
+        .collect()
+}
+
+/// The way along the recorded drive over that of the recording, 0 to 1; 1 if the recording stands (below 2 m, as in
+/// nuPlan).
+fn progress(record: &DriveRecord) -> Option<f64> {
+    let stations_m = record.stations_m()?;
+    let recorded_m = record.recorded_way_m()?;
+    if recorded_m < LEAST_WAY_M {
+        return Some(1.0);
+    }
+    let way_m = stations_m.last()?.0 - stations_m.first()?.0;
+    Some((way_m / recorded_m).clamp(0.0, 1.0))
+}
+
+fn least_ttc_s(record: &DriveRecord) -> Option<f64> {
+    let shape = record.shape?;
+    let tracks = record.tracks.as_deref()?;
+    let at = |step: usize| {
+        let ego = record.ego[step];
+        let own =
+            Moving { footprint: shape.footprint(&ego), velocity_mps: ego.world_velocity_mps() };
+        tracks.iter().filter_map(move |track: &Track| {
+            let other = track.samples.get(step).copied().flatten()?;
+            let other = Moving { footprint: other.footprint, velocity_mps: other.velocity_mps };
+            time_to_contact_s(&own, &other)
+        })
+    };
+    (0..record.ego.len()).flat_map(at).reduce(f64::min)
+}
+
+fn accelerations_mps2(record: &DriveRecord) -> Option<[f64; 2]> {
+    if !record.is_driven {
+        return None;
+    }
+    let most = |value: &dyn Fn(&EgoSample) -> f64| {
+        record.ego.iter().map(|ego| value(ego).abs()).fold(0.0, f64::max)
+    };
+    let along = most(&|ego| ego.acceleration_mps2.x);
+    let across = most(&|ego| ego.velocity_mps.x * ego.yaw_rate_radps);
+    Some([along, across])
+}
+
+impl Verdict {
+    /// The verdict as a score.
+    pub fn score(&self) -> Score {
+        let value = match self.judgement {
+            Judgement::Passed => Ok(1.0),
+            Judgement::Failed => Ok(0.0),
+            Judgement::OffModel => {
+                Err(Missing::new("left the trained area of the twin before any fault"))
+            }
+            Judgement::NotJudged => Err(Missing::new(self.not_judged.join("; "))),
+        };
+        let [along, across] = match self.accelerations_mps2 {
+            Some(accelerations) => accelerations.map(Some),
+            None => [None, None],
+        };
+        let parts = [
+            ("progress", self.progress),
+            ("least_progress", Some(self.least_progress)),
+            ("least_ttc_s", self.least_ttc_s),
+            ("impact_mps", self.impact_mps),
+            ("longitudinal_acceleration_mps2", along),
+            ("lateral_acceleration_mps2", across),
+        ];
+        Score::new(NAME, value, parts)
+    }
+}

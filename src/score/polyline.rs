@@ -1,0 +1,88 @@
+//! Lines on the ground.
+
+use glam::DVec2;
+
+/// A line through points on the ground, with the station of each: its distance from the start along the line.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Polyline {
+    points_m: Vec<DVec2>,
+    stations_m: Vec<f64>,
+}
+
+/// The point of a line that is nearest to another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Projection {
+    /// Its station, in metres.
+    pub station_m: f64,
+    /// Its distance, in metres.
+    pub distance_m: f64,
+    /// Unit vector along the line there; zero on a line of one point.
+    pub along: DVec2,
+    /// Distance to the left of the line, in metres: negative to its right.
+    pub left_m: f64,
+}
+
+impl Polyline {
+    /// A line through points; `None` without a point.
+    pub fn new(points_m: Vec<DVec2>) -> Option<Self> {
+        if points_m.is_empty() {
+            return None;
+        }
+        let mut station_m = 0.0;
+        let steps = points_m.windows(2).map(|pair| {
+            station_m += pair[0].distance(pair[1]);
+            station_m
+        });
+        let stations_m = std::iter::once(0.0).chain(steps).collect();
+        Some(Self { points_m, stations_m })
+    }
+
+    /// Its points.
+    pub fn points_m(&self) -> &[DVec2] {
+        &self.points_m
+    }
+
+    /// Stations of its points, in metres.
+    pub fn stations_m(&self) -> &[f64] {
+        &self.stations_m
+    }
+
+    /// Its length, in metres.
+    pub fn length_m(&self) -> f64 {
+        self.stations_m[self.stations_m.len() - 1]
+    }
+
+    /// The nearest point of the line.
+    pub fn project(&self, point_m: DVec2) -> Projection {
+        self.project_between(point_m, f64::NEG_INFINITY, f64::INFINITY)
+    }
+
+    /// The nearest point of the segments that reach into a range of stations. So an ego on a route that crosses
+    /// itself stays on its own branch.
+    pub fn project_between(&self, point_m: DVec2, from_m: f64, to_m: f64) -> Projection {
+        let first = self.points_m[0];
+        let alone = Projection {
+            station_m: 0.0,
+            distance_m: first.distance(point_m),
+            along: DVec2::ZERO,
+            left_m: 0.0,
+        };
+        let mut nearest: Option<Projection> = None;
+        for k in 1..self.points_m.len() {
+            if self.stations_m[k] < from_m || self.stations_m[k - 1] > to_m {
+                continue;
+            }
+            let start = self.points_m[k - 1];
+            let way = self.points_m[k] - start;
+            let Some(along) = way.try_normalize() else { continue };
+            let ahead_m = (point_m - start).dot(along).clamp(0.0, way.length());
+            let distance_m = (start + ahead_m * along).distance(point_m);
+            if nearest.is_none_or(|nearest| distance_m < nearest.distance_m) {
+                let station_m = self.stations_m[k - 1] + ahead_m;
+                let left_m = along.perp().dot(point_m - start);
+                nearest = Some(Projection { station_m, distance_m, along, left_m });
+            }
+        }
+        nearest.unwrap_or(alone)
+    }
+}

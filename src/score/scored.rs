@@ -1,0 +1,55 @@
+//! A score of an episode: its value, or why there is none.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+/// Why a score has no value: what it needs and the record lacks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Missing {
+    /// As a sentence: `needs a map of the lanes`.
+    pub reason: String,
+}
+
+/// A value, or why there is none.
+pub type Measured = Result<f64, Missing>;
+
+/// A score of one episode.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Score {
+    /// Its name and version: `alpasim.scene@3032e0c`, `wildcity.verdict@1`.
+    pub name: &'static str,
+    /// Its value; null if it lacks an input.
+    pub value: Option<f64>,
+    /// Why it has no value.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// What it was computed from and against: sub-scores, measures, thresholds; null what it lacks.
+    pub parts: BTreeMap<&'static str, Option<f64>>,
+}
+
+impl Missing {
+    /// What is missing.
+    pub fn new(reason: impl Into<String>) -> Self {
+        Self { reason: reason.into() }
+    }
+}
+
+impl Score {
+    /// A score from its value and its parts.
+    pub fn new(
+        name: &'static str,
+        value: Measured,
+        parts: impl IntoIterator<Item = (&'static str, Option<f64>)>,
+    ) -> Self {
+        // JSON has no infinity, and a score is never one.
+        let value = value.and_then(|value| match value.is_finite() {
+            true => Ok(value),
+            false => Err(Missing::new("is not a finite number")),
+        });
+        let reason = value.as_ref().err().map(|missing| missing.reason.clone());
+        let finite = |part: Option<f64>| part.filter(|part| part.is_finite());
+        let parts = parts.into_iter().map(|(name, part)| (name, finite(part))).collect();
+        Self { name, value: value.ok(), reason, parts }
+    }
+}

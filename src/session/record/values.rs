@@ -1,0 +1,72 @@
+//! Compares what a record says beside poses and images with what a replay computes.
+
+use super::format::{FrameRecord, FrameRequest};
+use super::replay_report::WrongValue;
+use crate::episode::{Episode, EpisodeSummary};
+
+/// The first value of a frame that is not the replayed episode's.
+pub(super) fn wrong_in_frame(
+    frame: &FrameRecord,
+    episode: &Episode,
+    rig_cameras: usize,
+    line: usize,
+) -> Option<WrongValue> {
+    unequal(line, "step", &frame.step, &episode.step())
+        .or_else(|| unequal(line, "time_us", &frame.time_us, &episode.time_us()))
+        .or_else(|| wrong_frame_hash(frame, rig_cameras, line))
+}
+
+/// The hash of the shown images must be that of their recorded hashes, which the replay compares with the pixels.
+fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Option<WrongValue> {
+    let hash_of = |images: &[String]| {
+        let mut hasher = blake3::Hasher::new();
+        for image in images {
+            // A hash that is none differs from that of the pixels.
+            let bytes = blake3::Hash::from_hex(image).map_or([0; 32], |hash| *hash.as_bytes());
+            hasher.update(&bytes);
+        }
+        hasher.finalize().to_hex().to_string()
+    };
+    let shown = match frame.request {
+        FrameRequest::Observe => hash_of(&frame.images),
+        FrameRequest::Reset | FrameRequest::Step => {
+            // Those of the last pose; the others are earlier frames of a bundle.
+            let poses = frame.poses.len();
+            let last = poses.checked_sub(1).map_or(0, |k| frame.cameras_of(k, rig_cameras).len());
+            hash_of(&frame.images[frame.images.len().saturating_sub(last)..])
+        }
+    };
+    // Between two decisions nothing is shown, even if a later observation shows what was rendered.
+    let nothing = hash_of(&[]);
+    let is_known = frame.frame_hash == shown
+        || (frame.request != FrameRequest::Observe && frame.frame_hash == nothing);
+    if is_known {
+        return None;
+    }
+    unequal(line, "frame_hash", &frame.frame_hash, &shown)
+}
+
+/// The first value of the last line that is not the replayed episode's. Its trust comes with images and is not
+/// computed again, but the outcome must follow from it.
+pub(super) fn wrong_in_end(
+    end: &EpisodeSummary,
+    episode: &Episode,
+    line: usize,
+) -> Option<WrongValue> {
+    let now = episode.summary_with(end.outcome, end.least_trust);
+    let outcomes = [end.outcome, now.outcome].map(|outcome| format!("{outcome:?}"));
+    unequal(line, "steps", &end.steps, &now.steps)
+        .or_else(|| unequal(line, "time_us", &end.time_us, &now.time_us))
+        .or_else(|| unequal(line, "distance_m", &end.distance_m, &now.distance_m))
+        .or_else(|| unequal(line, "outcome", &outcomes[0], &outcomes[1]))
+}
+
+fn unequal<T: PartialEq + std::fmt::Display>(
+    line: usize,
+    field: &'static str,
+    recorded: &T,
+    now: &T,
+) -> Option<WrongValue> {
+    let wrong = || WrongValue { line, field, recorded: recorded.to_string(), now: now.to_string() };
+    (recorded != now).then(wrong)
+}

@@ -1,0 +1,86 @@
+//! What a scenario refers to, and how its parts look that up.
+
+use glam::DVec3;
+
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::{ActorBox, ActorClass, Trajectory};
+
+use super::error::{FileError, in_range, listed};
+use super::tracks::TracksFile;
+use crate::limits;
+use crate::map::Map;
+
+/// What a scenario refers to.
+#[derive(Clone, Copy)]
+pub struct Surroundings<'a> {
+    /// Recorded drives of the twin.
+    pub drives: &'a [Trajectory],
+    /// The tracks file that the scenario names.
+    pub tracks: Option<&'a TracksFile>,
+    /// The map that the scenario names.
+    pub map: Option<&'a Map>,
+    /// Looks up an asset by its hash or by the name of a built-in one.
+    pub asset: &'a dyn Fn(&str) -> Option<AssetInfo>,
+}
+
+/// What a scenario needs to know about an asset.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AssetInfo {
+    /// Its hash, 64 lower-case hex digits.
+    pub hash: String,
+    /// Its kind.
+    pub class: ActorClass,
+    /// Its box.
+    pub box_: ActorBox,
+}
+
+/// Where the ego starts.
+#[derive(Clone, Debug, PartialEq)]
+pub enum EgoStart {
+    /// At a pose, `world_from_rig`.
+    Pose(Pose),
+    /// Along a recorded trajectory.
+    Station {
+        /// Its name.
+        trajectory: String,
+        /// Distance along it, in metres.
+        station_m: f64,
+    },
+}
+
+impl std::fmt::Debug for Surroundings<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Surroundings").field("drives", &self.drives.len()).finish_non_exhaustive()
+    }
+}
+
+/// A recorded drive by its name.
+pub(super) fn drive_named<'a>(
+    path: &str,
+    name: &str,
+    drives: &'a [Trajectory],
+) -> Result<&'a Trajectory, FileError> {
+    let found = drives.iter().find(|drive| drive.name == *name);
+    found.ok_or_else(|| {
+        let known = listed(drives.iter().map(|drive| drive.name.as_str()));
+        FileError::new(path, format!("the twin has no trajectory {name:?}; it has {known}"))
+    })
+}
+
+/// Points of a file.
+pub(super) fn points_of(path: &str, points: &[[f64; 3]]) -> Result<Vec<DVec3>, FileError> {
+    if !(2..=limits::COURSE_POINTS).contains(&points.len()) {
+        let message =
+            format!("{} points; 2 to {} are accepted", points.len(), limits::COURSE_POINTS);
+        return Err(FileError::new(path, message));
+    }
+    let most_m = Pose::MAX_COORDINATE_M;
+    let mut points_m = Vec::with_capacity(points.len());
+    for (index, point) in points.iter().enumerate() {
+        for (axis, value) in point.iter().enumerate() {
+            in_range(&format!("{path}[{index}][{axis}]"), *value, [-most_m, most_m])?;
+        }
+        points_m.push(DVec3::from_array(*point));
+    }
+    Ok(points_m)
+}

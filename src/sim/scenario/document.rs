@@ -1,0 +1,243 @@
+//! A scenario with its sweep: from text to one file for each combination of values.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde_json::Value;
+
+use super::error::{FileError, json, typed};
+use super::file::{ScenarioFile, SweepSection};
+use crate::limits;
+
+/// A scenario whose `$name` values are not chosen yet.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Document {
+    value: Value,
+    sweep: SweepSection,
+}
+
+/// One combination of a sweep.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Case {
+    /// The seed.
+    pub seed: u64,
+    /// The value of each `$name`.
+    pub values: BTreeMap<String, Value>,
+}
+
+impl Document {
+    /// Reads a scenario's JSON, and checks that each `$name` has values and each value is used.
+    ///
+    /// # Errors
+    /// Names the place of the first mistake.
+    pub fn parse(bytes: &[u8]) -> Result<Self, FileError> {
+        Self::from_json(json(bytes, "scenario", limits::SCENARIO_BYTES)?)
+    }
+
+    /// The same from JSON that is parsed already.
+    ///
+    /// # Errors
+    /// As [`Self::parse`].
+    pub fn from_json(mut value: Value) -> Result<Self, FileError> {
+        let format = value.get("format").and_then(Value::as_str);
+        if format != Some(ScenarioFile::FORMAT) {
+            let message = format!("{format:?}; write {:?}", ScenarioFile::FORMAT);
+            return Err(FileError::new("format", message));
+        }
+        remove_notes(&mut value);
+        let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
+            None => SweepSection::default(),
+            Some(sweep) => {
+                typed::<SweepSection>(sweep, "sweep").map_err(|error| error.within_root("sweep"))?
+            }
+        };
+        let document = Self { value, sweep };
+        document.check_sweep()?;
+        Ok(document)
+    }
+
+    /// Every combination of the sweep: seeds vary fastest, then the values of the last name.
+    pub fn cases(&self) -> Vec<Case> {
+        let mut combinations = vec![BTreeMap::new()];
+        for (name, values) in &self.sweep.values {
+            let mut longer = Vec::with_capacity(combinations.len() * values.len());
+            for combination in &combinations {
+                for value in values {
+                    let mut with = combination.clone();
+                    with.insert(name.clone(), value.clone());
+                    longer.push(with);
+                }
+            }
+            combinations = longer;
+        }
+        let [first, last] = self.sweep.seeds.unwrap_or([0, 0]);
+        let seeded = |values: BTreeMap<String, Value>| {
+            (first..=last).map(move |seed| Case { seed, values: values.clone() })
+        };
+        combinations.into_iter().flat_map(seeded).collect()
+    }
+
+    /// The first value of each name.
+    pub fn first_values(&self) -> BTreeMap<String, Value> {
+        let values = self.sweep.values.iter();
+        values.map(|(name, values)| (name.clone(), values[0].clone())).collect()
+    }
+
+    /// The scenario with chosen values.
+    ///
+    /// # Errors
+    /// A name has no value, or the file with these values is malformed.
+    pub fn with(&self, values: &BTreeMap<String, Value>) -> Result<ScenarioFile, FileError> {
+        let mut value = self.value.clone();
+        replace_names(&mut value, values, &mut String::new())?;
+        typed(value, "scenario")
+    }
+
+    fn check_sweep(&self) -> Result<(), FileError> {
+        let mut used = BTreeSet::new();
+        collect_names(&self.value, &mut used);
+        let mut count: u64 = 1;
+        for (name, values) in &self.sweep.values {
+            let path = format!("sweep.{name}");
+            if values.is_empty() {
+                return Err(FileError::new(path, "has no values; list at least one"));
+            }
+            if !used.contains(name) {
+                let message = format!("is not used: write \"${name}\" in place of a value");
+                return Err(FileError::new(path, message));
+            }
+            count = count.saturating_mul(values.len() as u64);
+        }
+        if let Some([first, last]) = self.sweep.seeds {
+            if first > last {
+                let message = format!("[{first}, {last}]; write the first and the last seed");
+                return Err(FileError::new("sweep.seeds", message));
+            }
+            count = count.saturating_mul((last - first).saturating_add(1));
+        }
+        if count > limits::SWEEP_CASES {
+            let message = format!("{count} combinations; at most {} are run", limits::SWEEP_CASES);
+            return Err(FileError::new("sweep", message));
+        }
+        match used.iter().find(|name| !self.sweep.values.contains_key(*name)) {
+            None => Ok(()),
+            Some(name) => {
+                let message = format!("has no values for \"${name}\"; list them as {name:?}: [..]");
+                Err(FileError::new("sweep", message))
+            }
+        }
+    }
+}
+
+impl FileError {
+    /// The path of a part that was read by itself.
+    fn within_root(self, root: &str) -> Self {
+        if self.path == root { self } else { self.within(root) }
+    }
+}
+
+/// Removes the comments of all objects.
+fn remove_notes(value: &mut Value) {
+    match value {
+        Value::Object(fields) => {
+            fields.remove("note");
+            fields.values_mut().for_each(remove_notes);
+        }
+        Value::Array(items) => items.iter_mut().for_each(remove_notes),
+        _ => {}
+    }
+}
+
+/// The name of a `$name` string.
+fn sweep_name(text: &str) -> Option<&str> {
+    text.strip_prefix('$').filter(|name| !name.is_empty())
+}
+
+fn collect_names(value: &Value, names: &mut BTreeSet<String>) {
+    match value {
+        Value::String(text) => names.extend(sweep_name(text).map(str::to_owned)),
+        Value::Array(items) => items.iter().for_each(|item| collect_names(item, names)),
+        Value::Object(fields) => fields.values().for_each(|item| collect_names(item, names)),
+        _ => {}
+    }
+}
+
+fn replace_names(
+    value: &mut Value,
+    values: &BTreeMap<String, Value>,
+    path: &mut String,
+) -> Result<(), FileError> {
+    let length = path.len();
+    match value {
+        Value::String(text) => {
+            if let Some(name) = sweep_name(text) {
+                let Some(chosen) = values.get(name) else {
+                    let message =
+                        format!("\"${name}\" has no value: give one, or a sweep over {name:?}");
+                    return Err(FileError::new(path.trim_start_matches('.'), message));
+                };
+                *value = chosen.clone();
+            }
+        }
+        Value::Array(items) => {
+            for (index, item) in items.iter_mut().enumerate() {
+                path.push_str(&format!("[{index}]"));
+                replace_names(item, values, path)?;
+                path.truncate(length);
+            }
+        }
+        Value::Object(fields) => {
+            for (name, item) in fields.iter_mut() {
+                path.push('.');
+                path.push_str(name);
+                replace_names(item, values, path)?;
+                path.truncate(length);
+            }
+        }
+        _ => {}
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn scenario(sweep: Value, speed: Value) -> Value {
+        json!({"format": "wildcity.scenario/1", "name": "cut-in", "note": "a comment",
+               "twin": {"name": "street", "note": "another"},
+               "actors": [{"name": "van", "idm": {"along": "log", "station_m": 5, "speed": speed}}],
+               "sweep": sweep})
+    }
+
+    #[test]
+    fn a_sweep_has_every_combination() {
+        let sweep = json!({"seeds": [3, 4], "v": [6, 8, 10]});
+        let document = Document::from_json(scenario(sweep, json!("$v"))).unwrap();
+        let cases = document.cases();
+        assert_eq!(cases.len(), 6);
+        assert_eq!((cases[1].seed, &cases[1].values["v"]), (4, &json!(6)));
+        let file = document.with(&cases[5].values).unwrap();
+        assert_eq!(file.actors[0].idm.as_ref().unwrap().speed, 10.0);
+    }
+
+    #[test]
+    fn mistakes_name_their_place() {
+        let path = |value: Value| {
+            let document = match Document::from_json(value) {
+                Err(error) => return error.path,
+                Ok(document) => document,
+            };
+            document.with(&document.first_values()).unwrap_err().path
+        };
+        assert_eq!(path(json!({"format": "other"})), "format");
+        assert_eq!(path(scenario(json!({"v": []}), json!("$v"))), "sweep.v");
+        assert_eq!(path(scenario(json!({"v": [1]}), json!(3))), "sweep.v");
+        assert_eq!(path(scenario(json!({}), json!("$v"))), "sweep");
+        assert_eq!(path(scenario(json!({"v": 3}), json!("$v"))), "sweep.v");
+        assert_eq!(path(scenario(json!({"seeds": [2, 1]}), json!(3))), "sweep.seeds");
+        assert_eq!(path(scenario(json!({"seeds": [0, u64::MAX]}), json!(3))), "sweep");
+        assert_eq!(path(scenario(json!({"v": ["fast"]}), json!("$v"))), "actors[0].idm.speed");
+        assert_eq!(path(scenario(Value::Null, json!(true))), "sweep");
+    }
+}

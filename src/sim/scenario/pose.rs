@@ -1,0 +1,28 @@
+//! Poses of scenario files.
+
+use glam::DQuat;
+
+use wildcity_scene::geometry::Pose;
+
+use super::error::FileError;
+use super::file::PoseSection;
+
+/// A pose of a file, checked.
+pub(super) fn pose_of(path: &str, section: &PoseSection) -> Result<Pose, FileError> {
+    let refused = |field: &str, message: String| FileError::new(format!("{path}.{field}"), message);
+    let q_wxyz = match (section.q, section.yaw_rad) {
+        (Some(_), Some(_)) => {
+            return Err(refused("q", "is there beside yaw_rad; write one of them".to_owned()));
+        }
+        (Some(q), None) => q,
+        (None, yaw_rad) => {
+            let yaw_rad = yaw_rad.unwrap_or(0.0);
+            if !yaw_rad.is_finite() {
+                return Err(refused("yaw_rad", format!("{yaw_rad:?}; write a finite number")));
+            }
+            let rotation = DQuat::from_rotation_z(yaw_rad);
+            [rotation.w, rotation.x, rotation.y, rotation.z]
+        }
+    };
+    Pose::checked(section.xyz, q_wxyz).map_err(|error| refused(error.field(), error.to_string()))
+}

@@ -1,0 +1,200 @@
+//! Actors that follow a course: at a speed of their own, or by the Intelligent Driver Model.
+
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+
+use wildcity_scene::ActorBox;
+use wildcity_scene::geometry::Pose;
+
+use super::course::{Course, turned_rad};
+use super::idm::{Idm, rolled};
+use super::lateral::Lateral;
+use super::lead::{Body, Corridor, Lead, lead_ahead};
+use super::script::Action;
+use super::state::ActorState;
+use crate::limits;
+
+/// An actor on a course.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Follow {
+    /// The courses of the actor: it begins on the first, and actions name the others.
+    pub courses: Vec<Arc<Course>>,
+    /// Where it begins, in metres along the first course.
+    pub station_m: f64,
+    /// How far to the left of the course it drives, in metres.
+    pub offset_m: f64,
+    /// Its speed at the begin, in m/s.
+    pub speed_mps: f64,
+    /// The model that keeps it behind others; without one it drives at its speed through everything.
+    pub idm: Option<Idm>,
+    /// Whether it disappears at the end of its course. Otherwise it stands there.
+    pub leaves: bool,
+}
+
+/// Where an actor is on its course.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Following {
+    course: usize,
+    pub(super) station_m: f64,
+    pub(super) speed_mps: f64,
+    /// The speed of a free road, in m/s.
+    free_mps: f64,
+    order: Option<SpeedOrder>,
+    lateral: Lateral,
+}
+
+/// A change of speed that a script orders.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct SpeedOrder {
+    to_mps: f64,
+    rate_mps2: f64,
+}
+
+impl Follow {
+    /// At the begin.
+    pub(super) fn begin(&self) -> Following {
+        Following {
+            course: 0,
+            station_m: self.station_m,
+            speed_mps: self.speed_mps,
+            free_mps: self.idm.map_or(self.speed_mps, |idm| idm.free_speed_mps),
+            order: None,
+            lateral: Lateral::at(self.offset_m),
+        }
+    }
+
+    /// The course that the actor is on.
+    pub(super) fn course(&self, now: &Following) -> &Course {
+        &self.courses[now.course]
+    }
+
+    /// After an action of its script.
+    pub(super) fn ordered(&self, now: &Following, action: Action) -> Following {
+        match action {
+            Action::Speed { to_mps, rate_mps2 } => {
+                let free_mps = if to_mps > 0.0 { to_mps } else { now.free_mps };
+                Following { order: Some(SpeedOrder { to_mps, rate_mps2 }), free_mps, ..*now }
+            }
+            Action::Offset { to_m, over_s } => {
+                Following { lateral: now.lateral.moving_to(to_m, over_s, now.speed_mps), ..*now }
+            }
+            Action::Course { course } => {
+                let place_m = self.pose(now).position_m;
+                let beside = self.courses[course].nearest(place_m);
+                let lateral = Lateral::at(beside.left_m);
+                Following { course, station_m: beside.station_m, lateral, ..*now }
+            }
+            Action::Spawn | Action::Remove => *now,
+        }
+    }
+
+    /// After a sub-step. `None` if the actor has left.
+    pub(super) fn after(
+        &self,
+        now: &Following,
+        box_: &ActorBox,
+        own: u16,
+        bodies: &[Body],
+        duration_s: f64,
+    ) -> Option<Following> {
+        let course = self.course(now);
+        let lead = self.idm.and_then(|idm| self.lead(now, &idm, box_, own, bodies));
+        let acceleration = self.acceleration(now, lead, duration_s);
+        let [way_m, speed_mps] = rolled(now.speed_mps, acceleration, duration_s);
+
+        // A line that lies d to the left of one with curvature k is (1 - k d) as long.
+        let stretch = 1.0 - course.curvature_1_m(now.station_m) * now.lateral.offset_m();
+        let station_m = now.station_m + way_m / stretch.max(0.1);
+        let lateral = now.lateral.after(duration_s, 0.5 * (now.speed_mps + speed_mps));
+        let order = now.order.filter(|order| order.to_mps == 0.0 || speed_mps != order.to_mps);
+        let next = Following { station_m, speed_mps, lateral, order, ..*now };
+        let length_m = course.length_m();
+        match (station_m >= length_m, self.leaves) {
+            (false, _) => Some(next),
+            (true, true) => None,
+            (true, false) => Some(Following { station_m: length_m, speed_mps: 0.0, ..next }),
+        }
+    }
+
+    /// Acceleration in m/s²: that of the model, that of an order, or the lesser of both.
+    fn acceleration(&self, now: &Following, lead: Option<Lead>, duration_s: f64) -> f64 {
+        let ordered = now.order.map(|order| {
+            let needed = (order.to_mps - now.speed_mps) / duration_s;
+            needed.clamp(-order.rate_mps2, order.rate_mps2)
+        });
+        let Some(idm) = self.idm else { return ordered.unwrap_or(0.0) };
+        let lead = lead.unwrap_or(Lead { gap_m: f64::INFINITY, speed_mps: now.speed_mps });
+        // While it brakes to a lower speed, the term of the free road would brake at its own rate instead.
+        let free_speed_mps = now.free_mps.max(ordered.map_or(0.0, |_| now.speed_mps));
+        let model = Idm { free_speed_mps, ..idm };
+        let followed = model.acceleration(now.speed_mps, lead.speed_mps, lead.gap_m);
+        ordered.map_or(followed, |ordered| ordered.min(followed))
+    }
+
+    /// What the actor follows: the nearest body in its corridor, or the end of its course, which is a wall.
+    fn lead(
+        &self,
+        now: &Following,
+        idm: &Idm,
+        box_: &ActorBox,
+        own: u16,
+        bodies: &[Body],
+    ) -> Option<Lead> {
+        let course = self.course(now);
+        let [least_m, most_m] = limits::LEAD_M;
+        let half_width_m = 0.5 * box_.width_m;
+        let offset_m = now.lateral.offset_m();
+        let target_m = now.lateral.target_m();
+        let corridor = Corridor {
+            station_m: now.station_m,
+            edges_m: [offset_m.min(target_m) - half_width_m, offset_m.max(target_m) + half_width_m],
+            half_length_m: 0.5 * box_.length_m,
+            height_m: box_.height_m,
+            ahead_m: (limits::LEAD_GAPS * idm.desired_gap_m(now.speed_mps, 0.0))
+                .clamp(least_m, most_m),
+        };
+        let body = lead_ahead(course, &corridor, own, bodies);
+        if self.leaves {
+            return body;
+        }
+        let gap_m = course.length_m() - now.station_m - corridor.half_length_m;
+        let end = Lead { gap_m, speed_mps: 0.0 };
+        Some(body.filter(|body| body.gap_m <= end.gap_m).unwrap_or(end))
+    }
+
+    /// The pose of an actor at a place.
+    fn pose(&self, at: &Following) -> Pose {
+        let on_course = self.course(at).at(at.station_m);
+        let offset_m = at.lateral.offset_m();
+        let rate_mps = at.lateral.rate_mps(at.speed_mps);
+        let position_m = on_course.position_m + on_course.rotation * (offset_m * DVec3::Y);
+        let rotation = match rate_mps == 0.0 {
+            true => on_course.rotation,
+            false => on_course.rotation * DQuat::from_rotation_z(rate_mps.atan2(at.speed_mps)),
+        };
+        Pose { position_m, rotation: rotation.normalize() }
+    }
+
+    /// The state at a place, `duration_s` after the pose `before`.
+    pub(super) fn state(
+        &self,
+        index: u16,
+        at: &Following,
+        before: Option<(Pose, f64)>,
+    ) -> ActorState {
+        let pose = self.pose(at);
+        let rate_mps = at.lateral.rate_mps(at.speed_mps);
+        let speed_mps = at.speed_mps.hypot(rate_mps);
+        let yaw_rate_radps = before.map_or(0.0, |(before, duration_s)| {
+            turned_rad(before.rotation, pose.rotation) / duration_s
+        });
+        ActorState {
+            index,
+            world_from_actor: pose,
+            velocity_mps: pose.rotation * (speed_mps * DVec3::X),
+            yaw_rate_radps,
+            present: true,
+        }
+    }
+}

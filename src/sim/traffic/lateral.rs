@@ -1,0 +1,124 @@
+//! Lateral moves of an actor on its course: from one offset to another by a quintic.
+
+/// The offset from the course, to the left, in metres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Lateral {
+    /// Coefficients of the polynomial in the move's own time, in seconds: metres, m/s, m/s² and so on.
+    coefficients: [f64; 6],
+    /// The move's own time so far, in seconds. It stands still while the actor does.
+    elapsed_s: f64,
+    /// When the move ends.
+    duration_s: f64,
+    /// Where it ends, in metres.
+    target_m: f64,
+    /// Speed at which the move's own time is the time, in m/s: that at its begin, but at least 1.
+    speed_mps: f64,
+}
+
+impl Lateral {
+    /// At an offset, without a move.
+    pub(super) fn at(offset_m: f64) -> Self {
+        Self {
+            coefficients: [offset_m, 0.0, 0.0, 0.0, 0.0, 0.0],
+            elapsed_s: 0.0,
+            duration_s: 0.0,
+            target_m: offset_m,
+            speed_mps: 1.0,
+        }
+    }
+
+    /// A move to `target_m` within `duration_s` from the present offset, rate and acceleration. It arrives with
+    /// neither rate nor acceleration: the quintic with these six conditions.
+    pub(super) fn moving_to(&self, target_m: f64, duration_s: f64, speed_mps: f64) -> Self {
+        let [from_m, rate, acceleration] = self.derivatives();
+        let way_m = target_m - from_m;
+        let t = duration_s;
+        let [t2, t3, t4, t5] = [t * t, t.powi(3), t.powi(4), t.powi(5)];
+        let cubic = (20.0 * way_m - 12.0 * rate * t - 3.0 * acceleration * t2) / (2.0 * t3);
+        let quartic = (-30.0 * way_m + 16.0 * rate * t + 3.0 * acceleration * t2) / (2.0 * t4);
+        let quintic = (12.0 * way_m - 6.0 * rate * t - acceleration * t2) / (2.0 * t5);
+        Self {
+            coefficients: [from_m, rate, 0.5 * acceleration, cubic, quartic, quintic],
+            elapsed_s: 0.0,
+            duration_s,
+            target_m,
+            speed_mps: speed_mps.max(1.0),
+        }
+    }
+
+    /// After `duration_s` at a mean speed. The move slows down with the actor, so that it never slides sideways.
+    pub(super) fn after(&self, duration_s: f64, speed_mps: f64) -> Self {
+        let pace = (speed_mps / self.speed_mps).min(1.0);
+        let elapsed_s = self.elapsed_s + pace * duration_s;
+        if elapsed_s >= self.duration_s {
+            return Self::at(self.target_m);
+        }
+        Self { elapsed_s, ..*self }
+    }
+
+    /// The present offset, in metres.
+    pub(super) fn offset_m(&self) -> f64 {
+        self.derivatives()[0]
+    }
+
+    /// The present rate at a speed, in m/s to the left.
+    pub(super) fn rate_mps(&self, speed_mps: f64) -> f64 {
+        self.derivatives()[1] * (speed_mps / self.speed_mps).min(1.0)
+    }
+
+    /// Where the move ends, in metres.
+    pub(super) fn target_m(&self) -> f64 {
+        self.target_m
+    }
+
+    /// Offset, rate and acceleration in the move's own time.
+    fn derivatives(&self) -> [f64; 3] {
+        let [a, b, c, d, e, f] = self.coefficients;
+        let t = self.elapsed_s;
+        [
+            a + t * (b + t * (c + t * (d + t * (e + t * f)))),
+            b + t * (2.0 * c + t * (3.0 * d + t * (4.0 * e + t * 5.0 * f))),
+            2.0 * c + t * (6.0 * d + t * (12.0 * e + t * 20.0 * f)),
+        ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lane_change_arrives_smoothly() {
+        let mut lateral = Lateral::at(-3.5).moving_to(0.0, 4.0, 10.0);
+        for _ in 0..200 {
+            lateral = lateral.after(0.01, 10.0);
+        }
+        // The middle: half the way, at the largest rate, 15/8 of the mean.
+        assert!((lateral.offset_m() + 1.75).abs() < 1e-9, "{lateral:?}");
+        assert!((lateral.rate_mps(10.0) - 1.875 * 3.5 / 4.0).abs() < 1e-9);
+        for _ in 0..201 {
+            lateral = lateral.after(0.01, 10.0);
+        }
+        assert_eq!(lateral, Lateral::at(0.0));
+    }
+
+    #[test]
+    fn a_second_move_continues_the_first() {
+        let mut lateral = Lateral::at(0.0).moving_to(2.0, 2.0, 5.0);
+        for _ in 0..90 {
+            lateral = lateral.after(0.01, 5.0);
+        }
+        let back = lateral.moving_to(0.0, 3.0, 5.0);
+        assert!((back.offset_m() - lateral.offset_m()).abs() < 1e-12);
+        assert!((back.rate_mps(5.0) - lateral.rate_mps(5.0)).abs() < 1e-12);
+        let end = back.after(2.999_999, 5.0);
+        assert!(end.offset_m().abs() < 1e-9 && end.rate_mps(5.0).abs() < 1e-6, "{end:?}");
+    }
+
+    #[test]
+    fn an_actor_that_stands_does_not_slide() {
+        let lateral = Lateral::at(0.0).moving_to(2.0, 2.0, 5.0).after(0.5, 5.0);
+        assert_eq!(lateral.after(1.0, 0.0), lateral);
+        assert_eq!(lateral.rate_mps(0.0), 0.0);
+    }
+}

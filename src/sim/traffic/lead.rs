@@ -1,0 +1,142 @@
+//! The vehicle ahead: the nearest box in the corridor of an actor's course.
+
+use glam::DVec3;
+
+use super::course::{Course, flat};
+use super::state::{ActorSpec, ActorState, EgoBox, EgoState};
+
+/// A box on the ground, as leads are searched among.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Body {
+    /// Index of the actor; `None` for the ego.
+    pub(super) actor: Option<u16>,
+    /// Middle of the box on the ground, in metres.
+    pub(super) center_m: DVec3,
+    /// Horizontal direction of its length; a unit vector, or zero for a box that points up.
+    forward: DVec3,
+    half_length_m: f64,
+    half_width_m: f64,
+    height_m: f64,
+    /// Velocity, in m/s.
+    pub(super) velocity_mps: DVec3,
+    /// Yaw rate, in rad/s.
+    pub(super) yaw_rate_radps: f64,
+}
+
+/// What an actor follows.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Lead {
+    /// From the own front to the lead's rear along the course, in metres; below 0 if they overlap.
+    pub(super) gap_m: f64,
+    /// The lead's speed along the course, in m/s.
+    pub(super) speed_mps: f64,
+}
+
+/// Where an actor looks for a lead.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Corridor {
+    /// The own station, in metres.
+    pub(super) station_m: f64,
+    /// The right and the left edge, in metres to the left of the course.
+    pub(super) edges_m: [f64; 2],
+    /// Half of the own length, in metres.
+    pub(super) half_length_m: f64,
+    /// Own height, in metres.
+    pub(super) height_m: f64,
+    /// How far to look from the own centre, in metres.
+    pub(super) ahead_m: f64,
+}
+
+impl Body {
+    pub(super) fn of_actor(spec: &ActorSpec, state: &ActorState) -> Self {
+        let pose = state.world_from_actor;
+        Self {
+            actor: Some(state.index),
+            center_m: pose.position_m,
+            forward: flat(pose.rotation * DVec3::X).normalize_or_zero(),
+            half_length_m: 0.5 * spec.box_.length_m,
+            half_width_m: 0.5 * spec.box_.width_m,
+            height_m: spec.box_.height_m,
+            velocity_mps: state.velocity_mps,
+            yaw_rate_radps: state.yaw_rate_radps,
+        }
+    }
+
+    pub(super) fn of_ego(ego: &EgoState, ego_box: &EgoBox) -> Self {
+        let pose = ego.world_from_rig;
+        let ahead_m = pose.rotation * (ego_box.center_x_m * DVec3::X);
+        Self {
+            actor: None,
+            center_m: pose.position_m + ahead_m,
+            forward: flat(pose.rotation * DVec3::X).normalize_or_zero(),
+            half_length_m: 0.5 * ego_box.box_.length_m,
+            half_width_m: 0.5 * ego_box.box_.width_m,
+            height_m: ego_box.box_.height_m,
+            velocity_mps: ego.velocity_mps,
+            yaw_rate_radps: ego.yaw_rate_radps,
+        }
+    }
+}
+
+/// The nearest body ahead in the corridor; of equally near ones the slowest, so that their order cannot matter.
+pub(super) fn lead_ahead(
+    course: &Course,
+    corridor: &Corridor,
+    own: u16,
+    bodies: &[Body],
+) -> Option<Lead> {
+    let own_m = course.point_m(corridor.station_m);
+    let [right_m, left_m] = corridor.edges_m;
+    let to_m = corridor.station_m + corridor.ahead_m;
+    let aside_m = right_m.abs().max(left_m.abs());
+    let mut lead: Option<Lead> = None;
+    for body in bodies.iter().filter(|body| body.actor != Some(own)) {
+        // A body that is farther away than the corridor is long cannot be in it.
+        let reach_m = aside_m + body.half_length_m.hypot(body.half_width_m);
+        let farthest_m = corridor.ahead_m + reach_m;
+        if (body.center_m - own_m).length_squared() > farthest_m * farthest_m {
+            continue;
+        }
+        let Some(found) = found_in(course, corridor, body, reach_m, to_m) else { continue };
+        let is_nearer =
+            lead.is_none_or(|lead| (found.gap_m, found.speed_mps) < (lead.gap_m, lead.speed_mps));
+        if is_nearer {
+            lead = Some(found);
+        }
+    }
+    lead
+}
+
+/// A body as a lead, if it is ahead in the corridor.
+fn found_in(
+    course: &Course,
+    corridor: &Corridor,
+    body: &Body,
+    reach_m: f64,
+    to_m: f64,
+) -> Option<Lead> {
+    let station_m = course.first_within(body.center_m, reach_m, corridor.station_m, to_m)?;
+    let beside = course.nearest_between(body.center_m, station_m, station_m + 2.0 * reach_m);
+    if beside.station_m <= corridor.station_m {
+        return None;
+    }
+    let pose = course.at(beside.station_m);
+    // A bridge above is not in the way.
+    let above_m = body.center_m.z - pose.position_m.z;
+    if above_m >= corridor.height_m || above_m <= -body.height_m {
+        return None;
+    }
+    // The extents of the turned box along and across the course.
+    let ahead = flat(pose.rotation * DVec3::X).normalize_or_zero();
+    let cos = body.forward.dot(ahead).abs();
+    let sin = body.forward.cross(ahead).z.abs();
+    let half_along_m = body.half_length_m * cos + body.half_width_m * sin;
+    let half_across_m = body.half_length_m * sin + body.half_width_m * cos;
+    let [right_m, left_m] = corridor.edges_m;
+    let is_inside =
+        beside.left_m - half_across_m < left_m && beside.left_m + half_across_m > right_m;
+    is_inside.then(|| Lead {
+        gap_m: beside.station_m - half_along_m - corridor.station_m - corridor.half_length_m,
+        speed_mps: body.velocity_mps.dot(ahead),
+    })
+}

@@ -1,0 +1,31 @@
+//! Traffic: what moves beside the ego.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | `world` | all actors of an episode, advanced by sub-steps |
+//! | `track` | actors that repeat recorded motion, or timed positions |
+//! | `follow`, `course`, `lateral` | actors on a course, with changes of offset |
+//! | `idm`, `lead` | the Intelligent Driver Model, and what an actor follows |
+//! | `attack` | actors that plan their way towards the ego |
+//! | `script` | conditions and actions |
+//! | `state` | the states of actors and ego, as contacts and renderer read them |
+
+pub mod attack;
+mod course;
+mod follow;
+mod idm;
+mod lateral;
+mod lead;
+mod script;
+mod state;
+mod track;
+mod world;
+
+pub use attack::Attack;
+pub use course::{Beside, Course};
+pub use follow::Follow;
+pub use idm::{Idm, rolled};
+pub use script::{Action, After, Condition, Near, Trigger};
+pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
+pub use track::{Track, TrackError, TrackKeyframe, Tracked};
+pub use world::{Actor, Behaviour, EgoMotion, Traffic, World};

@@ -1,0 +1,504 @@
+//! The traffic of an episode: all actors, advanced together.
+//!
+//! A step is cut into equal sub-steps of at most 10 ms. Each evaluates the triggers first, in the order of the
+//! actors and of their scripts, and then moves every actor. Triggers and actors read the states at the sub-step's
+//! begin only, and each actor has its own stream of random numbers. So the order of the actors cannot matter.
+
+use std::sync::Arc;
+
+use glam::{DQuat, DVec2, DVec3};
+
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::random::Random;
+
+use super::attack::{self, Attack, Spline};
+use super::course::turned_rad;
+use super::follow::{Follow, Following};
+use super::lead::Body;
+use super::script::{Action, After, Condition, Near, Trigger};
+use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
+use super::track::Track;
+use crate::limits;
+
+/// The actors of an episode before it begins.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Traffic {
+    /// Seed of every stream of random numbers.
+    pub seed: u64,
+    /// The ego's box.
+    pub ego_box: EgoBox,
+    /// The actors; at most [`limits::ACTORS`].
+    pub actors: Vec<Actor>,
+}
+
+/// An actor before the episode begins.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Actor {
+    /// Name, class, box and asset.
+    pub spec: ActorSpec,
+    /// How it moves.
+    pub behaviour: Behaviour,
+    /// What it does when a condition holds.
+    pub script: Vec<Trigger>,
+    /// Whether it is there from the begin; otherwise it waits for [`Action::Spawn`].
+    pub present: bool,
+}
+
+/// How an actor moves.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Behaviour {
+    /// Along timed poses, whatever others do.
+    Track(Track),
+    /// Along a course.
+    Follow(Follow),
+    /// Towards the ego.
+    Attack {
+        /// The settings.
+        attack: Attack,
+        /// Where it begins.
+        world_from_actor: Pose,
+        /// Its speed then, in m/s.
+        speed_mps: f64,
+    },
+}
+
+/// The ego's motion during one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EgoMotion {
+    /// At the step's begin.
+    pub from: EgoState,
+    /// At the step's end.
+    pub to: EgoState,
+    /// Whether the velocities of both states belong to the motion between them. Then the position is the cubic
+    /// with these ends. Otherwise, as for a teleport, it changes linearly.
+    pub smooth: bool,
+}
+
+/// The actors of an episode at one time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct World {
+    traffic: Arc<Traffic>,
+    time_us: i64,
+    states: Vec<ActorState>,
+    runs: Vec<Run>,
+}
+
+/// What changes about one actor beside its state.
+#[derive(Clone, Debug, PartialEq)]
+struct Run {
+    /// Whether it is in the world; a track may be absent nevertheless.
+    there: bool,
+    mode: Mode,
+    /// When each trigger of its script fired, in microseconds.
+    fired_us: Vec<Option<i64>>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+enum Mode {
+    Track,
+    Follow(Following),
+    Attack(Attacking),
+}
+
+/// An attacker on its present plan.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Attacking {
+    spline: Spline,
+    world_from_begin: Pose,
+    begin_us: i64,
+    plans: usize,
+}
+
+impl World {
+    /// The world at the begin of an episode, at time 0.
+    pub fn new(traffic: Arc<Traffic>) -> Self {
+        let runs: Vec<Run> = traffic.actors.iter().map(Run::new).collect();
+        let states = traffic.actors.iter().zip(&runs).enumerate();
+        let states = states
+            .map(|(index, (actor, run))| match run.there {
+                true => run.state(index, actor, 0, None),
+                false => absent(index),
+            })
+            .collect();
+        Self { traffic, time_us: 0, states, runs }
+    }
+
+    /// The actors as they were set up.
+    pub fn traffic(&self) -> &Traffic {
+        &self.traffic
+    }
+
+    /// Time since the episode's start, in microseconds.
+    pub fn time_us(&self) -> i64 {
+        self.time_us
+    }
+
+    /// The actors now, in order of their index.
+    pub fn states(&self) -> &[ActorState] {
+        &self.states
+    }
+
+    /// The actors at a time before the episode's start, in a warm-up: tracks at their own times, others where they
+    /// begin.
+    pub fn states_before(&self, time_us: i64) -> Vec<ActorState> {
+        let start = Self::new(self.traffic.clone());
+        let actors = self.traffic.actors.iter().zip(&start.runs).enumerate();
+        actors
+            .map(|(index, (actor, run))| match (&actor.behaviour, run.there) {
+                (Behaviour::Track(_), true) => run.state(index, actor, time_us.min(0), None),
+                _ => start.states[index],
+            })
+            .collect()
+    }
+
+    /// When a trigger fired, in microseconds; `None` if it has not.
+    pub fn fired_us(&self, actor: usize, trigger: usize) -> Option<i64> {
+        *self.runs.get(actor)?.fired_us.get(trigger)?
+    }
+
+    /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls `each` after
+    /// each sub-step.
+    pub fn step(&mut self, dt_us: i64, ego: &EgoMotion, each: &mut dyn FnMut(&SubStep<'_>)) {
+        let traffic = self.traffic.clone();
+        let begin_us = self.time_us;
+        let count = dt_us.max(1).unsigned_abs().div_ceil(limits::SUB_STEP_US.unsigned_abs()) as i64;
+        let mut ego_now = ego.from;
+        for sub_step in 1..=count {
+            let sub_begin_us = self.time_us;
+            // i128, since the product may overflow i64.
+            let since_us = (i128::from(dt_us) * i128::from(sub_step) / i128::from(count)) as i64;
+            let sub_end_us = begin_us.saturating_add(since_us);
+            let ego_next = ego.at(since_us, dt_us);
+            let bodies = self.bodies(&ego_now);
+            self.fire(&traffic, &ego_now, &bodies);
+            let before = std::mem::take(&mut self.states);
+            let after = self.moved(&traffic, &before, &bodies, sub_end_us);
+            each(&SubStep {
+                begin_us: sub_begin_us,
+                end_us: sub_end_us,
+                ego: [ego_now, ego_next],
+                before: &before,
+                after: &after,
+            });
+            self.states = after;
+            self.time_us = sub_end_us;
+            ego_now = ego_next;
+        }
+    }
+
+    /// The boxes that are there, the ego's first.
+    fn bodies(&self, ego: &EgoState) -> Vec<Body> {
+        let present = self.states.iter().filter(|state| state.present);
+        let actors = &self.traffic.actors;
+        let boxes =
+            present.map(|state| Body::of_actor(&actors[usize::from(state.index)].spec, state));
+        std::iter::once(Body::of_ego(ego, &self.traffic.ego_box)).chain(boxes).collect()
+    }
+
+    /// Fires the triggers whose conditions hold at the begin of the sub-step.
+    fn fire(&mut self, traffic: &Traffic, ego: &EgoState, bodies: &[Body]) {
+        let mut firing: Vec<(usize, usize)> = Vec::new();
+        for (index, actor) in traffic.actors.iter().enumerate() {
+            for (at, trigger) in actor.script.iter().enumerate() {
+                let waits = self.runs[index].fired_us[at].is_none();
+                if waits && self.holds(traffic, index, &trigger.when, ego, bodies) {
+                    firing.push((index, at));
+                }
+            }
+        }
+        for (index, at) in firing {
+            let actor = &traffic.actors[index];
+            self.runs[index].fired_us[at] = Some(self.time_us);
+            for action in &actor.script[at].then {
+                self.runs[index].ordered(actor, *action);
+            }
+        }
+    }
+
+    fn holds(
+        &self,
+        traffic: &Traffic,
+        index: usize,
+        when: &Condition,
+        ego: &EgoState,
+        bodies: &[Body],
+    ) -> bool {
+        let run = &self.runs[index];
+        let state = &self.states[index];
+        let speed_mps = state.velocity_mps.length();
+        let station_m = || match (&traffic.actors[index].behaviour, &run.mode) {
+            (Behaviour::Follow(_), Mode::Follow(now)) => now.station_m,
+            _ => f64::NEG_INFINITY,
+        };
+        let ego_station_m = || match (&traffic.actors[index].behaviour, &run.mode) {
+            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+                follow.course(now).nearest(bodies[0].center_m).station_m
+            }
+            _ => f64::NEG_INFINITY,
+        };
+        // An actor that has not appeared yet waits where it will: distances to it count.
+        let own_m = match state.present {
+            true => state.world_from_actor.position_m,
+            false => {
+                run.state(index, &traffic.actors[index], self.time_us, None)
+                    .world_from_actor
+                    .position_m
+            }
+        };
+        let near = |near: Near| {
+            let other_m = match near.actor {
+                None => Some(bodies[0].center_m),
+                Some(other) => {
+                    let other = &self.states[other];
+                    other.present.then_some(other.world_from_actor.position_m)
+                }
+            };
+            other_m.is_some_and(|other_m| other_m.distance(own_m) <= near.within_m)
+        };
+        let after = |after: After| {
+            let fired_us = self.fired_us(after.actor, after.trigger);
+            fired_us.is_some_and(|fired_us| self.time_us >= fired_us.saturating_add(after.delay_us))
+        };
+        when.time_us.is_none_or(|time_us| self.time_us >= time_us)
+            && when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
+            && when.speed_below_mps.is_none_or(|most| state.present && speed_mps <= most)
+            && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
+            && when.after.is_none_or(after)
+            && when.near.is_none_or(near)
+            && when.station_m.is_none_or(|least_m| station_m() >= least_m)
+            && when.ego_station_m.is_none_or(|least_m| ego_station_m() >= least_m)
+    }
+
+    /// The states at the end of a sub-step.
+    fn moved(
+        &mut self,
+        traffic: &Traffic,
+        before: &[ActorState],
+        bodies: &[Body],
+        end_us: i64,
+    ) -> Vec<ActorState> {
+        let begin_us = self.time_us;
+        let duration_s = (end_us - begin_us) as f64 * 1e-6;
+        let actors = traffic.actors.iter().zip(&mut self.runs).enumerate();
+        actors
+            .map(|(index, (actor, run))| {
+                if !run.there {
+                    return absent(index);
+                }
+                let state = &before[index];
+                run.advance(traffic, actor, state, bodies, [begin_us, end_us]);
+                match run.there {
+                    true => {
+                        let before = state.present.then_some((state.world_from_actor, duration_s));
+                        run.state(index, actor, end_us, before)
+                    }
+                    false => absent(index),
+                }
+            })
+            .collect()
+    }
+}
+
+impl EgoMotion {
+    /// An ego that stands.
+    pub fn standing(state: EgoState) -> Self {
+        Self { from: state, to: state, smooth: false }
+    }
+
+    /// The ego at a time of a step of `dt_us`.
+    pub fn at(&self, since_us: i64, dt_us: i64) -> EgoState {
+        if since_us <= 0 {
+            return self.from;
+        }
+        if since_us >= dt_us {
+            return self.to;
+        }
+        let t = since_us as f64 / dt_us as f64;
+        let [from, to] = [&self.from, &self.to];
+        let mut pose = from.world_from_rig.interpolate(&to.world_from_rig, t);
+        if self.smooth {
+            let dt_s = dt_us as f64 * 1e-6;
+            // Hermite's cubic: the ends' positions and velocities. On an arc its error is
+            // (v dt)⁴ κ³ / 384: 0.1 mm at 10 m/s, 0.5 s and 0.05 1/m.
+            pose.position_m =
+                (1.0 + 2.0 * t) * (1.0 - t) * (1.0 - t) * from.world_from_rig.position_m
+                    + t * t * (3.0 - 2.0 * t) * to.world_from_rig.position_m
+                    + dt_s * t * (1.0 - t) * (1.0 - t) * from.velocity_mps
+                    - dt_s * t * t * (1.0 - t) * to.velocity_mps;
+        }
+        let velocity_mps = match self.smooth {
+            true => from.velocity_mps.lerp(to.velocity_mps, t),
+            false => to.velocity_mps,
+        };
+        let yaw_rate_radps = match self.smooth {
+            true => from.yaw_rate_radps + t * (to.yaw_rate_radps - from.yaw_rate_radps),
+            false => to.yaw_rate_radps,
+        };
+        EgoState { world_from_rig: pose, velocity_mps, yaw_rate_radps }
+    }
+}
+
+impl Run {
+    fn new(actor: &Actor) -> Self {
+        let mode = match &actor.behaviour {
+            Behaviour::Track(_) => Mode::Track,
+            Behaviour::Follow(follow) => Mode::Follow(follow.begin()),
+            Behaviour::Attack { world_from_actor, speed_mps, .. } => Mode::Attack(Attacking {
+                spline: Spline::straight(*speed_mps),
+                world_from_begin: *world_from_actor,
+                begin_us: 0,
+                plans: 0,
+            }),
+        };
+        Self { there: actor.present, mode, fired_us: vec![None; actor.script.len()] }
+    }
+
+    fn ordered(&mut self, actor: &Actor, action: Action) {
+        match (action, &actor.behaviour, &mut self.mode) {
+            (Action::Spawn, ..) => self.there = true,
+            (Action::Remove, ..) => self.there = false,
+            (_, Behaviour::Follow(follow), Mode::Follow(now)) => *now = follow.ordered(now, action),
+            // The scenario's check refuses such scripts.
+            _ => {}
+        }
+    }
+
+    fn advance(
+        &mut self,
+        traffic: &Traffic,
+        actor: &Actor,
+        before: &ActorState,
+        bodies: &[Body],
+        [begin_us, end_us]: [i64; 2],
+    ) {
+        match (&actor.behaviour, &mut self.mode) {
+            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+                let duration_s = (end_us - begin_us) as f64 * 1e-6;
+                let box_ = &actor.spec.box_;
+                match follow.after(now, box_, before.index, bodies, duration_s) {
+                    Some(next) => *now = next,
+                    None => self.there = false,
+                }
+            }
+            (Behaviour::Attack { attack, .. }, Mode::Attack(now)) => {
+                let is_first = now.plans == 0;
+                let is_due = begin_us.saturating_sub(now.begin_us) >= attack.plan_us;
+                if before.present && (is_first || is_due) {
+                    *now = now.planned(
+                        traffic.seed,
+                        attack,
+                        &actor.spec.name,
+                        before,
+                        bodies,
+                        begin_us,
+                    );
+                } else if !before.present {
+                    now.begin_us = begin_us;
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// The state at a time; `before` is the pose before and the time since then, in seconds.
+    fn state(
+        &self,
+        index: usize,
+        actor: &Actor,
+        time_us: i64,
+        before: Option<(Pose, f64)>,
+    ) -> ActorState {
+        match (&actor.behaviour, &self.mode) {
+            (Behaviour::Track(track), _) => match track.at(time_us) {
+                None => absent(index),
+                Some(at) => ActorState {
+                    index: index as u16,
+                    world_from_actor: at.world_from_actor,
+                    velocity_mps: at.velocity_mps,
+                    yaw_rate_radps: at.yaw_rate_radps,
+                    present: true,
+                },
+            },
+            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+                follow.state(index as u16, now, before)
+            }
+            (Behaviour::Attack { .. }, Mode::Attack(now)) => now.state(index, time_us, before),
+            _ => absent(index),
+        }
+    }
+}
+
+impl Attacking {
+    /// The next plan from where the attacker is.
+    fn planned(
+        &self,
+        seed: u64,
+        attack: &Attack,
+        name: &str,
+        own: &ActorState,
+        bodies: &[Body],
+        time_us: i64,
+    ) -> Self {
+        let begin = own.world_from_actor;
+        let speed_mps = own.velocity_mps.dot(begin.rotation * DVec3::X);
+        let begin_from_world = begin.inverse();
+        let predicted = |body: &Body| {
+            let at_m = begin_from_world.transform_point(body.center_m).truncate();
+            let velocity_mps = (begin_from_world.rotation * body.velocity_mps).truncate();
+            attack::predicted(at_m, velocity_mps, body.yaw_rate_radps)
+        };
+        let attacked = predicted(&bodies[0]);
+        let others = bodies[1..].iter().filter(|body| body.actor != Some(own.index));
+        let neighbours: Vec<Vec<DVec2>> = others.map(|body| predicted(body).to_vec()).collect();
+        let mut plans: Vec<(f64, Spline)> = attack::candidates(speed_mps)
+            .into_iter()
+            .map(|spline| (attack::cost_m(&spline.points_m(), &attacked, &neighbours), spline))
+            .collect();
+        // A stable sort: equal costs keep the order of the candidates.
+        plans.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let mut random = Random::new(seed, &format!("attack/{name}"), self.plans);
+        let spline = match attack.best.min(plans.len()) {
+            0 => Spline::straight(speed_mps),
+            count => plans[random.below(count)].1,
+        };
+        Self { spline, world_from_begin: begin, begin_us: time_us, plans: self.plans + 1 }
+    }
+
+    fn state(&self, index: usize, time_us: i64, before: Option<(Pose, f64)>) -> ActorState {
+        let since_s = (time_us - self.begin_us) as f64 * 1e-6;
+        let at_m = self.spline.position_m(since_s);
+        let velocity = self.spline.velocity_mps(since_s);
+        let begin = &self.world_from_begin;
+        let velocity_mps = begin.rotation * velocity.extend(0.0);
+        // The heading is the direction of motion, backwards at a negative speed; below 0.1 m/s it stays.
+        let ahead = if velocity.x < 0.0 { -velocity } else { velocity };
+        let rotation = match velocity.length() < 0.1 {
+            true => before.map_or(begin.rotation, |(before, _)| before.rotation),
+            false => begin.rotation * DQuat::from_rotation_z(ahead.to_angle()),
+        };
+        let pose = Pose {
+            position_m: begin.transform_point(at_m.extend(0.0)),
+            rotation: rotation.normalize(),
+        };
+        let yaw_rate_radps = before.map_or(0.0, |(before, duration_s)| {
+            turned_rad(before.rotation, pose.rotation) / duration_s
+        });
+        ActorState {
+            index: index as u16,
+            world_from_actor: pose,
+            velocity_mps,
+            yaw_rate_radps,
+            present: true,
+        }
+    }
+}
+
+fn absent(index: usize) -> ActorState {
+    ActorState {
+        index: index as u16,
+        world_from_actor: Pose::IDENTITY,
+        velocity_mps: DVec3::ZERO,
+        yaw_rate_radps: 0.0,
+        present: false,
+    }
+}

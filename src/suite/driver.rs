@@ -1,0 +1,148 @@
+//! The built-in agents.
+
+use glam::DVec3;
+
+use wildcity_scene::geometry::Pose;
+use wildcity_session::Episode;
+use wildcity_sim::ego::{Action, Path, TimedPose};
+use wildcity_sim::traffic::{Idm, rolled};
+use wildcity_sim::{Command, EgoModel};
+
+use crate::case::{Case, pose_at};
+
+/// Agents that come with the program.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BuiltIn {
+    /// Drives as recorded. On the bare twin it must pass: it is each scenario's own test.
+    Log,
+    /// Brakes, and stands.
+    Stand,
+    /// Follows the recorded line by the Intelligent Driver Model.
+    Idm,
+}
+
+/// Poses of a trajectory command, 0.1 s apart: 2 s.
+const PLAN_POSES: i64 = 20;
+const PLAN_STEP_US: i64 = 100_000;
+/// Braking of an agent that stands, in m/s².
+const BRAKING_MPS2: f64 = 4.0;
+/// Least speed of a free road for `idm`, in m/s: a recording that crawls is no limit.
+const LEAST_FREE_MPS: f64 = 5.0;
+
+impl BuiltIn {
+    /// An agent by its name.
+    pub fn named(name: &str) -> Option<Self> {
+        match name {
+            "log" => Some(Self::Log),
+            "stand" => Some(Self::Stand),
+            "idm" => Some(Self::Idm),
+            _ => None,
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Log => "log",
+            Self::Stand => "stand",
+            Self::Idm => "idm",
+        }
+    }
+
+    /// The command for the next step.
+    ///
+    /// # Errors
+    /// The scenario has no recorded drive, which this agent follows.
+    pub(crate) fn command(self, case: &Case, episode: &Episode) -> Result<Command, String> {
+        let teleports = episode.ego().dynamics().model == EgoModel::Teleport;
+        let dt_us = case.options.dt_us.unwrap_or(wildcity_session::limits::DT_US);
+        match self {
+            Self::Stand if teleports => Ok(Command::Pose(episode.world_from_rig())),
+            Self::Stand => {
+                let speed_mps = episode.ego().velocity_m_s().length();
+                let braking = -BRAKING_MPS2.min(speed_mps / (dt_us as f64 * 1e-6));
+                let action = Action::checked(braking, 0.0).map_err(|error| error.to_string())?;
+                Ok(Command::Action(action))
+            }
+            Self::Log => {
+                let drive = case.drive.as_ref().ok_or("there is no recorded drive to follow")?;
+                let at = |time_us: i64| pose_at(drive, case.drive_start_us + time_us);
+                follow(teleports, episode, dt_us, &at)
+            }
+            Self::Idm => {
+                let plan = IdmPlan::new(case, episode)?;
+                follow(teleports, episode, dt_us, &|time_us| plan.at(time_us - episode.time_us()))
+            }
+        }
+    }
+}
+
+/// A command that leads along poses by time, in microseconds since the episode's start.
+fn follow(
+    teleports: bool,
+    episode: &Episode,
+    dt_us: i64,
+    at: &dyn Fn(i64) -> Pose,
+) -> Result<Command, String> {
+    let now_us = episode.time_us();
+    if teleports {
+        return Ok(Command::Pose(at(now_us + dt_us)));
+    }
+    let rig_from_world = episode.world_from_rig().inverse();
+    let count = PLAN_POSES.max(dt_us / PLAN_STEP_US + 1);
+    let poses = (1..=count).map(|k| {
+        let time_us = k * PLAN_STEP_US;
+        TimedPose { time_us, start_from_rig: rig_from_world * at(now_us + time_us) }
+    });
+    let path = Path::checked(poses.collect()).map_err(|error| error.to_string())?;
+    Ok(Command::Path(path))
+}
+
+/// A plan of the Intelligent Driver Model along the route on a free road; the end of the route is a wall.
+struct IdmPlan<'a> {
+    case: &'a Case,
+    /// Station at each 10 ms from now.
+    stations_m: Vec<f64>,
+}
+
+/// Step of the plan, in microseconds.
+const IDM_STEP_US: i64 = 10_000;
+
+impl<'a> IdmPlan<'a> {
+    fn new(case: &'a Case, episode: &Episode) -> Result<Self, String> {
+        let route = case.resolved.route.as_ref().ok_or("there is no route to follow")?;
+        let course = &route.course;
+        let length_m = course.length_m();
+        let begin = course.nearest(episode.world_from_rig().position_m);
+        let whole_s = case.line.limit_us.unwrap_or(0) as f64 * 1e-6;
+        let free_speed_mps = match whole_s > 0.0 {
+            true => (length_m / whole_s).max(LEAST_FREE_MPS),
+            false => Idm::WILDCITY.free_speed_mps,
+        };
+        let idm = Idm { free_speed_mps, ..Idm::WILDCITY };
+        let forward = episode.world_from_rig().rotation * DVec3::X;
+        let mut speed_mps = episode.ego().velocity_m_s().dot(forward).max(0.0);
+        let mut station_m = begin.station_m;
+        let mut stations_m = vec![station_m];
+        let plan_us = PLAN_POSES * PLAN_STEP_US + wildcity_session::limits::DT_MAX_US;
+        for _ in 0..plan_us / IDM_STEP_US {
+            let gap_m = length_m - station_m;
+            let acceleration = idm.acceleration(speed_mps, 0.0, gap_m);
+            let [way_m, end_mps] = rolled(speed_mps, acceleration, IDM_STEP_US as f64 * 1e-6);
+            station_m += way_m;
+            speed_mps = end_mps;
+            stations_m.push(station_m);
+        }
+        Ok(Self { case, stations_m })
+    }
+
+    /// The pose after a time from now.
+    fn at(&self, after_us: i64) -> Pose {
+        let last = self.stations_m.len() - 1;
+        let step = usize::try_from(after_us / IDM_STEP_US).unwrap_or(0).min(last);
+        match &self.case.resolved.route {
+            Some(route) => route.course.at(self.stations_m[step]),
+            None => Pose::IDENTITY,
+        }
+    }
+}

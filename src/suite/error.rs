@@ -1,0 +1,89 @@
+//! Why a suite could not be run at all. What fails within an episode is part of the results.
+
+use std::io;
+use std::path::PathBuf;
+
+use wildcity_server::ServerError;
+use wildcity_session::SessionError;
+use wildcity_sim::scenario::FileError;
+use wildcity_twin::residency::ResidencyError;
+use wildcity_twin::store::StoreError;
+
+/// Why a suite could not be run.
+#[derive(Debug, thiserror::Error)]
+pub enum SuiteError {
+    /// A file cannot be read or written.
+    #[error("cannot {what} {}: {cause}", path.display())]
+    Io {
+        /// `read`, `write` ..
+        what: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// A file is larger than this build reads.
+    #[error("{} has {bytes} bytes; at most {limit_bytes} are read", path.display())]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Its size.
+        bytes: u64,
+        /// The largest size that is read.
+        limit_bytes: u64,
+    },
+    /// The suite, a scenario, or a file that it names is malformed, or does not fit its twin.
+    #[error("{}: {cause}", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Where and why.
+        cause: FileError,
+    },
+    /// The version of a twin that a scenario was made for is not there.
+    #[error(
+        "scenario {scenario:?} was made for version {wanted} of twin {twin:?}, which is not in the store: import that \
+         version, or run with --latest"
+    )]
+    NoVersion {
+        /// The scenario.
+        scenario: String,
+        /// The twin.
+        twin: String,
+        /// BLAKE3 of the version's manifest.
+        wanted: String,
+    },
+    /// Two cases have the same name.
+    #[error("two episodes are named {name:?}: give the scenarios different names")]
+    SameName {
+        /// The name.
+        name: String,
+    },
+    /// There are more episodes than this build runs.
+    #[error("{count} episodes; at most {} are run", crate::limits::EPISODES)]
+    TooMany {
+        /// Their number.
+        count: usize,
+    },
+    /// The directory has episodes of another run.
+    #[error("{} has episodes of another run: give another directory with --out", dir.display())]
+    NotEmpty {
+        /// The directory.
+        dir: PathBuf,
+    },
+    /// A twin cannot be read.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A twin cannot be opened.
+    #[error(transparent)]
+    Twin(#[from] ResidencyError),
+    /// The engine cannot be started.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+    /// The server for agents cannot be started.
+    #[error(transparent)]
+    Server(#[from] ServerError),
+    /// A task of the run ended unexpectedly.
+    #[error("an episode's task ended unexpectedly: {0}")]
+    Task(String),
+}

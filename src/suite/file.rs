@@ -1,0 +1,146 @@
+//! The suite file `wildcity.suite/1`.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use wildcity_sim::scenario::{Document, FileError, ScenarioFile};
+
+use crate::error::SuiteError;
+use crate::limits;
+
+/// A suite: which scenarios are driven, by what, and what is rendered.
+///
+/// ```json
+/// {"format": "wildcity.suite/1", "name": "streets", "scenarios": ["straight.json", "pedestrian.json"],
+///  "agent": "log", "cameras": ["front"], "size": [320, 180], "seeds": [0, 9]}
+/// ```
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SuiteFile {
+    /// `wildcity.suite/1`.
+    pub format: String,
+    /// Name of the suite.
+    pub name: String,
+    /// Comment.
+    #[serde(default)]
+    pub note: Option<String>,
+    /// Scenario files, relative to the suite's file.
+    pub scenarios: Vec<PathBuf>,
+    /// The agent: `log`, `stand`, `idm`, or a command.
+    #[serde(default)]
+    pub agent: Option<String>,
+    /// The first and the last seed of every scenario that has no sweep of seeds.
+    #[serde(default)]
+    pub seeds: Option<[u64; 2]>,
+    /// The cameras that are rendered for built-in agents; if absent, all of the twin's rig.
+    #[serde(default)]
+    pub cameras: Option<Vec<String>>,
+    /// Width and height of their images, in pixels; if absent, those of the rig.
+    #[serde(default)]
+    pub size: Option<[u64; 2]>,
+    /// Simulated time of a step, in microseconds; if absent, 100000.
+    #[serde(default)]
+    pub dt_us: Option<i64>,
+    /// The least pass rate, held against the lower end of its interval; if absent, every episode must pass.
+    #[serde(default)]
+    pub at_least: Option<f64>,
+}
+
+/// A scenario of a suite.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SuiteScenario {
+    /// Its file.
+    pub path: PathBuf,
+    /// Its contents.
+    pub document: Document,
+}
+
+impl SuiteFile {
+    /// The format that this build reads.
+    pub const FORMAT: &str = "wildcity.suite/1";
+
+    /// Reads a suite with all of its scenarios. A scenario's file is a suite of that scenario alone.
+    ///
+    /// # Errors
+    /// Names the file and the place of the first mistake.
+    pub fn read(path: &Path) -> Result<(Self, Vec<SuiteScenario>), SuiteError> {
+        let bytes = read(path)?;
+        let wrong = |cause| SuiteError::File { path: path.to_owned(), cause };
+        let value: serde_json::Value = serde_json::from_slice(&bytes)
+            .map_err(|error| wrong(mistake("suite", format!("not JSON: {error}"))))?;
+        if value.get("format").and_then(serde_json::Value::as_str) == Some(ScenarioFile::FORMAT) {
+            let document = Document::from_json(value).map_err(wrong)?;
+            let suite = Self::of_one(path);
+            return Ok((suite, vec![SuiteScenario { path: path.to_owned(), document }]));
+        }
+        let suite: Self = serde_path_to_error::deserialize(value).map_err(|error| {
+            let at = error.path().to_string();
+            wrong(mistake(&at, error.into_inner().to_string()))
+        })?;
+        suite.check().map_err(wrong)?;
+        let dir = path.parent().unwrap_or(Path::new("."));
+        let mut scenarios = Vec::new();
+        for file in &suite.scenarios {
+            let path = dir.join(file);
+            let document = Document::parse(&read(&path)?)
+                .map_err(|cause| SuiteError::File { path: path.clone(), cause })?;
+            scenarios.push(SuiteScenario { path, document });
+        }
+        Ok((suite, scenarios))
+    }
+
+    /// The suite of one scenario.
+    fn of_one(path: &Path) -> Self {
+        let name = path.file_stem().map(|name| name.to_string_lossy().into_owned());
+        Self {
+            format: Self::FORMAT.to_owned(),
+            name: name.unwrap_or_default(),
+            note: None,
+            scenarios: vec![path.to_owned()],
+            agent: None,
+            seeds: None,
+            cameras: None,
+            size: None,
+            dt_us: None,
+            at_least: None,
+        }
+    }
+
+    fn check(&self) -> Result<(), FileError> {
+        if self.format != Self::FORMAT {
+            return Err(mistake("format", format!("{:?}; write {:?}", self.format, Self::FORMAT)));
+        }
+        if self.scenarios.is_empty() {
+            return Err(mistake("scenarios", "is empty; name at least one scenario".to_owned()));
+        }
+        if let Some([first, last]) = self.seeds
+            && first > last
+        {
+            let message = format!("[{first}, {last}]; write the first and the last seed");
+            return Err(mistake("seeds", message));
+        }
+        match self.at_least {
+            Some(rate) if !(0.0..=1.0).contains(&rate) => {
+                Err(mistake("at_least", format!("{rate:?}; a rate is from 0 to 1")))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+fn mistake(path: &str, message: String) -> FileError {
+    FileError { path: path.to_owned(), message }
+}
+
+/// Reads a file of at most [`limits::FILE_BYTES`].
+pub(crate) fn read(path: &Path) -> Result<Vec<u8>, SuiteError> {
+    let failed = |cause| SuiteError::Io { what: "read", path: path.to_owned(), cause };
+    let bytes = fs::metadata(path).map_err(failed)?.len();
+    if bytes > limits::FILE_BYTES {
+        let limit_bytes = limits::FILE_BYTES;
+        return Err(SuiteError::TooLarge { path: path.to_owned(), bytes, limit_bytes });
+    }
+    fs::read(path).map_err(failed)
+}

@@ -1,0 +1,97 @@
+//! `junit.xml`: what CI systems show.
+
+use std::fmt::Write as _;
+
+use crate::result::{EpisodeEntry, Status, SuiteResult};
+
+/// The result as JUnit XML: `failure` is driving, `error` technical, `skipped` off the model.
+pub fn junit(result: &SuiteResult) -> String {
+    let counts = &result.counts;
+    let skipped = counts.off_model + counts.not_judged;
+    let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");
+    // Writing into a text cannot fail.
+    let _ = writeln!(
+        text,
+        "<testsuites><testsuite name=\"{}\" tests=\"{}\" failures=\"{}\" errors=\"{}\" skipped=\"{skipped}\">",
+        escaped(&result.suite),
+        counts.episodes,
+        counts.failed,
+        counts.technical,
+    );
+    for episode in &result.episodes {
+        case(&mut text, result, episode);
+    }
+    text.push_str("</testsuite></testsuites>\n");
+    text
+}
+
+fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
+    let class = format!("{}.{}", result.suite, episode.scenario);
+    let _ = write!(
+        text,
+        "  <testcase classname=\"{}\" name=\"{}\"",
+        escaped(&class),
+        escaped(&episode.name)
+    );
+    let inner = match episode.status {
+        Status::Passed => String::new(),
+        Status::Failed => {
+            let types: Vec<&str> = episode.faults.iter().map(|fault| &*fault.fault).collect();
+            let kind = types.first().copied().unwrap_or("unknown");
+            let lines: Vec<String> = episode.faults.iter().map(line).collect();
+            element("failure", kind, lines.first().map_or("", |line| line), &lines.join("\n"))
+        }
+        Status::OffModel => {
+            let message = "left the trained area of the twin before any fault";
+            format!("<skipped message=\"{message}\"/>")
+        }
+        Status::NotJudged => {
+            format!("<skipped message=\"{}\"/>", escaped(&episode.not_judged.join("; ")))
+        }
+        Status::Technical => {
+            let last = episode.errors.last();
+            let kind = last.map_or("server_error", |error| &error.kind);
+            let message = last.map_or("", |error| &error.message);
+            let lines: Vec<String> = episode
+                .errors
+                .iter()
+                .map(|error| format!("{}: {}", error.kind, error.message))
+                .collect();
+            element("error", kind, message, &lines.join("\n"))
+        }
+    };
+    if inner.is_empty() {
+        text.push_str("/>\n");
+    } else {
+        let _ = writeln!(text, ">{inner}</testcase>");
+    }
+}
+
+fn line(fault: &wildcity_episode::FaultLine) -> String {
+    let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
+    format!("{}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6)
+}
+
+fn element(name: &str, kind: &str, message: &str, body: &str) -> String {
+    let [kind, message, body] = [kind, message, body].map(escaped);
+    format!("<{name} type=\"{kind}\" message=\"{message}\">{body}</{name}>")
+}
+
+/// Text for XML 1.0, which has no control characters but tab and line breaks.
+fn escaped(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '&' => escaped.push_str("&amp;"),
+            '<' => escaped.push_str("&lt;"),
+            '>' => escaped.push_str("&gt;"),
+            '"' => escaped.push_str("&quot;"),
+            '\t' | '\n' => escaped.push(character),
+            control if control.is_control() => escaped.push('\u{fffd}'),
+            // The two code points that XML leaves out beside controls.
+            '\u{fffe}' | '\u{ffff}' => escaped.push('\u{fffd}'),
+            other => escaped.push(other),
+        }
+    }
+    escaped
+}

@@ -1,0 +1,49 @@
+//! Suites of scenarios, run without a person: "did my driver get worse?" as one command.
+//!
+//! A suite names scenarios; a run drives each of them with each of its seeds, with an agent that dials in or with a
+//! built-in one, and judges every episode from its record. The results do not depend on how many episodes are driven
+//! at once.
+//!
+//! | module | what it does |
+//! |---|---|
+//! | `file` | the format `wildcity.suite/1` |
+//! | `case` | one scenario with one seed: what is opened, what is recorded about it |
+//! | `driver` | the built-in agents: `log`, `stand`, `idm` |
+//! | `dial_in` | agents that are commands |
+//! | `run` | drives all cases, some at once, technical failures once more |
+//! | `finish` | writes scenario and result into the record of an episode |
+//! | `verify` | renders all episodes again |
+//! | `technical` | failures that are not driving |
+//! | `result` | `result.json`: episodes, rates, means, exit code |
+//! | `junit`, `page` | `junit.xml`, `report.html` |
+//! | `picture` | the picture of a fault |
+//! | [`limits`] | limits |
+
+mod case;
+mod dial_in;
+mod driver;
+mod error;
+mod file;
+mod finish;
+mod junit;
+pub mod limits;
+mod page;
+mod picture;
+mod plot;
+mod result;
+mod run;
+mod technical;
+mod verify;
+
+pub use case::{Case, cases};
+pub use driver::BuiltIn;
+pub use error::SuiteError;
+pub use file::{SuiteFile, SuiteScenario};
+pub use junit::junit;
+pub use page::page;
+pub use picture::{Picture, pictures};
+pub use result::{
+    Counts, EpisodeEntry, ExitCode, MeanEntry, Rate, Status, SuiteResult, TechnicalEntry,
+};
+pub use run::{AgentChoice, RunSettings, run};
+pub use verify::verify;

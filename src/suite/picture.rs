@@ -1,0 +1,98 @@
+//! The picture of a fault: a recorded frame, rendered again.
+
+use std::path::Path;
+
+use wildcity_render::Backend;
+use wildcity_session::{FrameRequest, RecordedEpisode, ReplayUntil, jpeg, limits as session};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Catalog;
+
+use crate::limits;
+use crate::result::{EpisodeEntry, Status, SuiteResult};
+
+/// A picture for the report.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// Name of the episode.
+    pub episode: String,
+    /// The step.
+    pub step: u64,
+    /// Name of the camera.
+    pub camera: String,
+    /// A JPEG file.
+    pub jpeg: Vec<u8>,
+}
+
+/// The pictures of the worst episodes of a run: of the step of their first fault, by their first camera. An episode that
+/// cannot be rendered again has none; the report says so.
+pub fn pictures(
+    result: &SuiteResult,
+    episodes: &Path,
+    catalog: &Catalog,
+    backend: &dyn Backend,
+) -> Vec<Picture> {
+    let cache = Cache::new(catalog.clone());
+    let worst = result.worst();
+    worst
+        .into_iter()
+        .filter_map(|episode| match picture(episode, episodes, &cache, backend) {
+            Ok(picture) => picture,
+            Err(error) => {
+                tracing::warn!(episode = episode.name, "no picture of the fault: {error}");
+                None
+            }
+        })
+        .collect()
+}
+
+impl SuiteResult {
+    /// The failed episodes, those with the earliest fault first.
+    pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
+        let mut worst: Vec<&EpisodeEntry> =
+            self.episodes.iter().filter(|episode| episode.status == Status::Failed).collect();
+        worst.sort_by_key(|episode| {
+            (episode.faults.first().map_or(i64::MAX, |fault| fault.time_us), &episode.name)
+        });
+        worst.truncate(limits::WORST);
+        worst
+    }
+}
+
+fn picture(
+    episode: &EpisodeEntry,
+    episodes: &Path,
+    cache: &Cache,
+    backend: &dyn Backend,
+) -> Result<Option<Picture>, String> {
+    let path = episodes.join(&episode.record);
+    let mut recording = RecordedEpisode::read(&path).map_err(|error| error.to_string())?;
+    let fault_us = episode.faults.first().map_or(i64::MAX, |fault| fault.time_us);
+    let shown = |frame: &wildcity_session::FrameRecord| {
+        frame.request != FrameRequest::Observe && !frame.images.is_empty()
+    };
+    // The first frame at or after the fault.
+    let at = recording.frames.iter().position(|frame| shown(frame) && frame.time_us >= fault_us);
+    let Some(at) = at.or_else(|| recording.frames.iter().rposition(shown)) else { return Ok(None) };
+    // The steps before it are driven, so that the ego is where it was, but not rendered.
+    recording.frames.truncate(at + 1);
+    recording.end = None;
+    for frame in recording.frames.iter_mut().take(at) {
+        frame.cameras = vec![Vec::new(); frame.poses.len()];
+        frame.images.clear();
+    }
+    let step = recording.frames[at].step;
+    let mut found: Option<Picture> = None;
+    let twin = recording.header.twin.clone();
+    let mut open = |version| cache.open(&twin, Some(version));
+    let report = recording.replay(&mut open, backend, ReplayUntil::End, &mut |image| {
+        if found.is_none() {
+            let size = &image.camera.camera;
+            let jpeg = jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)?;
+            let camera = image.camera.name.clone();
+            found = Some(Picture { episode: episode.name.clone(), step, camera, jpeg });
+        }
+        Ok(())
+    });
+    report.map_err(|error| error.to_string())?;
+    Ok(found)
+}

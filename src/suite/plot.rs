@@ -1,0 +1,125 @@
+//! Plots of a driven episode, as SVG: the drive from above, and the speed over time.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use glam::DVec2;
+
+use wildcity_episode::{EpisodeFile, drive_record};
+use wildcity_score::DriveRecord;
+
+use crate::result::EpisodeEntry;
+
+/// Width and height of a plot, and its margin, in pixels.
+const SIZE_PX: DVec2 = DVec2::new(420.0, 220.0);
+const MARGIN_PX: f64 = 28.0;
+
+/// Both plots of an episode as SVG; `None` if its record cannot be read.
+pub(crate) fn plots(episode: &EpisodeEntry, episodes: &Path) -> Option<String> {
+    let record = EpisodeFile::read(&episodes.join(&episode.record)).ok()?;
+    let drive = drive_record(&record)?;
+    let fault_us = episode.faults.first().map(|fault| fault.time_us);
+    Some(from_above(&drive, fault_us) + &speed(&drive, fault_us))
+}
+
+/// What maps values to pixels: the same scale on both axes if `is_even`.
+struct Frame {
+    least: DVec2,
+    scale: DVec2,
+}
+
+impl Frame {
+    fn around(points: &[DVec2], is_even: bool) -> Self {
+        let least = points.iter().fold(DVec2::INFINITY, |least, point| least.min(*point));
+        let most = points.iter().fold(DVec2::NEG_INFINITY, |most, point| most.max(*point));
+        // A standing ego has no extent; a metre, or a second, is shown then.
+        let extent = (most - least).max(DVec2::ONE);
+        let room_px = SIZE_PX - 2.0 * MARGIN_PX;
+        let scale = room_px / extent;
+        let scale = if is_even { DVec2::splat(scale.min_element()) } else { scale };
+        Self { least, scale }
+    }
+
+    fn at(&self, point: DVec2) -> DVec2 {
+        let px = (point - self.least) * self.scale;
+        DVec2::new(MARGIN_PX + px.x, SIZE_PX.y - MARGIN_PX - px.y)
+    }
+}
+
+fn from_above(drive: &DriveRecord, fault_us: Option<i64>) -> String {
+    let ego: Vec<DVec2> = drive.ego.iter().map(|sample| sample.origin_m).collect();
+    let route = drive.reference.as_ref().map_or(Vec::new(), |drive| drive.line.points_m().to_vec());
+    let all: Vec<DVec2> = ego.iter().chain(&route).copied().collect();
+    let frame = Frame::around(&all, true);
+    let mut svg = begin("the drive from above (grey: as recorded), in metres");
+    line(&mut svg, &frame, &route, "#bbb", 4.0);
+    let tracks = drive.tracks.iter().flatten();
+    for track in tracks {
+        let there: Vec<DVec2> =
+            track.samples.iter().flatten().map(|sample| sample.footprint.center_m).collect();
+        line(&mut svg, &frame, &there, "#d55e00", 1.5);
+    }
+    line(&mut svg, &frame, &ego, "#0072b2", 2.0);
+    if let Some(at) = sample_at(drive, fault_us) {
+        dot(&mut svg, frame.at(ego[at]));
+    }
+    svg + "</svg>"
+}
+
+fn speed(drive: &DriveRecord, fault_us: Option<i64>) -> String {
+    let step_s = drive.dt_us as f64 * 1e-6;
+    let points: Vec<DVec2> = drive
+        .ego
+        .iter()
+        .enumerate()
+        .map(|(step, sample)| DVec2::new(step as f64 * step_s, sample.speed_mps()))
+        .collect();
+    let with_zero: Vec<DVec2> = points.iter().copied().chain([DVec2::ZERO]).collect();
+    let frame = Frame::around(&with_zero, false);
+    let most = points.iter().map(|point| point.y).fold(0.0, f64::max);
+    let end_s = points.last().map_or(0.0, |point| point.x);
+    let mut svg = begin(&format!("speed, 0 to {most:.1} m/s over {end_s:.1} s"));
+    let axis = [DVec2::ZERO, DVec2::new(end_s, 0.0)];
+    line(&mut svg, &frame, &axis, "#bbb", 1.0);
+    line(&mut svg, &frame, &points, "#0072b2", 2.0);
+    if let Some(at) = sample_at(drive, fault_us) {
+        dot(&mut svg, frame.at(points[at]));
+    }
+    svg + "</svg>"
+}
+
+fn sample_at(drive: &DriveRecord, fault_us: Option<i64>) -> Option<usize> {
+    let last = drive.ego.len() as i64 - 1;
+    let step = fault_us? / drive.dt_us.max(1);
+    usize::try_from(step.clamp(0, last)).ok()
+}
+
+// Writing into a text cannot fail.
+
+fn begin(title: &str) -> String {
+    let DVec2 { x, y } = SIZE_PX;
+    format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{x}\" height=\"{y}\" viewBox=\"0 0 {x} {y}\">\
+         <text x=\"6\" y=\"14\" font-size=\"12\" fill=\"#444\">{title}</text>"
+    )
+}
+
+fn line(svg: &mut String, frame: &Frame, points: &[DVec2], color: &str, width: f64) {
+    if points.len() < 2 {
+        return;
+    }
+    let _ = write!(
+        svg,
+        "<polyline fill=\"none\" stroke=\"{color}\" stroke-width=\"{width}\" points=\""
+    );
+    for point in points {
+        let DVec2 { x, y } = frame.at(*point);
+        let _ = write!(svg, "{x:.1},{y:.1} ");
+    }
+    svg.push_str("\"/>");
+}
+
+fn dot(svg: &mut String, at: DVec2) {
+    let DVec2 { x, y } = at;
+    let _ = write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" fill=\"#b00020\"/>");
+}

@@ -1,0 +1,257 @@
+//! Drives all cases of a suite, some at once.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+
+use wildcity_render::Backend;
+use wildcity_scene::ProfileOverrides;
+use wildcity_server::{Config, Limits, Running};
+use wildcity_session::{Engine, EngineSettings, Outcome, Session};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::{Catalog, DiskCacheSettings};
+
+use crate::case::Case;
+use crate::dial_in::{self, Dialled};
+use crate::driver::BuiltIn;
+use crate::error::SuiteError;
+use crate::finish::finish;
+use crate::limits;
+use crate::result::{EpisodeEntry, SuiteResult};
+use crate::technical::Technical;
+
+/// What drives.
+#[derive(Clone, Debug, PartialEq)]
+pub enum AgentChoice {
+    /// An agent that comes with the program.
+    BuiltIn(BuiltIn),
+    /// A command, started once for each episode, that dials in.
+    Command(String),
+}
+
+/// How a suite is run.
+pub struct RunSettings {
+    /// Name of the suite.
+    pub suite: String,
+    /// What drives.
+    pub agent: AgentChoice,
+    /// Episodes at once.
+    pub jobs: usize,
+    /// How often a technical failure is tried again.
+    pub retries: u32,
+    /// How long a command may take for an episode.
+    pub agent_timeout: Duration,
+    /// Whether versions that scenarios name were ignored.
+    pub latest: bool,
+    /// The least pass rate, for the lower end of its interval; every episode must pass without one.
+    pub at_least: Option<f64>,
+    /// The twins.
+    pub catalog: Catalog,
+    /// Their directory or URL, and the cache of parts of them, for the server that agents dial.
+    pub twins: PathBuf,
+    /// The cache on disk.
+    pub cache: Option<DiskCacheSettings>,
+    /// The renderer.
+    pub backend: Arc<dyn Backend>,
+    /// Where the episodes are recorded; must be empty.
+    pub episodes: PathBuf,
+    /// Called after each episode.
+    pub progress: Box<dyn Fn(&EpisodeEntry) + Send + Sync>,
+}
+
+/// What all episodes share.
+struct Shared {
+    agent: AgentChoice,
+    retries: u32,
+    agent_timeout: Duration,
+    episodes: PathBuf,
+    host: Host,
+    progress: Box<dyn Fn(&EpisodeEntry) + Send + Sync>,
+}
+
+/// Where sessions are opened.
+enum Host {
+    /// In this process, for built-in agents.
+    Engine(Arc<Engine>),
+    /// A server on a free port of the loopback interface.
+    Server { running: Option<Running>, url: String },
+}
+
+impl std::fmt::Debug for RunSettings {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("RunSettings")
+            .field("suite", &self.suite)
+            .field("agent", &self.agent)
+            .field("jobs", &self.jobs)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Drives all cases. The result is in order of their names and has no times of the clock, so it does not depend on
+/// `jobs`.
+///
+/// # Errors
+/// The directory has episodes of another run, or the engine or the server cannot be started.
+pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult, SuiteError> {
+    check_empty(&settings.episodes)?;
+    let host = match &settings.agent {
+        AgentChoice::BuiltIn(_) => Host::Engine(engine(&settings)?),
+        AgentChoice::Command(_) => server(&settings).await?,
+    };
+    let agent_name = match &settings.agent {
+        AgentChoice::BuiltIn(agent) => agent.name().to_owned(),
+        AgentChoice::Command(command) => command.clone(),
+    };
+    let permits = Arc::new(Semaphore::new(settings.jobs.clamp(1, limits::JOBS)));
+    let shared = Arc::new(Shared {
+        agent: settings.agent,
+        retries: settings.retries,
+        agent_timeout: settings.agent_timeout,
+        episodes: settings.episodes,
+        host,
+        progress: settings.progress,
+    });
+    let mut tasks = JoinSet::new();
+    for case in cases {
+        let shared = shared.clone();
+        let permits = permits.clone();
+        tasks.spawn(async move {
+            // The semaphore is never closed.
+            let _permit = permits.acquire_owned().await;
+            let entry = shared.episode(&case).await;
+            (shared.progress)(&entry);
+            entry
+        });
+    }
+    let mut entries = Vec::new();
+    while let Some(entry) = tasks.join_next().await {
+        entries.push(entry.map_err(|error| SuiteError::Task(error.to_string()))?);
+    }
+    if let Some(mut shared) = Arc::into_inner(shared) {
+        shared.host.stop().await;
+    }
+    entries.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(SuiteResult::new(settings.suite, agent_name, settings.latest, settings.at_least, entries))
+}
+
+/// Refuses a directory with records: their names would differ from those of a fresh run.
+fn check_empty(dir: &Path) -> Result<(), SuiteError> {
+    let failed = |cause| SuiteError::Io { what: "read", path: dir.to_owned(), cause };
+    match wildcity_episode::list(dir).map_err(failed)?.is_empty() {
+        true => Ok(()),
+        false => Err(SuiteError::NotEmpty { dir: dir.to_owned() }),
+    }
+}
+
+fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
+    Ok(Engine::start(EngineSettings {
+        cache: Cache::new(settings.catalog.clone()),
+        episodes: settings.episodes.clone(),
+        backend: settings.backend.clone(),
+        step_timeout: Limits::default().step,
+    })?)
+}
+
+async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
+    let config = Config {
+        listen: ([127, 0, 0, 1], 0).into(),
+        twins: settings.twins.clone(),
+        cache: settings.cache.clone(),
+        episodes: settings.episodes.clone(),
+        uploads: settings.episodes.join(".uploads"),
+        tokens: None,
+        backend: settings.backend.clone(),
+        profile: ProfileOverrides::default(),
+        limits: Limits::default(),
+    };
+    let running = wildcity_server::start(config).await?;
+    let url = running.url();
+    Ok(Host::Server { running: Some(running), url })
+}
+
+impl Host {
+    async fn stop(&mut self) {
+        if let Self::Server { running, .. } = self
+            && let Some(running) = running.take()
+        {
+            running.stop().await;
+        }
+    }
+}
+
+impl Shared {
+    /// Drives a case, technical failures once more, and judges its record.
+    async fn episode(&self, case: &Case) -> EpisodeEntry {
+        let mut errors = Vec::new();
+        for attempt in 1..=u64::from(self.retries) + 1 {
+            let driven = self.attempt(case, attempt).await;
+            let finished = match driven {
+                Ok(record) => finish(case, record).await,
+                Err(technical) => Err(technical),
+            };
+            match finished {
+                Ok(finished) => return EpisodeEntry::new(case, Some(finished), errors),
+                Err(technical) => {
+                    tracing::warn!(
+                        episode = case.name,
+                        "{}: {}",
+                        technical.kind,
+                        technical.message
+                    );
+                    errors.push(technical);
+                }
+            }
+        }
+        EpisodeEntry::new(case, None, errors)
+    }
+
+    /// Drives a case. Returns the file of its record.
+    async fn attempt(&self, case: &Case, attempt: u64) -> Result<PathBuf, Technical> {
+        // Each attempt has a session of its own: the server keeps one that was lost for a while.
+        let session = match attempt {
+            1 => case.name.clone(),
+            attempt => format!("{}.{attempt}", case.name),
+        };
+        let record = self.episodes.join(format!("{session}-1.jsonl"));
+        match (&self.host, &self.agent) {
+            (Host::Engine(engine), AgentChoice::BuiltIn(agent)) => {
+                drive(engine.clone(), case, session, *agent).await?;
+            }
+            (Host::Server { url, .. }, AgentChoice::Command(command)) => {
+                let dialled =
+                    Dialled { command, url, session: &session, timeout: self.agent_timeout };
+                dial_in::drive(&dialled, case, &record).await?;
+            }
+            _ => return Err(Technical::server("the host does not fit the agent")),
+        }
+        Ok(record)
+    }
+}
+
+/// Drives a case with a built-in agent.
+async fn drive(
+    engine: Arc<Engine>,
+    case: &Case,
+    session: String,
+    agent: BuiltIn,
+) -> Result<(), Technical> {
+    let failed = |error: wildcity_session::SessionError| Technical::server(error.to_string());
+    let mut session = Session::open(engine, session, case.options.clone()).await.map_err(failed)?;
+    let driven = steps(&mut session, case, agent).await;
+    let outcome = if driven.is_ok() { Outcome::Completed } else { Outcome::ServerError };
+    session.close(outcome).await;
+    driven
+}
+
+async fn steps(session: &mut Session, case: &Case, agent: BuiltIn) -> Result<(), Technical> {
+    let failed = |error: wildcity_session::SessionError| Technical::server(error.to_string());
+    session.reset(case.seed, None).await.map_err(failed)?;
+    for step in 1..=case.steps {
+        let command = agent.command(case, session.episode()).map_err(Technical::server)?;
+        session.step(command, step == case.steps).await.map_err(failed)?;
+    }
+    Ok(())
+}

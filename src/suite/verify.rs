@@ -1,0 +1,46 @@
+//! Renders the episodes of a run again.
+
+use std::path::Path;
+
+use wildcity_render::Backend;
+use wildcity_session::{RecordedEpisode, ReplayUntil};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Catalog;
+
+use crate::result::SuiteResult;
+
+/// Replays every recorded episode of a run. Returns what differs, one line for each episode that does.
+pub fn verify(
+    result: &SuiteResult,
+    episodes: &Path,
+    catalog: &Catalog,
+    backend: &dyn Backend,
+) -> Vec<String> {
+    let cache = Cache::new(catalog.clone());
+    let recorded = result.episodes.iter().filter(|episode| !episode.record.is_empty());
+    recorded
+        .filter_map(|episode| {
+            let wrong = differs(&episodes.join(&episode.record), &cache, backend)?;
+            Some(format!("{}: {wrong}", episode.name))
+        })
+        .collect()
+}
+
+/// What differs in an episode.
+fn differs(path: &Path, cache: &Cache, backend: &dyn Backend) -> Option<String> {
+    let recording = match RecordedEpisode::read(path) {
+        Ok(recording) => recording,
+        Err(error) => return Some(error.to_string()),
+    };
+    let twin = &recording.header.twin;
+    let mut open = |version| cache.open(twin, Some(version));
+    match recording.replay(&mut open, backend, ReplayUntil::FirstDifference, &mut |_| Ok(())) {
+        Err(error) => Some(error.to_string()),
+        Ok(report) => {
+            let diverged = report.diverged.map(|diverged| diverged.to_string());
+            let image = report.difference.map(|difference| difference.to_string());
+            let value = report.wrong_value.map(|value| value.to_string());
+            diverged.or(image).or(value)
+        }
+    }
+}

@@ -1,0 +1,49 @@
+//! Tracked objects: Gaussians of each moving object of a recorded drive, in the object's own axes.
+//!
+//! Two formats have them. NuRec has layers with `gaussian_cuboid_ids`, the index of each Gaussian's track in
+//! `obj_track_ids`; their positions are relative to the middle of the track's cuboid (x forward, y left, z up). And
+//! drivestudio has RigidNodes, which `python -m wildcity.convert --model RigidNodes` writes as safetensors with the
+//! tensor `point_ids`. A static reading of the file leaves them out, since they have no fixed place.
+
+use std::io::BufReader;
+use std::path::Path;
+
+use super::hash_reader::HashReader;
+use super::objects::{self, TrackedObject};
+use super::{
+    BUFFER_BYTES, Format, IngestError, Progress, archive, file, read_whole_part, safetensors,
+};
+
+/// Reads the tracked objects of a file, in order of their tracks, and the file's BLAKE3 in hex.
+///
+/// # Errors
+/// The file has none, is of a format without them, or is damaged.
+pub fn read_tracked(
+    path: &Path,
+    progress: Progress<'_>,
+) -> Result<(Vec<TrackedObject>, String), IngestError> {
+    let (opened, file_bytes) = file::open(path)?;
+    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(opened));
+    let found = match Format::of(std::io::BufRead::fill_buf(&mut input)?)? {
+        Format::Safetensors => {
+            let (gaussians, ids) = safetensors::read_tracked(&mut input, file_bytes, progress)?;
+            objects::split(&gaussians, &ids, |id| Some(id.to_string()))
+        }
+        Format::Zip => {
+            let bytes = read_whole_part(&mut input)?;
+            progress(file_bytes, file_bytes);
+            archive::read_tracked(bytes)?
+        }
+        _ => Vec::new(),
+    };
+    std::io::copy(&mut input, &mut std::io::sink())?;
+    if found.is_empty() {
+        return Err(IngestError::Body {
+            format: "file",
+            place: "tracked objects".into(),
+            reason: "there are none; NuRec (.usdz) and safetensors with point_ids may have some"
+                .into(),
+        });
+    }
+    Ok((found, input.into_inner().finish()))
+}

@@ -1,0 +1,117 @@
+//! Reading: whole, cut, damaged, and with what later builds add.
+
+use std::fs;
+
+use serde_json::json;
+use wildcity_episode::{EpisodeFile, list};
+
+use crate::written::{self, Made};
+
+#[test]
+fn all_lines_are_read() {
+    let episode = Made::default().read();
+    assert_eq!((episode.frames.len(), episode.actors.len()), (51, 51));
+    assert_eq!(episode.scenario.as_ref().unwrap().actors[1].name, "car1");
+    assert_eq!(episode.end.as_ref().unwrap().outcome, "completed");
+    assert_eq!(episode.cut, None);
+    let state = episode.actors[50].actors[1].state().unwrap();
+    assert_eq!(state.index, 1);
+    assert!(state.world_from_actor.position_m.x > 8.1, "{state:?}");
+}
+
+#[test]
+fn a_file_cut_anywhere_is_readable_up_to_the_cut() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = dir.path().join("whole-1.jsonl");
+    written::write(&whole, &Made { steps: 5, ..Made::default() }.lines());
+    let bytes = fs::read(&whole).unwrap();
+    let head = bytes.iter().position(|&byte| byte == b'\n').unwrap() + 1;
+    let cut = dir.path().join("cut-1.jsonl");
+    let mut most = 0;
+    // Every place of the last lines, and every eleventh of the others.
+    let last = bytes.len() - 900;
+    for length in (head..last).step_by(11).chain(last..bytes.len()) {
+        fs::write(&cut, &bytes[..length]).unwrap();
+        let read = EpisodeFile::read(&cut).unwrap();
+        let whole_lines = bytes[..length].iter().filter(|&&byte| byte == b'\n').count();
+        let lines_read = 1
+            + usize::from(read.scenario.is_some())
+            + read.actors.len()
+            + read.frames.len()
+            + usize::from(read.end.is_some());
+        assert_eq!(lines_read, whole_lines, "after {length} bytes");
+        let is_between_lines = bytes[length - 1] == b'\n';
+        assert_eq!(read.cut.is_none(), is_between_lines, "after {length} bytes");
+        most = most.max(lines_read);
+    }
+    assert_eq!(most, 14);
+    for length in (0..head).step_by(5) {
+        fs::write(&cut, &bytes[..length]).unwrap();
+        let error = EpisodeFile::read(&cut).unwrap_err().to_string();
+        assert!(error.contains("no header"), "{length}: {error}");
+    }
+}
+
+#[test]
+fn a_damaged_line_ends_the_reading_and_is_named() {
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    lines[6]["kind"] = json!("frame");
+    let read = written::read(&lines);
+    let cut = read.cut.unwrap();
+    assert_eq!((cut.line, read.frames.len()), (7, 2));
+    assert!(cut.reason.contains("missing field"), "{}", cut.reason);
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    lines.push(lines[3].clone());
+    let cut = written::read(&lines).cut.unwrap();
+    assert!(cut.reason.contains("follows the end"), "{}", cut.reason);
+}
+
+#[test]
+fn what_later_builds_add_is_passed_over() {
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    lines[0]["origin"] = json!({ "episode": "other-1" });
+    lines.insert(4, json!({ "kind": "note", "text": "hello" }));
+    let read = written::read(&lines);
+    assert_eq!((read.cut, read.frames.len()), (None, 4));
+    lines[0]["format"] = json!(1);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("new-1.jsonl");
+    written::write(&path, &lines);
+    let error = EpisodeFile::read(&path).unwrap_err().to_string();
+    assert!(error.contains("format 1; this build reads 0"), "{error}");
+}
+
+#[test]
+fn a_step_that_was_taken_again_counts_once() {
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    // Back to step 1 and on from there: lines are header, scenario, then actors and frame of each step.
+    let again = lines[6..8].to_vec();
+    lines.splice(10..10, again);
+    let read = written::read(&lines);
+    let steps: Vec<u64> = read.driven().iter().map(|frame| frame.step).collect();
+    assert_eq!(steps, [0, 1, 2]);
+}
+
+#[test]
+fn two_hundred_steps_with_thirty_actors_stay_below_a_megabyte() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("many-1.jsonl");
+    written::write(&path, &Made { steps: 200, actors: 30, ..Made::default() }.lines());
+    let bytes = fs::metadata(&path).unwrap().len();
+    assert!(bytes < 1_000_000, "{bytes} bytes");
+    assert_eq!(EpisodeFile::read(&path).unwrap().actors.len(), 201);
+}
+
+#[test]
+fn a_directory_is_listed_newest_first() {
+    let dir = tempfile::tempdir().unwrap();
+    assert_eq!(list(&dir.path().join("nowhere")).unwrap(), []);
+    for name in ["a-1.jsonl", "b-1.jsonl", "notes.txt"] {
+        written::write(&dir.path().join(name), &Made::default().lines());
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    let listed = list(dir.path()).unwrap();
+    let names: Vec<&str> = listed.iter().map(|listed| listed.name.as_str()).collect();
+    assert_eq!(names, ["b-1", "a-1"]);
+    assert!(listed[0].bytes > 1000);
+}

@@ -1,0 +1,6 @@
+//! Episodes' files: reading them whole and cut, comparing and scoring them.
+
+mod diff;
+mod files;
+mod scores;
+mod written;

@@ -1,0 +1,4 @@
+//! Traffic: vectors of the formulas, and what must hold for every episode.
+
+mod episodes;
+mod formulas;

@@ -1,0 +1,80 @@
+//! Agents that are commands. The command is this test's own binary, which drives if it is told to.
+
+use std::env;
+
+use serde_json::Value;
+use wildcity_client::{Client, Open, Pose};
+use wildcity_suite::{AgentChoice, ExitCode, Status};
+
+use crate::street::Bench;
+
+/// The command line that runs [`the_agent`], with a manner of driving.
+fn command(manner: &str) -> AgentChoice {
+    let binary = env::current_exe().unwrap();
+    let test = "dial_in::the_agent --exact --nocapture";
+    AgentChoice::Command(format!("AGENT_MANNER={manner} {} {test}", binary.display()))
+}
+
+/// Not a test: the agent, if the suite has started this binary as one.
+#[test]
+fn the_agent() {
+    let Ok(open) = env::var("WILDCITY_OPEN") else { return };
+    let manner = env::var("AGENT_MANNER").unwrap();
+    if manner == "fails" {
+        std::process::exit(3);
+    }
+    if manner == "idle" {
+        return;
+    }
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    runtime.block_on(drive(&open, &manner));
+}
+
+async fn drive(open: &str, manner: &str) {
+    let url = env::var("WILDCITY_URL").unwrap();
+    let steps: u64 = env::var("WILDCITY_STEPS").unwrap().parse().unwrap();
+    let mut seed: u64 = env::var("WILDCITY_SEED").unwrap().parse().unwrap();
+    if manner == "cheats" {
+        seed += 1;
+    }
+    let mut fields: Value = serde_json::from_str(open).unwrap();
+    fields["seq"] = 0.into();
+    let open: Open = serde_json::from_value(fields).unwrap();
+    let mut client = Client::connect(&url, "test agent").await.unwrap();
+    client.open(open).await.unwrap();
+    client.reset(seed, None).await.unwrap();
+    for step in 1..=steps {
+        let xyz = [20.0 + step as f64, 0.0, 0.0];
+        client.step(Pose { xyz, q: [1.0, 0.0, 0.0, 0.0] }).await.unwrap();
+    }
+    client.close().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_drives_what_it_is_told_to() {
+    let bench = Bench::new();
+    bench.suite();
+    let cases = bench.cases(&bench.path("rails.json")).unwrap();
+    let settings = bench.settings(command("follows"), 2, "out");
+    let result = wildcity_suite::run(settings, cases).await.unwrap();
+    assert_eq!(result.counts.passed, 1, "{}", result.to_json());
+    assert_eq!(result.episodes[0].steps, 20);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn technical_failures_are_tried_again_and_both_kept() {
+    let bench = Bench::new();
+    bench.suite();
+    for (manner, kind) in
+        [("fails", "agent_error"), ("cheats", "agent_error"), ("idle", "agent_lost")]
+    {
+        let cases = bench.cases(&bench.path("rails.json")).unwrap();
+        let settings = bench.settings(command(manner), 1, manner);
+        let result = wildcity_suite::run(settings, cases).await.unwrap();
+        let episode = &result.episodes[0];
+        assert_eq!(episode.status, Status::Technical, "{manner}");
+        let kinds: Vec<&str> = episode.errors.iter().map(|error| &*error.kind).collect();
+        assert_eq!(kinds, [kind; 2], "{manner}: {:?}", episode.errors);
+        assert_eq!(result.exit_code(), ExitCode::Technical);
+    }
+}

@@ -1,0 +1,6 @@
+//! Suites: their files, runs with built-in agents and with commands, results and reports.
+
+mod dial_in;
+mod files;
+mod runs;
+mod street;

@@ -1,0 +1,134 @@
+//! Runs with the built-in agents, and what is written about them.
+
+use wildcity_episode::{EpisodeFile, diff, result};
+use wildcity_suite::{AgentChoice, BuiltIn, ExitCode, Status, junit, page, pictures, verify};
+
+use crate::street::{Bench, cpu};
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_log_passes_and_a_stand_fails_for_progress() {
+    let bench = Bench::new();
+    let log = bench.run_built_in(BuiltIn::Log, "log").await;
+    assert_eq!((log.counts.passed, log.counts.episodes), (4, 4), "{}", log.to_json());
+    assert_eq!(log.exit_code(), ExitCode::Passed);
+    assert_eq!(log.pass_rate.rate, Some(1.0));
+    assert!((log.pass_rate.interval[0] - 0.510).abs() < 1e-3, "{:?}", log.pass_rate);
+    for episode in &log.episodes {
+        assert_eq!(episode.steps, 20);
+        assert!((episode.distance_m - 20.0).abs() < 0.5, "{}", episode.distance_m);
+    }
+
+    let stand = bench.run_built_in(BuiltIn::Stand, "stand").await;
+    assert_eq!((stand.counts.failed, stand.exit_code()), (4, ExitCode::Driving));
+    for episode in &stand.episodes {
+        assert_eq!(episode.faults[0].fault, "progress", "{}", episode.name);
+    }
+    // `idm` sets off from a stand on rails: from 10 m/s it drives on.
+    let idm = bench.run_built_in(BuiltIn::Idm, "idm").await;
+    let car: Vec<Status> =
+        idm.episodes.iter().filter(|e| e.scenario == "car").map(|e| e.status).collect();
+    assert_eq!(car, [Status::Passed; 2], "{}", idm.to_json());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn any_number_of_jobs_gives_the_same_bytes() {
+    let bench = Bench::new();
+    let mut results = Vec::new();
+    for jobs in [1, 2, 8] {
+        let out = format!("jobs{jobs}");
+        let result = bench.run(AgentChoice::BuiltIn(BuiltIn::Log), jobs, &out).await;
+        results.push((result.to_json(), junit(&result)));
+    }
+    assert_eq!(results[0], results[1]);
+    assert_eq!(results[0], results[2]);
+    assert!(results[0].0.contains("\"frames_hash\": \""), "{}", results[0].0);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn records_are_whole_and_score_to_the_same_result() {
+    let bench = Bench::new();
+    let run = bench.run_built_in(BuiltIn::Log, "log").await;
+    for entry in &run.episodes {
+        let episode = EpisodeFile::read(&bench.path("log").join(&entry.record)).unwrap();
+        assert_eq!(episode.cut, None);
+        assert_eq!(episode.scenario.as_ref().unwrap().hash, entry.scenario_hash);
+        let again = result(&episode).unwrap();
+        assert_eq!(episode.result.as_ref(), Some(&again), "the line and a second scoring");
+        assert_eq!(again.scores, entry.scores);
+    }
+    let read = |name: &str| EpisodeFile::read(&bench.path("log").join(name)).unwrap();
+    let [car_3, car_4] = ["car-3-1.jsonl", "car-4-1.jsonl"].map(read);
+    assert_eq!(diff(&car_3, &car_3), None);
+    assert!(diff(&car_3, &car_4).unwrap().how.contains("scenario"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_run_verifies_and_an_altered_record_does_not() {
+    let bench = Bench::new();
+    let run = bench.run_built_in(BuiltIn::Log, "log").await;
+    let check = || verify(&run, &bench.path("log"), &bench.catalog(), &cpu());
+    assert_eq!(check(), Vec::<String>::new());
+    let path = bench.path("log").join(&run.episodes[1].record);
+    let text = std::fs::read_to_string(&path).unwrap();
+    // A digit of the distance in the summary at the end.
+    let at = text.rfind("\"distance_m\":").unwrap() + "\"distance_m\":".len();
+    let mut altered = text.clone();
+    altered.replace_range(at..=at, "7");
+    assert_ne!(altered, text);
+    std::fs::write(&path, altered).unwrap();
+    let wrong = check();
+    assert_eq!(wrong.len(), 1, "{wrong:?}");
+    assert!(wrong[0].starts_with("car-4") && wrong[0].contains("distance_m"), "{wrong:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_report_shows_the_worst_episodes_with_pictures() {
+    let bench = Bench::new();
+    let run = bench.run_built_in(BuiltIn::Stand, "stand").await;
+    let shown = pictures(&run, &bench.path("stand"), &bench.catalog(), &cpu());
+    assert_eq!(shown.len(), 4);
+    assert!(shown.iter().all(|picture| picture.jpeg.starts_with(&[0xff, 0xd8])));
+    assert_eq!((shown[0].step, shown[0].camera.as_str()), (20, "front"));
+    let html = page(&run, &shown, &bench.path("stand"));
+    assert_eq!(html.matches("data:image/jpeg;base64,").count(), 4);
+    assert_eq!(html.matches("<svg").count(), 8);
+    assert!(html.contains("progress at 2.00 s") && !html.contains("http://cdn"), "{html}");
+
+    let xml = junit(&run);
+    assert_eq!(xml.matches("<testcase").count(), 4);
+    assert_eq!(xml.matches("<failure type=\"progress\"").count(), 4);
+    assert!(xml.contains("failures=\"4\" errors=\"0\" skipped=\"0\""), "{xml}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_directory_with_records_is_refused() {
+    let bench = Bench::new();
+    bench.run_built_in(BuiltIn::Log, "log").await;
+    let cases = bench.cases(&bench.suite()).unwrap();
+    let settings = bench.settings(AgentChoice::BuiltIn(BuiltIn::Log), 1, "log");
+    let error = wildcity_suite::run(settings, cases).await.unwrap_err().to_string();
+    assert!(error.contains("another run"), "{error}");
+}
+
+#[test]
+fn exit_codes_are_technical_before_driving() {
+    let bench = Bench::new();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let passed = runtime.block_on(bench.run_built_in(BuiltIn::Log, "log"));
+    let mut changed = passed.clone();
+    changed.counts.failed = 1;
+    assert_eq!(changed.exit_code(), ExitCode::Driving);
+    changed.counts.technical = 1;
+    assert_eq!(changed.exit_code(), ExitCode::Technical);
+    let mut off = passed.clone();
+    off.counts.off_model = 1;
+    assert_eq!(off.exit_code(), ExitCode::Technical, "a quarter of them are off the model");
+    off.counts.episodes = 10;
+    assert_eq!(off.exit_code(), ExitCode::Passed);
+    let mut rated = passed.clone();
+    // 4 of 4 have a lower end of 0.51.
+    rated.at_least = Some(0.5);
+    assert_eq!(rated.exit_code(), ExitCode::Passed);
+    rated.at_least = Some(0.9);
+    assert_eq!(rated.exit_code(), ExitCode::Driving);
+}

@@ -1,0 +1,252 @@
+//! Actors in a street, and the same Gaussians as a part of the twin.
+
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+use wildcity_render::{Backend, Frame, Readout, RollingShutter, Target, View};
+use wildcity_scene::actor::{ContactShadow, PlacedChunk};
+use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole, ShutterDirection};
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, sh};
+
+use crate::images::{Image, agree, max_difference, psnr, render, render_one};
+use crate::scene_files::Random;
+use crate::streets::street;
+
+/// Size of the actor's box, in metres.
+const BOX_M: [f64; 3] = [4.4, 1.8, 1.5];
+
+/// `n` Gaussians in a box on the ground, x forward and z up.
+pub(crate) fn actor(n: usize, sh_degree: u8, seed: u64) -> Gaussians {
+    let mut random = Random(seed);
+    let mut g = Gaussians::with_capacity(sh_degree, n);
+    for _ in 0..n {
+        let [x, y, z] = [0.5, 0.5, 0.0].map(|from| random.unit() - from);
+        g.means_m.push([x * BOX_M[0], y * BOX_M[1], z * BOX_M[2]]);
+        g.quats_wxyz.push([0; 4].map(|_| (random.unit() - 0.5) as f32));
+        g.ln_scales.push([0.1, 0.02, 0.06].map(|s: f64| (s.ln() + random.unit() - 0.5) as f32));
+        g.logit_opacities.push(random.between(-1.0, 4.0));
+        g.sh.extend((0..3).map(|_| random.between(-1.5, 1.5)));
+        g.sh.extend((3..3 * sh::coefficients(sh_degree)).map(|_| random.between(-0.3, 0.3)));
+    }
+    g
+}
+
+/// The chunk of an actor.
+pub(crate) fn chunk_of(gaussians: &Gaussians) -> Arc<Chunk> {
+    let mut chunks = Scene::from_gaussians(gaussians).chunks;
+    assert_eq!(chunks.len(), 1);
+    chunks.remove(0)
+}
+
+/// A pose in the street of [`street`], where y is down: `ahead_m` along it, on its ground, turned by `yaw_rad`.
+pub(crate) fn on_street(ahead_m: f64, aside_m: f64, yaw_rad: f64) -> Pose {
+    // The actor's x along the street (z), its y to the left (-x), its z up (-y).
+    let axes = glam::DMat3::from_cols(DVec3::Z, DVec3::NEG_X, DVec3::NEG_Y);
+    let rotation = DQuat::from_mat3(&axes) * DQuat::from_rotation_z(yaw_rad);
+    Pose { position_m: DVec3::new(aside_m, 1.6, ahead_m), rotation }
+}
+
+/// A pinhole, a fisheye, and both with a shutter that rolls while the camera drives at 30 m/s in a curve.
+pub(crate) fn views() -> Vec<(&'static str, View)> {
+    let pinhole =
+        Camera::from_pinhole(160, 96, Pinhole { fx: 110.0, fy: 112.0, cx: 79.0, cy: 49.0 });
+    let lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None));
+    let fisheye =
+        Camera { lens, pinhole: Pinhole { fx: 60.0, fy: 60.0, ..pinhole.pinhole }, ..pinhole };
+    let pose = Pose { position_m: DVec3::new(0.4, 0.0, 20.0), ..Pose::IDENTITY };
+    let first = Pose {
+        position_m: pose.position_m - DVec3::new(0.05, 0.0, 0.9),
+        rotation: DQuat::from_rotation_y(-0.01),
+    };
+    let rolling = |camera, direction| {
+        let rolling_shutter = Some(RollingShutter { direction, world_from_camera_first: first });
+        View { rolling_shutter, ..View::new(camera, pose) }
+    };
+    vec![
+        ("pinhole", View::new(pinhole, pose)),
+        ("fisheye", View::new(fisheye, pose)),
+        ("rolling pinhole", rolling(pinhole, ShutterDirection::TopToBottom)),
+        ("rolling fisheye", rolling(fisheye, ShutterDirection::RightToLeft)),
+    ]
+}
+
+/// The twin, three actors in it (two share a chunk, two overlap), and the same as one set of Gaussians.
+pub(crate) fn street_with_actors() -> (Scene, Scene) {
+    let mut twin = street(10_000, 1, 31);
+    let car = actor(3_000, 3, 5);
+    let other = actor(2_000, 0, 6);
+    let scene = Scene::from_gaussians(&twin);
+    let (car_chunk, other_chunk) = (chunk_of(&car), chunk_of(&other));
+    let placed = [
+        (&car, &car_chunk, on_street(26.0, 1.5, 0.3)),
+        (&other, &other_chunk, on_street(27.0, 2.0, -2.0)),
+        (&car, &car_chunk, on_street(30.0, -2.5, 1.4)),
+    ];
+    let mut in_scene = Vec::new();
+    for (index, (gaussians, chunk, pose)) in placed.into_iter().enumerate() {
+        let mut moved = gaussians.clone();
+        moved.transform(&pose);
+        twin.append(&moved);
+        in_scene.push(PlacedChunk::at_rest(Arc::clone(chunk), pose, index as u16));
+    }
+    (Scene { placed: in_scene, ..scene }, Scene::from_gaussians(&twin))
+}
+
+/// Asserts that actors are drawn as if the twin contained them, by every kind of camera.
+pub(crate) fn check_merged(backend: &dyn Backend) {
+    let (placed, merged) = street_with_actors();
+    let twin = Scene { placed: Vec::new(), ..placed.clone() };
+    let profile = RenderProfile::default();
+    for (name, view) in views() {
+        let image = render_one(backend, &placed, &profile, view);
+        let truth = render_one(backend, &merged, &profile, view);
+        let db = psnr(&image.rgba, &truth.rgba);
+        eprintln!("{}, {name}: {db:.1} dB", backend.name());
+        assert!(db >= 60.0, "{name}: {db} dB");
+        // A twin without them must be far off, or the bound proves nothing.
+        let without = render_one(backend, &twin, &profile, view);
+        let db = psnr(&without.rgba, &truth.rgba);
+        assert!(db < 30.0, "{name}: {db} dB without the actors");
+    }
+}
+
+/// Asserts that what an actor's motion does to an image with a rolling shutter is what the opposite motion of the
+/// camera does.
+pub(crate) fn check_motion(backend: &dyn Backend) {
+    let chunk = chunk_of(&actor(3_000, 1, 7));
+    let profile = RenderProfile::default();
+    for (name, rolling) in views().into_iter().filter(|(_, view)| view.rolling_shutter.is_some()) {
+        let shutter = rolling.rolling_shutter.unwrap();
+        let pose = on_street(26.0, 0.5, 0.3);
+        let still = Scene {
+            placed: vec![PlacedChunk::at_rest(chunk.clone(), pose, 0)],
+            ..Scene::default()
+        };
+        let truth = render_one(backend, &still, &profile, rolling);
+
+        // At the start the actor lies where the moving camera sees it, seen from the camera at rest.
+        let world_from_first = shutter.world_from_camera_first;
+        let world_from_actor_at_start =
+            rolling.world_from_camera * world_from_first.inverse() * pose;
+        let moving = Scene {
+            placed: vec![PlacedChunk { world_from_actor_at_start, ..still.placed[0].clone() }],
+            ..Scene::default()
+        };
+        let readout = Some(Readout { direction: shutter.direction, share: 1.0 });
+        let at_rest = View { rolling_shutter: None, readout, ..rolling };
+        let image = render_one(backend, &moving, &profile, at_rest);
+        let db = psnr(&image.rgba, &truth.rgba);
+        eprintln!("{}, {name}: {db:.1} dB", backend.name());
+        assert!(db >= 60.0, "{name}: {db} dB");
+        let frozen = render_one(backend, &still, &profile, at_rest);
+        assert!(psnr(&frozen.rgba, &truth.rgba) < 40.0, "{name}: the motion shows nothing");
+
+        // Half the exposure: half the motion.
+        let half = View { readout: readout.map(|r| Readout { share: 0.5, ..r }), ..at_rest };
+        let first = world_from_first.interpolate(&rolling.world_from_camera, 0.5);
+        let rolling_shutter = Some(RollingShutter { world_from_camera_first: first, ..shutter });
+        let truth = render_one(backend, &still, &profile, View { rolling_shutter, ..rolling });
+        let image = render_one(backend, &moving, &profile, half);
+        let db = psnr(&image.rgba, &truth.rgba);
+        assert!(db >= 55.0, "{name}, half: {db} dB");
+    }
+}
+
+/// Asserts that tints and contact shadows are those of the reference backend, and that both show.
+pub(crate) fn check_light(backend: &dyn Backend, reference: &dyn Backend) {
+    let (scene, _) = street_with_actors();
+    let mut lit = scene.clone();
+    let shadow = Some(ContactShadow { length_m: BOX_M[0] as f32, width_m: BOX_M[1] as f32 });
+    for placed in &mut lit.placed {
+        placed.tint = [1.5, 0.5, 0.25];
+        placed.shadow = shadow;
+    }
+    // Above the ground by what the wheels of a parked car do not touch.
+    lit.placed[2].world_from_actor.position_m.y += 0.1;
+    let profile = RenderProfile::default();
+    for (name, view) in views() {
+        let image = render_one(backend, &lit, &profile, view);
+        let truth = render_one(reference, &lit, &profile, view);
+        agree(&image, &truth).unwrap_or_else(|e| panic!("{name}: {e}"));
+        // Shadows darken, and change no opacity and no depth.
+        let mut tinted = lit.clone();
+        tinted.placed.iter_mut().for_each(|placed| placed.shadow = None);
+        let bright = render_one(backend, &tinted, &profile, view);
+        let darker = bright.rgba.iter().zip(&image.rgba).filter(|(a, b)| *a - *b > 0.02).count();
+        assert!(darker > 20, "{name}: {darker} darker values");
+        let lighter = bright.rgba.iter().zip(&image.rgba).any(|(a, b)| *b - *a > 1e-5);
+        assert!(!lighter, "{name}: a shadow lightens");
+        assert_eq!((bright.opacity, bright.depth_m), (image.opacity, image.depth_m), "{name}");
+    }
+}
+
+/// Asserts that frames leave nothing behind: what a backend drew with actors does not change a frame without them,
+/// nor do actors that no view sees.
+pub(crate) fn check_ghosts(backend: &dyn Backend) {
+    let (scene, _) = street_with_actors();
+    let twin = Scene { placed: Vec::new(), ..scene.clone() };
+    // A pinhole and a lens: a software device that is loaded takes long for each.
+    let views = [views()[0].1, views()[3].1];
+    let draw = |scene: &Scene| render(backend, scene, &RenderProfile::default(), &views);
+    let before: Vec<Image> = draw(&twin);
+    let with = draw(&scene);
+    assert!(max_difference(&before[0].rgba, &with[0].rgba) > 0.1, "actors are drawn");
+    assert_eq!(before, draw(&twin));
+    assert_eq!(with, draw(&scene));
+    let mut behind = scene.clone();
+    for placed in &mut behind.placed {
+        *placed = PlacedChunk::at_rest(placed.chunk.clone(), on_street(-40.0, 0.0, 0.0), 0);
+    }
+    assert_eq!(before, draw(&behind));
+}
+
+/// The instance ids of one view.
+pub(crate) fn instances(backend: &dyn Backend, scene: &Scene, view: View) -> (Vec<u16>, Vec<f32>) {
+    let pixels = view.camera.pixels();
+    let mut ids = vec![77; pixels];
+    let mut opacity = vec![f32::NAN; pixels];
+    let target =
+        Target { instances: Some(&mut ids), opacity: Some(&mut opacity), ..Target::default() };
+    let profile = RenderProfile::default();
+    let frame = Frame { scene, profile: &profile, views: &[view] };
+    backend.render(&frame, &mut [target], &|_, _| {}).unwrap();
+    (ids, opacity)
+}
+
+/// Asserts that instance ids are those of the reference backend, that they name what is seen, and that asking for them
+/// changes no other image.
+pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
+    let (mut scene, _) = street_with_actors();
+    scene.placed[2].actor = 40;
+    for (name, view) in views() {
+        let (ids, opacity) = instances(backend, &scene, view);
+        let (truth, _) = instances(reference, &scene, view);
+        let differing = ids.iter().zip(&truth).filter(|(a, b)| a != b).count();
+        assert!(differing * 500 < ids.len(), "{name}: {differing} of {} differ", ids.len());
+        for (pixel, (&id, &opacity)) in ids.iter().zip(&opacity).enumerate() {
+            // A pixel without an instance has more than half of its transmittance left.
+            assert_eq!(id == 0, opacity < 0.5, "{name}: pixel {pixel} is {id} at {opacity}");
+        }
+        let mut seen = ids.clone();
+        seen.sort_unstable();
+        seen.dedup();
+        assert_eq!(seen, [0, 1, 2, 3, 42], "{name}");
+        let image = render_one(backend, &scene, &RenderProfile::default(), view);
+        assert_eq!(image.opacity, opacity, "{name}");
+    }
+    // All views in one frame.
+    let views: Vec<View> = views().into_iter().map(|(_, view)| view).collect();
+    let mut all: Vec<Vec<u16>> = views.iter().map(|view| vec![77; view.camera.pixels()]).collect();
+    let targets = all.iter_mut().map(|ids| Target { instances: Some(ids), ..Target::default() });
+    let mut targets: Vec<Target<'_>> = targets.collect();
+    let profile = RenderProfile::default();
+    let frame = Frame { scene: &scene, profile: &profile, views: &views };
+    backend.render(&frame, &mut targets, &|_, _| {}).unwrap();
+    drop(targets);
+    for (ids, view) in all.iter().zip(&views) {
+        assert_eq!(*ids, instances(backend, &scene, *view).0);
+    }
+}
