@@ -173,7 +173,8 @@ fn shutter_terms(view_index: u32, expansion: Expansion, center: ProjectedPoint) 
 struct Expanded {
     close: bool,
     shift_px: vec2f,
-    root_px: array<vec2f, 3>,
+    // Columns: of the axes, then of the terms of second order.
+    root_px: array<vec2f, 6>,
 }
 
 // `axes_m` has a Gaussian's axes times their standard deviations, in the camera's frame at the end of the exposure.
@@ -190,7 +191,6 @@ fn expand_axes(view_index: u32, center: ProjectedPoint, axes_m: array<vec3f, 3>)
     }
     var square = 0.0;
     var longest2 = 0.0;
-    var bend2 = 0.0;
     var most_moment = 0.0;
     for (var axis = 0; axis < 3; axis++) {
         var abc = components(expansion, axes_m[axis]);
@@ -198,20 +198,23 @@ fn expand_axes(view_index: u32, center: ProjectedPoint, axes_m: array<vec3f, 3>)
         abc += moment * shutter.rolls * shutter.motion;
         most_moment = max(most_moment, abs(moment));
         expanded.root_px[axis] = first_order(expansion, abc);
-        let bend = second_order(expansion, abc);
+        var bend = second_order(expansion, abc);
+        bend += dot(shutter.per_px, bend) * shutter.rolls * shutter.motion_px;
+        expanded.root_px[axis + 3] = bend;
         expanded.shift_px += bend;
-        bend2 += dot(bend, bend);
         square += dot(abc, abc);
         longest2 = max(longest2, dot(abc, abc));
     }
-    expanded.shift_px += dot(shutter.per_px, expanded.shift_px) * shutter.rolls * shutter.motion_px;
+    for (var axis = 3; axis < 6; axis++) {
+        expanded.root_px[axis] = ROOT_3 * expanded.root_px[axis] - expanded.shift_px / ROOT_3;
+    }
     let longest = sqrt(longest2);
     let scale = max(max_component(vec3f(abs(expansion.plane[0]), 0.0)), max_component(vec3f(abs(expansion.plane[1]), 0.0)));
     let px_per_rad = max(abs(expansion.terms.x), abs(expansion.terms.y)) * scale;
     let beyond = max(ROOT_3 * most_moment - shutter.to_limit, 0.0);
     let shutter_px = px_per_rad * longest * lenses[view_index].axis_angle.w * most_moment
         + beyond * length(shutter.motion_px);
-    let error_px = bound.y * square + bound.z * longest2 * longest + bound.w * bend2 + shutter_px;
+    let error_px = bound.y * square + bound.z * longest2 * longest + shutter_px;
     expanded.close = expansion.room >= 2.5 * longest && error_px <= bound.x;
     return expanded;
 }

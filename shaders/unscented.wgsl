@@ -46,16 +46,9 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
     // Small Gaussians: the expansion around the centre.
     let expanded = expand_axes(lens, center, axes_m);
     if expanded.close {
-        let u = expanded.root_px;
-        let xs = vec3f(u[0].x, u[1].x, u[2].x);
-        let ys = vec3f(u[0].y, u[1].y, u[2].y);
-        let minors = cross(xs, ys);
-        let covariance = vec3f(dot(xs, xs), dot(xs, ys), dot(ys, ys));
-        let foot = Footprint(center.at_px + expanded.shift_px, covariance, dot(minors, minors), 1.0);
-        var projected = shape_of(foot, gaussian.log2_opacity, index_of_view(view));
-        projected.depth_m = depth_m;
-        projected.from_camera_m = from_camera_m;
-        return projected;
+        return splat_of_root(
+            center.at_px + expanded.shift_px, expanded.root_px, gaussian.log2_opacity, index_of_view(view), depth_m, from_camera_m,
+        );
     }
 
     // The sigma points at +-sqrt(3) standard deviations along each axis, relative to where the centre
@@ -74,30 +67,47 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
     // A square root of the covariance with six columns. For each pair of points, half their difference
     // and the offset of their middle from the mean contribute as much as the two points themselves.
     var root_px: array<vec2f, 6>;
-    var widest = 0.0;
     for (var axis = 0u; axis < 3u; axis++) {
         let pair = pairs[axis];
         let across = (0.5 / ROOT_3) * (pair.xy - pair.zw);
         let middle = (1.0 / ROOT_3) * (0.5 * (pair.xy + pair.zw) - mean_px);
         root_px[axis] = across;
         root_px[axis + 3u] = middle;
-        widest = max(widest, max(max(abs(across.x), abs(across.y)), max(abs(middle.x), abs(middle.y))));
+    }
+    return splat_of_root(
+        center.at_px + mean_px, root_px, gaussian.log2_opacity, index_of_view(view), depth_m, from_camera_m,
+    );
+}
+
+// The splat with a mean and a root of the covariance, in pixels.
+fn splat_of_root(
+    mean_px: vec2f,
+    root_px: array<vec2f, 6>,
+    log2_opacity: f32,
+    view: u32,
+    depth_m: f32,
+    from_camera_m: vec3f,
+) -> Projected {
+    var root = root_px;
+    var widest = 0.0;
+    for (var i = 0u; i < 6u; i++) {
+        widest = max(widest, max(abs(root[i].x), abs(root[i].y)));
     }
     // Covariance, and its determinant as the sum of the squares of all 2 x 2 minors (Cauchy-Binet).
     let units_per_px = min(MAX_SIGMA_PX / max(widest, 1e-30), 1.0);
     var covariance = vec3f(0.0);
     var det_unblurred = 0.0;
     for (var i = 0u; i < 6u; i++) {
-        let column = root_px[i] * units_per_px;
+        let column = root[i] * units_per_px;
         covariance += vec3f(column.x * column, column.y * column.y);
         for (var k = 0u; k < i; k++) {
-            let other = root_px[k] * units_per_px;
+            let other = root[k] * units_per_px;
             let minor = column.x * other.y - column.y * other.x;
             det_unblurred += minor * minor;
         }
     }
-    let foot = Footprint(center.at_px + mean_px, covariance, det_unblurred, units_per_px);
-    var projected = shape_of(foot, gaussian.log2_opacity, index_of_view(view));
+    let foot = Footprint(mean_px, covariance, det_unblurred, units_per_px);
+    var projected = shape_of(foot, log2_opacity, view);
     projected.depth_m = depth_m;
     projected.from_camera_m = from_camera_m;
     return projected;

@@ -1,29 +1,25 @@
 //! When the expansion of a camera around a Gaussian's centre stands for the six points of the unscented transform.
 //!
-//! The expansion has all terms of second order in the size of a Gaussian: the Jacobian gives the covariance, and the
-//! second derivatives the shift of the mean. The six points have terms of higher order as well, which matter only
-//! for Gaussians that are large for their distance. A bound of the difference, in pixels of mean and standard
-//! deviation together, decides for each Gaussian (profile field `lens_error_px`). Both fast backends have the same
-//! rule; the reference backend always projects six points.
+//! The expansion has all terms of second order in the size of a Gaussian: they shift the mean and widen the
+//! covariance. The six points have terms of higher order as well, which matter only for Gaussians that are large for
+//! their distance. A bound of the difference, in pixels of mean and standard deviation together, decides for each
+//! Gaussian (profile field `lens_error_px`). Both fast backends have the same rule; the reference backend always
+//! projects six points.
 //!
 //! With standard deviations as shares of the distance, `s` the largest and `Σ` the sum of their squares, the bound is
 //!
 //! ```text
-//! second Σ + third s³ + per_bend Σ bend² + what a shutter adds
+//! second Σ + third s³ + what a shutter adds
 //! ```
 //!
 //! - `third`: a column of the covariance's root has `t₁(v) + 3 t₃(v)`, where `t₁` and `t₃` are the terms of first and
 //!   third order. With the most pixels per radian L, a lens of r pixels at θ has `|t₃|` of at most about half of
 //!   `0.6 L + |r″|/2 + |r‴|/6`: perspective alone has `a c²`, at most 0.385, and the arc tangent `a³/3`.
-//! - `per_bend`: the six points' pairs lie beside their straight lines by the terms of second order, `bend`, which
-//!   widens the covariance by at most `3 Σ bend²`. The standard deviation, at least σ after the blur, grows by that
-//!   divided by 2 σ.
 //! - `second`: second derivatives that the expansion leaves out, of OpenCV's distortion and of windshields.
 
 use glam::{DVec2, DVec3};
 
 use super::View;
-use super::layout::PixelFilter;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Lens, Windshield, WindshieldReference};
@@ -37,8 +33,6 @@ pub struct ExpansionBound {
     pub second_px: f64,
     /// Factor of the cube of the largest, in pixels.
     pub third_px: f64,
-    /// Factor of the squares of the second-order terms in pixels, in 1/px.
-    pub per_bend: f64,
 }
 
 impl ExpansionBound {
@@ -67,13 +61,7 @@ impl ExpansionBound {
         if let Some(windshield) = &camera.windshield {
             second_px += 0.5 * px_per_rad * windshield_bend(camera, windshield);
         }
-        let least_sigma_px = PixelFilter::new(profile, camera).total_px2.min_element().sqrt();
-        Some(Self {
-            max_error_px: profile.lens_error_px,
-            second_px,
-            third_px: 1.5 * third_px,
-            per_bend: 1.5 / least_sigma_px,
-        })
+        Some(Self { max_error_px: profile.lens_error_px, second_px, third_px: 1.5 * third_px })
     }
 }
 

@@ -335,7 +335,7 @@ pub struct Lens {
     pub pad2: u32,
     /// The camera's rotation during the exposure: unit axis, and angle in radians.
     pub axis_angle: [f32; 4],
-    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order; 0 for always six points.
+    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all zero for six points of every Gaussian.
     pub expansion: [f32; 4],
 }
 

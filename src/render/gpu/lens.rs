@@ -128,8 +128,8 @@ impl Lens {
             lens.set_shutter_motion(&motion);
         }
         if let Some(bound) = ExpansionBound::of(view, profile) {
-            let ExpansionBound { max_error_px, second_px, third_px, per_bend } = bound;
-            let bound = [max_error_px, second_px, third_px, per_bend];
+            let ExpansionBound { max_error_px, second_px, third_px } = bound;
+            let bound = [max_error_px, second_px, third_px, 0.0];
             lens.expansion = bound.map(|value| value as f32);
         }
         lens

@@ -62,8 +62,8 @@ struct ShutterTerms<S: Simd> {
 
 /// The image of a Gaussian's axes.
 pub(in crate::cpu) struct ExpandedAxes<S: Simd> {
-    /// Columns of a root of the covariance, in pixels.
-    pub(in crate::cpu) columns: [Px<S>; 3],
+    /// Columns of a root of the covariance, in pixels: of the axes, then of the terms of second order.
+    pub(in crate::cpu) columns: [Px<S>; 6],
     /// From the image of the centre to the mean of the six points.
     pub(in crate::cpu) mean_shift: Px<S>,
     /// Bounds of what is left out, in units of the bound's factors.
@@ -76,8 +76,6 @@ pub(in crate::cpu) struct Remainder<S: Simd> {
     pub(in crate::cpu) square: f32x16<S>,
     /// The largest length of an axis' (a, b, c).
     pub(in crate::cpu) longest: f32x16<S>,
-    /// Sum of the squares of the second-order terms, in px².
-    pub(in crate::cpu) bend_px2: f32x16<S>,
     /// What the shutter adds, in pixels.
     pub(in crate::cpu) shutter_px: f32x16<S>,
     /// How far the end of the lens' field is, as a length of (a, b, c).
@@ -287,13 +285,12 @@ impl<S: Simd> Expansion<S> {
     pub(in crate::cpu) fn axes(&self, simd: S, axes_m: [Vec3x16<S>; 3]) -> ExpandedAxes<S> {
         let zero = f32x16::splat(simd, 0.0);
         let none = Px { x: zero, y: zero };
-        let mut columns = [none; 3];
+        let mut columns = [none; 6];
         let mut shift = none;
         let mut square = zero;
         let mut longest2 = zero;
-        let mut bend2 = zero;
         let mut most_moment = zero;
-        for (axis_m, column) in axes_m.into_iter().zip(&mut columns) {
+        for (axis, axis_m) in axes_m.into_iter().enumerate() {
             let mut abc = self.components(axis_m);
             if let Some(ShutterTerms { motion, per_px, gain, rolls, .. }) = &self.shutter {
                 // A point that is exposed at another moment has moved.
@@ -301,19 +298,29 @@ impl<S: Simd> Expansion<S> {
                 abc = motion.mul_add(moment * *rolls, abc);
                 most_moment = most_moment.max(moment.abs());
             }
-            *column = self.first_order(abc);
-            let bend = self.second_order(simd, abc);
+            columns[axis] = self.first_order(abc);
+            let mut bend = self.second_order(simd, abc);
+            if let Some(ShutterTerms { motion_px, per_px, gain, rolls, .. }) = &self.shutter {
+                bend = motion_px.mul_add(per_px.dot(bend) * *gain * *rolls, bend);
+            }
+            columns[3 + axis] = bend;
             shift = Px { x: shift.x + bend.x, y: shift.y + bend.y };
-            bend2 = bend.x.mul_add(bend.x, bend.y.mul_add(bend.y, bend2));
             let length2 = abc.dot(abc);
             square += length2;
             longest2 = longest2.max(length2);
         }
+        // The middle of a pair of points lies 3 times its axis' terms beside the centre's image; its distance from the
+        // mean, over √3, is a column of the root.
+        let root_3 = f32x16::splat(simd, 3.0_f32.sqrt());
+        let per_root_3 = f32x16::splat(simd, 3.0_f32.sqrt().recip());
+        for bend in &mut columns[3..] {
+            bend.x = root_3.mul_add(bend.x, -(shift.x * per_root_3));
+            bend.y = root_3.mul_add(bend.y, -(shift.y * per_root_3));
+        }
         let longest = longest2.sqrt();
         let mut shutter_px = zero;
         if let Some(terms) = &self.shutter {
-            let ShutterTerms { motion_px, per_px, gain, rolls, to_limit, rotation_rad, .. } = terms;
-            shift = motion_px.mul_add(per_px.dot(shift) * *gain * *rolls, shift);
+            let ShutterTerms { motion_px, to_limit, rotation_rad, .. } = terms;
             // The camera's rotation between two moments, and the ends of the exposure, where the change of the
             // moment stops: a point beyond them is off by the motion since then.
             let px_per_rad = self.alpha.abs().max(self.beta.abs()) * self.plane_scale();
@@ -322,7 +329,7 @@ impl<S: Simd> Expansion<S> {
             let beyond = (points - *to_limit).max(zero);
             shutter_px += beyond * motion_px.dot(*motion_px).sqrt();
         }
-        let remainder = Remainder { square, longest, bend_px2: bend2, shutter_px, room: self.room };
+        let remainder = Remainder { square, longest, shutter_px, room: self.room };
         ExpandedAxes { columns, mean_shift: shift, remainder }
     }
 

@@ -224,7 +224,7 @@ fn expand<S: Simd>(
     let Some(bound) = view.unscented.expansion_bound() else { return none };
     let Some(mut expansion) = lens.expand(simd, center, exposed) else { return none };
     expansion.in_frame(rotation_rows(simd, view));
-    let ExpandedAxes { columns: [u, v, w], mean_shift, remainder } = expansion.axes(simd, axes_m);
+    let ExpandedAxes { columns, mean_shift, remainder } = expansion.axes(simd, axes_m);
     let pixels = exposed.pixels;
     let close = in_range
         & pixels.margin.simd_ge(f32x16::splat(simd, 0.0))
@@ -232,14 +232,13 @@ fn expand<S: Simd>(
     if close.all_false() {
         return none;
     }
-    let row_x = Vec3x16 { x: u.x, y: v.x, z: w.x };
-    let row_y = Vec3x16 { x: u.y, y: v.y, z: w.y };
+    let moments = moments_of_root(simd, columns.map(|column| [column.x, column.y]));
     let projected = ProjectedBlock {
         mean_x: pixels.x_px + mean_shift.x,
         mean_y: pixels.y_px + mean_shift.y,
         depth_m,
         log2_opacity,
-        ellipse: Ellipse::from_root(simd, row_x, row_y, &view.filter),
+        ellipse: Ellipse::from_moments(simd, moments, &view.filter, f32x16::splat(simd, 1.0)),
         in_range: close,
     };
     (projected.clip(simd, view.size_px, cutoffs), in_range & !close)
@@ -249,12 +248,10 @@ fn expand<S: Simd>(
 #[inline(always)]
 fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) -> mask32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
-    let Remainder { square, longest, bend_px2, shutter_px, room } = *remainder;
+    let Remainder { square, longest, shutter_px, room } = *remainder;
     let cube = longest * longest * longest;
-    let error_px = splat(bound.second_px).mul_add(
-        square,
-        splat(bound.third_px).mul_add(cube, splat(bound.per_bend).mul_add(bend_px2, shutter_px)),
-    );
+    let error_px =
+        splat(bound.second_px).mul_add(square, splat(bound.third_px).mul_add(cube, shutter_px));
     // The points lie √3 standard deviations from the centre; the rest is a margin.
     let within = room.simd_ge(splat(2.5) * longest);
     within & error_px.simd_le(splat(bound.max_error_px))
@@ -334,7 +331,20 @@ fn project_six_points<S: Simd>(
             [(ax - mean_x + (bx - mean_x)) * half, (ay - mean_y + (by - mean_y)) * half];
     }
 
-    // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
+    let moments = moments_of_root(simd, root);
+    let ellipse = Ellipse::from_moments(simd, moments, &view.filter, splat(1.0));
+
+    let inside = in_range & margin.simd_ge(splat(0.0));
+    let projected =
+        ProjectedBlock { mean_x, mean_y, depth_m, log2_opacity, ellipse, in_range: inside };
+    let splats = projected.clip(simd, view.size_px, cutoffs);
+    (splats, in_range.to_bitmask() & !inside.to_bitmask())
+}
+
+/// The covariance of a root with six columns, and its determinant as the sum of the squares of the 15 minors.
+#[inline(always)]
+fn moments_of_root<S: Simd>(simd: S, root: [[f32x16<S>; 2]; 6]) -> Moments<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
     let [mut xx, mut yy, mut xy, mut det] = [splat(0.0); 4];
     for (i, [x, y]) in root.into_iter().enumerate() {
         xx = x.mul_add(x, xx);
@@ -345,14 +355,7 @@ fn project_six_points<S: Simd>(
             det = minor.mul_add(minor, det);
         }
     }
-    let moments = Moments { xx, yy, xy, det };
-    let ellipse = Ellipse::from_moments(simd, moments, &view.filter, splat(1.0));
-
-    let inside = in_range & margin.simd_ge(splat(0.0));
-    let projected =
-        ProjectedBlock { mean_x, mean_y, depth_m, log2_opacity, ellipse, in_range: inside };
-    let splats = projected.clip(simd, view.size_px, cutoffs);
-    (splats, in_range.to_bitmask() & !inside.to_bitmask())
+    Moments { xx, yy, xy, det }
 }
 
 /// Which Gaussians certainly miss the image: the test of [`CullBound`] in f32. Its bounds of the angles are
