@@ -69,7 +69,8 @@ struct RoundDerivatives {
 pub(super) struct LensPixels<S: Simd> {
     pub(super) x_px: f32x16<S>,
     pub(super) y_px: f32x16<S>,
-    /// Not below 0 where the point is within the field. Elsewhere the pixels are meaningless.
+    /// Not below 0 where the point is within the field. Elsewhere the pixels are meaningless, except for round
+    /// lenses without a windshield: there they are those of the end of the field on the same azimuth.
     pub(super) margin: f32x16<S>,
 }
 
@@ -177,6 +178,13 @@ impl LensProjection {
         }
     }
 
+    /// Whether a point beyond the field has the pixels of the end of the field on its azimuth, so that it lies
+    /// farther from the image than they do.
+    #[inline(always)]
+    pub(super) fn ends_on_azimuth(&self) -> bool {
+        self.windshield.is_none() && matches!(self.model, Model::Round { .. })
+    }
+
     /// The rolling shutter, if the camera moves during the exposure.
     #[inline(always)]
     pub(super) fn shutter(&self) -> Option<&SimdShutter> {
@@ -202,8 +210,12 @@ impl LensProjection {
             Model::Round { px_from_round, series, max_t, .. } => {
                 let off_axis2 = x.mul_add(x, y * y);
                 let inverse = splat(1.0) / (z.mul_add(z, off_axis2).sqrt() + z);
-                let t = off_axis2.sqrt() * inverse;
-                let radius = series.at(simd, t) * inverse;
+                let off_axis = off_axis2.sqrt();
+                let t = off_axis * inverse;
+                // Beyond the field: where the field ends on the same azimuth.
+                let end = splat(*max_t);
+                let t_per_off_axis = inverse.min(end / off_axis);
+                let radius = series.at(simd, t.min(end)) * t_per_off_axis;
                 let [[c, d], [e, f]] = px_from_round.map(|row| row.map(splat));
                 LensPixels {
                     x_px: c.mul_add(x, d * y).mul_add(radius, cx),

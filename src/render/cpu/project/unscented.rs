@@ -163,7 +163,11 @@ fn project_lanes<S: Simd>(
     };
     let mut in_range = in_range & (in_depth | !is_depth);
     if lens.shutter().is_none() {
-        in_range = in_range & !(found & beside(simd, center_px, center, sigma_m, view));
+        let beside = beside(simd, center_px, center, sigma_m, view);
+        in_range = match lens.ends_on_azimuth() {
+            true => in_range & !beside,
+            false => in_range & !(found & beside),
+        };
     }
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
