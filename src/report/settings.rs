@@ -82,7 +82,7 @@ const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
 /// Scales of the image's sides. An agent that reads 576 x 320 px of a camera of 1920 x 1080 px has 0.3.
 const SCALES: [f64; 3] = [0.5, 1.0 / 3.0, 0.25];
 /// Values of `lens_error_px`; 0 projects six points of every Gaussian.
-const LENS_ERRORS_PX: [f64; 4] = [0.0, 1.0 / 256.0, 1.0 / 16.0, 0.25];
+const LENS_ERRORS_PX: [f64; 5] = [0.0, 1.0 / 256.0, 1.0 / 64.0, 1.0 / 16.0, 0.25];
 /// JPEG qualities; 90 is the server's default.
 const JPEG_QUALITIES: [u8; 4] = [50, 75, 90, 98];
 /// `tau_px` and `alpha_cut` of the combined settings, from cautious to coarse.

@@ -135,7 +135,7 @@ impl RenderProfile {
         tau_px: 1.0,
         reach_m: None,
         rays: Rays::Splats,
-        lens_error_px: 1.0 / 64.0,
+        lens_error_px: 0.0,
         sky_error: 0.025,
         background: [0.0; 3],
     };
@@ -356,7 +356,7 @@ mod tests {
     #[test]
     fn keys_lists_every_field() {
         // Fields that are written only if they are not the default.
-        let other = RenderProfile { rays: Rays::Exact, lens_error_px: 0.0, ..Default::default() };
+        let other = RenderProfile { rays: Rays::Exact, lens_error_px: 0.25, ..Default::default() };
         let json = serde_json::to_value(other).unwrap();
         let mut fields: Vec<_> = json.as_object().unwrap().keys().map(String::as_str).collect();
         let mut keys = RenderProfile::KEYS.to_vec();
