@@ -9,14 +9,15 @@
 //! | [`wildcity_client`] | the Rust client of the protocol | protocol |
 //! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | nothing of ours |
 //! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
-//! | [`wildcity_generate`] | procedural streets and cities | scene |
-//! | [`wildcity_sim`] | what moves: the dynamics of the ego vehicle | scene |
+//! | [`wildcity_generate`] | procedural streets and cities, and their maps | scene, sim |
+//! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | scene |
+//! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
 //! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, scene, sim, twin |
-//! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | scene, session, twin |
+//! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
 //! | [`wildcity_server`] | WebSocket and HTTP | protocol, push, render, scene, session, sim, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
@@ -39,5 +40,7 @@
 //! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses or actors there is no
 //!    buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
+//!
+//! [`wildcity_score`]: ../wildcity_score/index.html
 
 pub mod cli;

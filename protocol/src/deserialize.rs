@@ -5,7 +5,10 @@ use std::fmt;
 use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
 use serde::{Deserialize, Deserializer};
 
-use crate::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
+use crate::message::{
+    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, RandomStart, Rig, RigChoice,
+    ScenarioChoice, Start,
+};
 
 /// Decided by the fields that are present. Serde's own `untagged` tries one variant after the other, and
 /// cannot say what was wrong with each.
@@ -17,15 +20,65 @@ impl<'de> Deserialize<'de> for Start {
             pose: Option<Pose>,
             trajectory: Option<String>,
             station_m: Option<f64>,
+            random: Option<RandomStart>,
         }
-        let Either { pose, trajectory, station_m } = Either::deserialize(deserializer)?;
-        match (pose, trajectory, station_m) {
-            (Some(pose), None, None) => Ok(Self::Pose { pose }),
-            (None, Some(trajectory), station_m) => {
+        let Either { pose, trajectory, station_m, random } = Either::deserialize(deserializer)?;
+        match (pose, trajectory, station_m, random) {
+            (Some(pose), None, None, None) => Ok(Self::Pose { pose }),
+            (None, None, None, Some(random)) => Ok(Self::Random { random }),
+            (None, Some(trajectory), station_m, None) => {
                 Ok(Self::Station { trajectory, station_m: station_m.unwrap_or_default() })
             }
-            _ => Err(D::Error::custom("a start has either pose, or trajectory and station_m")),
+            _ => Err(D::Error::custom(
+                "a start has either pose, or trajectory and station_m, or random",
+            )),
         }
+    }
+}
+
+/// Decided by the fields that are present.
+impl<'de> Deserialize<'de> for BranchPoint {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Either {
+            session: Option<String>,
+            snapshot: Option<String>,
+            episode: Option<String>,
+            step: Option<u64>,
+        }
+        let Either { session, snapshot, episode, step } = Either::deserialize(deserializer)?;
+        match (session, snapshot, episode, step) {
+            (Some(session), Some(snapshot), None, None) => Ok(Self::Snapshot { session, snapshot }),
+            (None, None, Some(episode), Some(step)) => Ok(Self::Recorded { episode, step }),
+            _ => Err(D::Error::custom(
+                "a branch is from either session and snapshot, or episode and step",
+            )),
+        }
+    }
+}
+
+/// A string is a name.
+impl<'de> Deserialize<'de> for ScenarioChoice {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = ScenarioChoice;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("the name of a scenario, an object with name and values, or a scenario")
+            }
+
+            fn visit_str<E: Error>(self, name: &str) -> Result<ScenarioChoice, E> {
+                Ok(ScenarioChoice::Name(name.to_owned()))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<ScenarioChoice, A::Error> {
+                serde_json::Map::deserialize(MapAccessDeserializer::new(map))
+                    .map(ScenarioChoice::Object)
+            }
+        }
+        deserializer.deserialize_any(Either)
     }
 }
 

@@ -14,6 +14,8 @@
 //!     pose: Some(pose),
 //!     trajectory: None,
 //!     action: None,
+//!     until_us: None,
+//!     notes: None,
 //!     terminate: false,
 //! };
 //! let json = serde_json::to_string(&step)?;

@@ -130,7 +130,7 @@ impl Import {
         let cannot = || format!("cannot import {}", self.source.display());
         let bar = progress::bytes("reading");
         let read = read_scene(&self.source, &axes, &mut progress::show(&bar));
-        let SourceScene { gaussians, hash } = read.with_context(cannot)?;
+        let SourceScene { gaussians, hash, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
         if gaussians.is_empty() {
             let source = self.source.display();

@@ -25,6 +25,7 @@ mod input_files;
 mod inspect;
 mod limits;
 mod lod;
+mod map;
 mod output;
 mod profile_options;
 mod progress;
@@ -34,6 +35,7 @@ mod replay;
 mod report;
 mod rig;
 mod route;
+mod scenario;
 mod scene_source;
 mod serve;
 mod sky_source;
@@ -73,6 +75,8 @@ enum Command {
     Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
+    Scenario(scenario::ScenarioCommand),
+    Map(map::MapCommand),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
     Stress(stress::Stress),
@@ -80,7 +84,8 @@ enum Command {
     Devices(devices::Devices),
 }
 
-/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure. A
+/// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure, and 3
+/// for a recording that is cut (`replay --verify`). A
 /// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
     let arguments = Arguments::parse();
@@ -98,6 +103,8 @@ pub fn main() -> ExitCode {
         Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
+        Command::Scenario(command) => command.run(),
+        Command::Map(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),
         Command::Stress(command) => command.run(),

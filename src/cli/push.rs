@@ -22,7 +22,7 @@ use super::progress;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// Scene files of the formats that `wildcity import` reads; each scene in one file.
+    /// Scene files of the formats that `wildcity import` reads, and the files that they name.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 

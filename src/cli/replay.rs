@@ -10,6 +10,7 @@ use wildcity_twin::residency::Cache;
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
+use super::exit::Exit;
 use super::{output, progress};
 
 /// Show a recorded episode, or render it again and compare every image with the recording.
@@ -24,8 +25,8 @@ pub(super) struct Replay {
     episode: PathBuf,
 
     /// Render every frame again; the exit code is 1 if an image, a time, a hash or the summary at the end differs, or
-    /// if the recording is incomplete.
-    /// Without --out, stops at the first difference.
+    /// if there are no frames; and 3 if all is as recorded, but the recording was cut: the episode still runs, or the
+    /// server was killed. Without --out, stops at the first difference.
     #[arg(long)]
     verify: bool,
 
@@ -39,6 +40,9 @@ pub(super) struct Replay {
     #[command(flatten)]
     backend: BackendOptions,
 }
+
+/// The exit code of a recording that was cut and verifies as far as it goes.
+const CUT_EXIT_CODE: u8 = 3;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -98,13 +102,18 @@ impl Replay {
             Some(wrong) if self.verify => anyhow::bail!("the record contradicts itself: {wrong}"),
             Some(wrong) => writeln!(out, "wrong       {wrong}")?,
         }
+        if !self.verify {
+            return Ok(());
+        }
         // An empty or unfinished recording does not prove that the whole episode repeats.
-        let missing = match (recording.frames.is_empty(), &recording.end) {
-            (true, _) => "has no frames",
-            (false, None) => "has no end: the episode still runs, or was interrupted",
-            (false, Some(_)) => return Ok(()),
-        };
-        anyhow::ensure!(!self.verify, "the recording is incomplete: it {missing}");
+        let last = recording.frames.last().context("the recording has no frames")?;
+        if recording.end.is_none() {
+            let step = last.step;
+            let message = format!(
+                "the recording is cut, verified to step {step}: the episode still runs, or was interrupted"
+            );
+            return Err(Exit { code: CUT_EXIT_CODE, message }.into());
+        }
         Ok(())
     }
 }
@@ -142,6 +151,7 @@ fn write_png(dir: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {
     let request = match request {
         FrameRequest::Reset => "reset".to_owned(),
         FrameRequest::Step => "step".to_owned(),
+        FrameRequest::Restore => "restore".to_owned(),
         FrameRequest::Observe => format!("observe{pose}"),
     };
     let path = dir.join(format!("{frame:06}_{request}_{}.png", camera.name));

@@ -35,7 +35,7 @@ impl ActorModel {
 }
 
 /// Counts changes of the models: assets of another revision are made again.
-pub const ACTOR_REVISION: u32 = 1;
+pub const ACTOR_REVISION: u32 = 2;
 
 /// All models: a red hatchback, a silver sedan, a white van, and a pedestrian in mid-stride.
 pub fn actor_models() -> Vec<ActorModel> {
@@ -55,7 +55,7 @@ pub fn actor_models() -> Vec<ActorModel> {
             name,
             class: ActorClass::Vehicle,
             box_: ActorBox { length_m, width_m, height_m },
-            gaussians: painter.gaussians,
+            gaussians: above_ground(&painter.gaussians),
         });
     }
     let mut painter = Painter::detailed(&light, 1);
@@ -67,6 +67,11 @@ pub fn actor_models() -> Vec<ActorModel> {
         gaussians: painter.gaussians,
     });
     models
+}
+
+/// The Gaussians with centres above the ground. A wheel arch is a whole disc, and a road need not hide its lower part.
+fn above_ground(gaussians: &Gaussians) -> Gaussians {
+    gaussians.select((0..gaussians.len()).filter(|&i| gaussians.means_m[i][2] >= 0.0))
 }
 
 #[cfg(test)]

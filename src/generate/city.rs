@@ -12,8 +12,10 @@ use rayon::prelude::*;
 use wildcity_scene::chunk::{self, CELL_M};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, Trajectory};
+use wildcity_sim::map::MapFile;
 
 use super::light::Light;
+use super::map::{MappedStreet, map_of};
 use super::random::Random;
 use super::road::LANE_T_M;
 use super::route::{self, BEYOND_M, Bends, Route, Wave};
@@ -85,6 +87,25 @@ pub fn city_drive(settings: &CitySettings) -> Result<Trajectory, GenerateError> 
         poses.extend(route.poses(LANE_T_M, &mut station_m, to_s_m));
     }
     Ok(Trajectory { name: "log".into(), keyframes: route::keyframes(poses, settings.speed_m_s) })
+}
+
+/// The map of a city, from end to end: the lanes of all its streets, linked, with their intersections.
+///
+/// # Errors
+/// Names the first setting out of range.
+pub fn city_map(settings: &CitySettings) -> Result<MapFile, GenerateError> {
+    settings.check()?;
+    let sites: Vec<(Route, f64)> = Streets::new(settings)
+        .map(|site| {
+            let crossing_m = site.crossing_m(&mut site.random(settings.seed));
+            (site.route, crossing_m)
+        })
+        .collect();
+    let streets: Vec<MappedStreet<'_>> = sites
+        .iter()
+        .map(|(route, crossing_m)| MappedStreet { route, crossing_m: *crossing_m })
+        .collect();
+    Ok(map_of(&streets))
 }
 
 impl Iterator for City {
@@ -171,12 +192,21 @@ struct Site {
 }
 
 impl Site {
-    fn plan(self, seed: u64) -> Plan {
-        let mut random = Random::new(seed, "street", self.index);
+    fn random(&self, seed: u64) -> Random {
+        Random::new(seed, "street", self.index)
+    }
+
+    /// The middle of its crossing, in metres along the route: the first draw of its stream.
+    fn crossing_m(&self, random: &mut Random) -> f64 {
         let [from_m, to_m] = self.route.driven_m;
         let middle_m = 0.5 * (from_m + to_m);
         // A street of 100 m, the shortest, leaves 40 m on either side.
-        let crossing_m = middle_m + 0.1 * (to_m - from_m) * random.range(-1.0, 1.0);
+        middle_m + 0.1 * (to_m - from_m) * random.range(-1.0, 1.0)
+    }
+
+    fn plan(self, seed: u64) -> Plan {
+        let mut random = self.random(seed);
+        let crossing_m = self.crossing_m(&mut random);
         Plan::new(self.route, crossing_m, [random.seed(), seed])
     }
 }

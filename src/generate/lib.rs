@@ -30,6 +30,7 @@ mod facade;
 mod furniture;
 mod ground_floor;
 mod light;
+mod map;
 mod pedestrian;
 mod plants;
 mod random;
@@ -40,10 +41,11 @@ mod surface;
 
 pub use actors::{ACTOR_REVISION, ActorModel, actor_models};
 pub use canyon::canyon;
-pub use city::{Cell, City, city, city_drive};
+pub use city::{Cell, City, city, city_drive, city_map};
 use serde::{Deserialize, Serialize};
 
 use wildcity_scene::{Gaussians, Trajectory};
+use wildcity_sim::map::MapFile;
 
 /// Counts the generator's changes: a demo twin of another revision is built again.
 pub const REVISION: u32 = 3;
@@ -113,6 +115,16 @@ pub enum GenerateError {
 pub fn street(settings: &StreetSettings) -> Result<Street, GenerateError> {
     settings.check()?;
     Ok(street::build(settings))
+}
+
+/// The map of the street: its lanes, parking bays, pavements, crosswalks and intersection.
+///
+/// # Errors
+/// Names the first setting out of range.
+pub fn street_map(settings: &StreetSettings) -> Result<MapFile, GenerateError> {
+    settings.check()?;
+    let route = route::Route::new(settings.length_m);
+    Ok(map::map_of(&[map::MappedStreet { route: &route, crossing_m: settings.crossing_m }]))
 }
 
 impl Default for StreetSettings {

@@ -27,9 +27,9 @@ pub(super) const SIDE_FRONT_M: f64 = 6.2;
 pub(super) const SIDE_REACH_M: f64 = 82.0;
 
 /// Where the zebra crossings lie, in metres from the middle of the crossing.
-const ZEBRA_M: [f64; 2] = [6.4, 9.6];
+pub(super) const ZEBRA_M: [f64; 2] = [6.4, 9.6];
 /// Where the stop lines lie, in metres from the middle of the crossing.
-const STOP_M: [f64; 2] = [10.8, 11.2];
+pub(super) const STOP_M: [f64; 2] = [10.8, 11.2];
 /// No lane marks within this distance of the middle of the crossing, in metres.
 const JUNCTION_M: f64 = 11.2;
 /// Length of a dash of the centre line and of the gap after it, in metres.

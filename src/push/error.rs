@@ -1,5 +1,7 @@
 //! Why a push was refused or failed.
 
+use std::time::Duration;
+
 use wildcity_session::SessionError;
 use wildcity_twin::ingest::IngestError;
 use wildcity_twin::store::StoreError;
@@ -55,6 +57,25 @@ pub enum PushError {
         /// How many may wait or run.
         limit: usize,
     },
+    /// Its client cancelled it.
+    #[error("the push was cancelled; send it again if it is wanted after all")]
+    Cancelled,
+    /// It can no longer be cancelled.
+    #[error("the push {id:?} {why}")]
+    TooLate {
+        /// Its id.
+        id: String,
+        /// Why not.
+        why: &'static str,
+    },
+    /// Reading and checking it took too long.
+    #[error(
+        "reading and checking took longer than {limit:?}; push the scene in parts, some cells each"
+    )]
+    TimedOut {
+        /// The most that it may take.
+        limit: Duration,
+    },
     /// The process stops.
     #[error("the server is shutting down; send the push again when it is back")]
     ShuttingDown,
@@ -82,10 +103,13 @@ impl PushError {
             Self::OutOfRange { .. }
             | Self::InvalidField { .. }
             | Self::InvalidName { .. }
-            | Self::Content { .. } => true,
+            | Self::Content { .. }
+            | Self::TimedOut { .. } => true,
             Self::Session(SessionError::Twin(error)) => is_refused_content(error),
             Self::UnknownPush { .. }
             | Self::Busy { .. }
+            | Self::Cancelled
+            | Self::TooLate { .. }
             | Self::ShuttingDown
             | Self::Session(_)
             | Self::Unreadable { .. }

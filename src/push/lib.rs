@@ -17,6 +17,7 @@
 //! JSON: the server converts requests and answers.
 
 mod base;
+mod blocking;
 mod commit;
 mod error;
 pub mod limits;
@@ -31,8 +32,9 @@ mod status;
 
 pub use base::{check_base, default_id};
 pub use error::PushError;
+pub use preview::PsnrPreview;
 pub use publish::{Viewpoints, publish};
-pub use queue::{Begun, PushQueue};
+pub use queue::{Begun, PushQueue, QueueLimits};
 pub use report::{CellChange, FileReport, PushReport, Ranges};
 pub use request::{CellSelection, PushRequest, RequestedFile, profile_with};
 pub use source::{

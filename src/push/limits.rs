@@ -1,8 +1,33 @@
 //! Limits and defaults of this package, with the arithmetic behind each.
 
+use std::time::Duration;
+
 /// Default maximum of pushes that wait or run. A waiting push holds its request in memory, but not its
 /// files.
 pub const OPEN_PUSHES: usize = 16;
+
+/// Bytes of memory that a push may take per byte of its files, beside [`MEMORY_BASE_BYTES`]. Compressed formats have
+/// 12 to 24 bytes per Gaussian, which take 68 to 248 in memory; joining files and the preview make copies.
+pub const MEMORY_PER_FILE_BYTE: u64 = 24;
+
+/// Bytes of memory that the smallest push may take: a mesh becomes 400,000 Gaussians of 68 bytes, and its textures are
+/// decoded.
+pub const MEMORY_BASE_BYTES: u64 = 256 << 20;
+
+/// Bytes of memory that running pushes are assigned at a time.
+pub const MEMORY_UNIT_BYTES: u64 = 1 << 20;
+
+/// Part of the memory for twins that running pushes may take in addition: a third, which with the default for
+/// twins is a quarter of the machine's memory.
+pub const MEMORY_SHARE_OF_TWINS: u64 = 3;
+
+/// Default for how long reading and checking one push may take. 60 GB at 100 MB/s are 10 minutes.
+pub const CHECK_TIMEOUT: Duration = Duration::from_secs(1800);
+
+/// Bytes of memory that a push of files of so many bytes may take.
+pub fn push_memory_bytes(file_bytes: u64) -> u64 {
+    file_bytes.saturating_mul(MEMORY_PER_FILE_BYTE).saturating_add(MEMORY_BASE_BYTES)
+}
 
 /// Number of ended pushes whose status is kept. A report of 100,000 cells takes 3 MB, and most reports
 /// have about a hundred cells.
@@ -15,12 +40,24 @@ pub const PUSH_FILES: usize = 256;
 /// as much again while files are joined. The largest upload holds no more, unless it is compressed.
 pub const PUSH_GAUSSIANS: u64 = 250_000_000;
 
-/// Poses of one preview: 32 small images before, and 32 after.
-pub const PREVIEW_POSES: usize = 32;
+/// The most poses of one preview: 32 small images before, and 32 after.
+pub const PREVIEW_MAX_POSES: usize = 32;
+
+/// Poses of a preview whose push names none, along the twin's first trajectory.
+pub const PREVIEW_DEFAULT_POSES: usize = 4;
+
+/// Longest side of the images that are compared, in pixels.
+pub const PREVIEW_SIDE_PX: u32 = 320;
 
 /// Gaussians of a push that gets a preview. They are in memory as a scene beside the push itself: 92 B
 /// each at SH degree 1, 1.8 GB.
 pub const PREVIEW_GAUSSIANS: usize = 20_000_000;
+
+/// Cells beyond which a push must have [`GAUSSIANS_PER_CELL`] in each on average. They take 50 MB on disk at least.
+pub const SPARSE_CELLS: usize = 4096;
+
+/// Gaussians in each of many cells, on average. A cell of a street has tens of thousands.
+pub const GAUSSIANS_PER_CELL: usize = 16;
 
 /// Characters of a push's note.
 pub const NOTE_CHARS: usize = 1000;

@@ -23,10 +23,13 @@ use wildcity_twin::residency::Viewpoint;
 use wildcity_twin::store::{StoreError, Version};
 
 use crate::base::find_base;
+use crate::blocking::run_blocking;
 use crate::commit::{NewContent, commit};
 use crate::error::PushError;
+use crate::limits;
+use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
-use crate::queue::PushQueue;
+use crate::queue::{PushQueue, Turn};
 use crate::read::{PushedScene, read};
 use crate::report::{CellChanges, PushReport};
 use crate::request::{CellSelection, PushRequest};
@@ -58,38 +61,64 @@ pub async fn publish(
     files: Vec<SourceFile>,
     viewpoints: Viewpoints<'_>,
 ) -> Result<PushedVersion, PushError> {
-    let _turn = queue.turn().await?;
+    let file_bytes = files.iter().map(|file| file.bytes).sum();
+    let turn = queue.turn(&request.twin, file_bytes).await?;
     let request = Arc::new(request);
 
-    push.enter(State::Ingesting);
-    let scene = {
-        let push = push.clone();
-        let request = request.clone();
-        blocking(move || read(&push, &request, &files)).await?
+    let limit = queue.check_timeout();
+    let checked = timeout(limit, read_and_check(engine, push, &request, files, &turn)).await;
+    let Ok(checked) = checked else {
+        push.stop_flag().stop();
+        return Err(PushError::TimedOut { limit });
     };
+    let (scene, base) = checked?;
 
-    push.enter(State::Validating);
-    let base = {
-        let engine = engine.clone();
-        let request = request.clone();
-        blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
-    };
-    let scene = check(engine, push, &request, scene, base.clone()).await?;
-
-    push.enter(State::Committing);
+    // From here on the push cannot be cancelled.
+    push.enter(State::Committing)?;
     let committed = {
         let engine = engine.clone();
         let push = push.clone();
         let request = request.clone();
-        blocking(move || commit_held(&engine, &push, &request, &scene, base.as_deref())).await?
+        let turn = turn.clone();
+        run_blocking(move || {
+            let _turn = turn;
+            commit_held(&engine, &push, &request, &scene, base.as_deref())
+        })
+        .await?
     };
     let Committed { version, held } = committed;
     tracing::info!(twin = request.twin, version = version.number, "pushed");
 
-    push.enter(State::Prefetching);
+    push.enter(State::Prefetching)?;
     preload(engine, &request.twin, version.number, viewpoints(&request.twin)).await;
     drop(held);
     Ok(PushedVersion { number: version.number, hash: version.hash })
+}
+
+/// Everything before the commit. Threads hold the turn: they end a moment after their push does.
+async fn read_and_check(
+    engine: &Arc<Engine>,
+    push: &Arc<Push>,
+    request: &Arc<PushRequest>,
+    files: Vec<SourceFile>,
+    turn: &Turn,
+) -> Result<(CheckedScene, Option<Arc<Version>>), PushError> {
+    push.enter(State::Ingesting)?;
+    let scene = {
+        let push = push.clone();
+        let request = request.clone();
+        let turn = turn.clone();
+        run_blocking(move || read(&push, &request, &files, turn.memory_bytes())).await?
+    };
+
+    push.enter(State::Validating)?;
+    let base = {
+        let engine = engine.clone();
+        let request = request.clone();
+        run_blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
+    };
+    let scene = check(engine, push, request, scene, base.clone()).await?;
+    Ok((scene, base))
 }
 
 /// Determines which cells would change, and compares images before and after.
@@ -104,7 +133,7 @@ async fn check(
         let push = push.clone();
         let request = request.clone();
         let base = base.clone();
-        blocking(move || {
+        run_blocking(move || {
             let scene = compare_cells(&push, &request, scene, base.as_deref())?;
             let changed = comparison(&request, &scene.gaussians, &scene.report, base.as_ref())?;
             Ok((scene, changed))
@@ -114,7 +143,7 @@ async fn check(
     if let Some(changed) = changed {
         let progress = |done, total| push.set_progress(done, total);
         let poses = request.preview_poses.clone();
-        scene.report.preview = engine.preview_psnr(changed, poses, &progress).await?;
+        scene.report.preview = preview_psnr(engine, changed, poses, &progress).await?;
         push.set_report(scene.report.clone());
     }
     check_psnr(request, &scene.gaussians, &scene.report, base.as_deref())?;
@@ -139,12 +168,27 @@ fn compare_cells(
     for mean_m in &gaussians.means_m {
         *counts.entry(cell_at(mean_m)).or_insert(0) += 1;
     }
+    check_density(counts.len(), gaussians.len())
+        .inspect_err(|_| push.set_report(report.clone()))?;
     let changes = CellChanges::new(&request.cells, base.map(|base| &base.manifest), &counts);
     let changes = changes.inspect_err(|_| push.set_report(report.clone()))?;
     report.cells = changes.cells;
     report.left_out = changes.left_out;
     push.set_report(report.clone());
     Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, report })
+}
+
+/// Refuses Gaussians that are scattered over many cells: each cell is an object of 12 kB at least, whatever it holds.
+fn check_density(cells: usize, gaussians: usize) -> Result<(), PushError> {
+    let is_sparse = gaussians < limits::GAUSSIANS_PER_CELL.saturating_mul(cells);
+    if cells <= limits::SPARSE_CELLS || !is_sparse {
+        return Ok(());
+    }
+    let reason = format!(
+        "{gaussians} Gaussians lie in {cells} cells of 64 m, fewer than {} in each: is the unit of the files metres?",
+        limits::GAUSSIANS_PER_CELL
+    );
+    Err(PushError::Content { reason, cells: Vec::new() })
 }
 
 /// A committed version that is not yet opened as the latest.
@@ -191,9 +235,17 @@ async fn preload(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec
     }
 }
 
-/// Runs work that may wait for a disk, or takes long, beside the asynchronous tasks.
-async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> Result<T, PushError> + Send + 'static,
-) -> Result<T, PushError> {
-    tokio::task::spawn_blocking(work).await.map_err(|_| PushError::Crashed)?
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scattered_gaussians_are_refused_and_cities_are_not() {
+        let sparse = limits::SPARSE_CELLS + 1;
+        let error = check_density(100_000, 100_000).unwrap_err();
+        assert!(error.is_refusal() && error.to_string().contains("100000 cells"), "{error}");
+        assert!(check_density(sparse, limits::GAUSSIANS_PER_CELL * sparse - 1).is_err());
+        assert!(check_density(sparse, limits::GAUSSIANS_PER_CELL * sparse).is_ok());
+        assert!(check_density(limits::SPARSE_CELLS, limits::SPARSE_CELLS).is_ok());
+    }
 }

@@ -1,12 +1,14 @@
-//! The pushes of a server: those that wait, the one that runs, and those that ended not long ago.
+//! The pushes of a server: those that wait, those that run, and those that ended not long ago.
 //!
-//! One push runs at a time, since each takes the memory of its files and all cores.
+//! The pushes of one twin run one after the other, in the order of their requests. Pushes of different twins wait for
+//! each other only while memory is short.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use parking_lot::Mutex;
-use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::sync::{Mutex as AsyncMutex, OwnedMutexGuard, OwnedSemaphorePermit, Semaphore};
 
 use crate::error::PushError;
 use crate::limits;
@@ -17,10 +19,35 @@ use crate::status::{Push, State};
 /// The pushes of a server.
 pub struct PushQueue {
     entries: Mutex<Entries>,
-    /// One push runs at a time: each takes the memory of its files, and all cores.
-    turn: Semaphore,
+    /// One lock per twin with a push that waits or runs.
+    twins: Mutex<BTreeMap<String, Arc<AsyncMutex<()>>>>,
+    /// Memory of running pushes, in units of [`limits::MEMORY_UNIT_BYTES`].
+    memory: Arc<Semaphore>,
+    limits: QueueLimits,
+}
+
+/// What the pushes of a server may use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct QueueLimits {
     /// How many may wait or run.
-    limit: usize,
+    pub open: usize,
+    /// Bytes of memory that running pushes may take together.
+    pub memory_bytes: u64,
+    /// How long reading and checking one push may take.
+    pub check_timeout: Duration,
+}
+
+/// The right of a push to run. The next one gets it when all clones are dropped: threads hold a clone, because they
+/// go on for a moment after their push was cancelled.
+#[derive(Clone, Debug)]
+pub(crate) struct Turn(Arc<TurnParts>);
+
+#[derive(Debug)]
+struct TurnParts {
+    /// Bytes that the push may unpack.
+    memory_bytes: u64,
+    _memory: OwnedSemaphorePermit,
+    _twin: OwnedMutexGuard<()>,
 }
 
 #[derive(Default)]
@@ -45,9 +72,15 @@ pub enum Begun {
 }
 
 impl PushQueue {
-    /// An empty queue, of which at most `limit` pushes may wait or run at a time.
-    pub fn new(limit: usize) -> Self {
-        Self { entries: Mutex::default(), turn: Semaphore::new(1), limit }
+    /// An empty queue.
+    pub fn new(limits: QueueLimits) -> Self {
+        let memory = Arc::new(Semaphore::new(memory_units(limits.memory_bytes) as usize));
+        Self { entries: Mutex::default(), twins: Mutex::default(), memory, limits }
+    }
+
+    /// How long reading and checking one push may take.
+    pub(crate) fn check_timeout(&self) -> Duration {
+        self.limits.check_timeout
     }
 
     /// Number of pushes that wait or run.
@@ -79,8 +112,9 @@ impl PushQueue {
                 return Ok(Begun::Known(push.clone()));
             }
         }
-        if entries.open_count() >= self.limit {
-            return Err(PushError::Busy { limit: self.limit }.into());
+        let limit = self.limits.open;
+        if entries.open_count() >= limit {
+            return Err(PushError::Busy { limit }.into());
         }
         let files = files()?;
         entries.begun += 1;
@@ -99,11 +133,35 @@ impl PushQueue {
         found.ok_or_else(|| PushError::UnknownPush { id: id.to_owned(), twin: twin.to_owned() })
     }
 
-    /// Waits for the turn of one push. Dropping the permit gives the turn to the next.
-    pub(crate) async fn turn(&self) -> Result<SemaphorePermit<'_>, PushError> {
+    /// Waits for the turn of a push of files of so many bytes.
+    pub(crate) async fn turn(&self, twin: &str, file_bytes: u64) -> Result<Turn, PushError> {
+        let lock = {
+            let mut twins = self.twins.lock();
+            // Locks that no push holds or waits for are forgotten.
+            twins.retain(|_, lock| Arc::strong_count(lock) > 1);
+            twins.entry(twin.to_owned()).or_default().clone()
+        };
+        // The twin first: a push that waits for its twin keeps no memory from other twins.
+        let twin = lock.lock_owned().await;
+        let needed = limits::push_memory_bytes(file_bytes).min(self.limits.memory_bytes);
+        let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;
         // The semaphore is never closed while the process runs.
-        self.turn.acquire().await.map_err(|_| PushError::ShuttingDown)
+        let memory = memory.map_err(|_| PushError::ShuttingDown)?;
+        let parts = TurnParts { memory_bytes: needed, _memory: memory, _twin: twin };
+        Ok(Turn(Arc::new(parts)))
     }
+}
+
+impl Turn {
+    /// Bytes that the push may unpack.
+    pub(crate) fn memory_bytes(&self) -> u64 {
+        self.0.memory_bytes
+    }
+}
+
+/// Bytes as permits of the semaphore, rounded up.
+fn memory_units(bytes: u64) -> u32 {
+    u32::try_from(bytes.div_ceil(limits::MEMORY_UNIT_BYTES)).unwrap_or(u32::MAX)
 }
 
 impl Entries {
@@ -127,6 +185,12 @@ mod tests {
     use super::*;
     use crate::request::CellSelection;
     use crate::status::PushedVersion;
+
+    const TIMEOUT: Duration = Duration::from_secs(60);
+
+    fn queue(open: usize) -> PushQueue {
+        PushQueue::new(QueueLimits { open, memory_bytes: 1 << 30, check_timeout: TIMEOUT })
+    }
 
     fn request(content: &str) -> PushRequest {
         PushRequest {
@@ -159,7 +223,7 @@ mod tests {
 
     #[test]
     fn an_id_is_one_push_until_it_failed() {
-        let queue = PushQueue::new(2);
+        let queue = queue(2);
         let push = new(begin(&queue, "a", "x"));
         assert!(matches!(begin(&queue, "a", "x"), Ok(Begun::Known(_))));
         assert!(matches!(begin(&queue, "b", "x"), Err(PushError::OutOfRange { .. })));
@@ -174,7 +238,7 @@ mod tests {
 
     #[test]
     fn a_push_without_its_files_is_not_begun() {
-        let queue = PushQueue::new(1);
+        let queue = queue(1);
         let missing = || Err(PushError::Unreadable { name: "a".into(), reason: "gone".into() });
         assert!(queue.begin(&request("a"), "x", missing).is_err());
         assert_eq!(queue.open_count(), 0);
@@ -185,7 +249,7 @@ mod tests {
 
     #[test]
     fn open_pushes_and_remembered_ones_have_a_maximum() {
-        let queue = PushQueue::new(1);
+        let queue = queue(1);
         let first = new(begin(&queue, "a", "first"));
         assert!(matches!(begin(&queue, "a", "x"), Err(PushError::Busy { limit: 1 })));
         let version = PushedVersion { number: 1, hash: String::new() };
@@ -195,5 +259,49 @@ mod tests {
         }
         assert!(queue.get("city", "first").is_err(), "the oldest is forgotten");
         assert!(queue.get("city", "p0").is_ok());
+    }
+
+    /// Whether a turn comes within a moment.
+    async fn comes(queue: &PushQueue, twin: &str, file_bytes: u64) -> Option<Turn> {
+        let turn = queue.turn(twin, file_bytes);
+        tokio::time::timeout(Duration::from_millis(50), turn).await.ok().map(Result::unwrap)
+    }
+
+    #[tokio::test]
+    async fn pushes_of_different_twins_wait_for_memory_only() {
+        let queue = queue(8);
+        let first = comes(&queue, "city", 1000).await.expect("nothing runs");
+        assert!(comes(&queue, "city", 1000).await.is_none(), "one push of a twin at a time");
+        let other = comes(&queue, "street", 1000).await.expect("another twin");
+        // A large push waits until all of the memory is free, and is not overtaken by later ones.
+        assert!(comes(&queue, "avenue", 1 << 40).await.is_none());
+        drop(other);
+        let held = first.clone();
+        drop(first);
+        assert!(comes(&queue, "city", 1000).await.is_none(), "a thread of the first still runs");
+        drop(held);
+        let large = comes(&queue, "avenue", 1 << 40).await.expect("nothing runs");
+        assert_eq!(large.memory_bytes(), 1 << 30);
+        assert!(comes(&queue, "street", 1000).await.is_none(), "no memory is left");
+        drop(large);
+        assert!(comes(&queue, "street", 1000).await.is_some());
+        assert_eq!(queue.twins.lock().len(), 1, "the locks of idle twins are forgotten");
+    }
+
+    #[test]
+    fn a_cancelled_push_stays_cancelled_until_it_is_sent_again() {
+        let queue = queue(2);
+        let push = new(begin(&queue, "a", "x"));
+        push.enter(State::Ingesting).unwrap();
+        push.cancel().unwrap();
+        assert!(matches!(push.enter(State::Committing), Err(PushError::Cancelled)));
+        let version = PushedVersion { number: 1, hash: String::new() };
+        assert_eq!(push.end(Ok(version)), State::Failed);
+        assert!(matches!(push.status().error.as_deref(), Some(PushError::Cancelled)));
+        assert!(push.cancel().is_err(), "it has ended");
+        assert_eq!(queue.open_count(), 0);
+        let again = new(begin(&queue, "a", "x"));
+        again.enter(State::Committing).unwrap();
+        assert_eq!(again.cancel(), Err("is being published"));
     }
 }

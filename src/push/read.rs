@@ -1,13 +1,15 @@
 //! Reads the files of a push and joins them to one scene.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use wildcity_scene::Gaussians;
-use wildcity_twin::ingest::IngestError;
+use wildcity_twin::ingest::{self, IngestError, ListedFiles, ReadLimits};
 
 use crate::error::PushError;
 use crate::limits;
 use crate::report::{FileReport, PushReport, Ranges};
 use crate::request::{PushRequest, RequestedFile};
-use crate::source::{SourceFile, SourceScene, read_scene};
+use crate::source::{SourceFile, SourceScene, read_limited};
 use crate::status::Push;
 
 /// The joined files of a push.
@@ -20,26 +22,29 @@ pub(crate) struct PushedScene {
     pub(crate) report: PushReport,
 }
 
-/// Reads the files in order, converts them to the twin's axes, and joins them. The report of the push
-/// is set on success, and on failure if Gaussians are the reason.
+/// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A file that
+/// another one names, such as a buffer of a glTF, is a part of that scene and no scene of its own. The report of
+/// the push is set on success, and on failure if Gaussians are the reason.
 pub(crate) fn read(
     push: &Push,
     request: &PushRequest,
     files: &[SourceFile],
+    memory_bytes: u64,
 ) -> Result<PushedScene, PushError> {
-    let mut scene = PushedScene {
-        gaussians: Gaussians::default(),
-        hashes: Vec::with_capacity(files.len()),
-        options: Vec::new(),
-        report: PushReport::default(),
-    };
-    let total_bytes: u64 = files.iter().map(|file| file.bytes).sum();
-    let mut read_bytes = 0;
-    for (requested, file) in request.files.iter().zip(files) {
-        let progress = &mut |done: u64, _| push.set_progress(read_bytes + done, total_bytes);
-        add_file(push, &mut scene, RequestedSource { requested, file }, progress)?;
-        read_bytes += file.bytes;
+    let mut reader = Reader::new(push, files, memory_bytes);
+    // Scenes that may name others come first: what they name is known before it could be read as a scene.
+    let names_others: Vec<bool> =
+        files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
+    for is_first in [true, false] {
+        for (index, requested) in request.files.iter().enumerate() {
+            if names_others[index] == is_first && !reader.parts.contains(&files[index].name) {
+                reader.read(index, requested)?;
+            }
+        }
     }
+    reader.join_read(files.len())?;
+
+    let mut scene = reader.scene;
     scene.report.sh_degree = scene.gaussians.sh_degree;
     scene.report.ranges = Ranges::of(&scene.gaussians);
     push.set_report(scene.report.clone());
@@ -50,64 +55,141 @@ pub(crate) fn read(
     Ok(scene)
 }
 
-/// A file, with its axes and unit from the request.
-struct RequestedSource<'a> {
-    requested: &'a RequestedFile,
-    file: &'a SourceFile,
+/// Reads files in any order, and joins them in the order of the request.
+struct Reader<'a> {
+    push: &'a Push,
+    files: &'a [SourceFile],
+    /// The files that a scene may name.
+    listed: ListedFiles,
+    /// Bytes that each scene may unpack to.
+    memory_bytes: u64,
+    total_bytes: u64,
+    read_bytes: u64,
+    /// Names of the files that are parts of a scene.
+    parts: BTreeSet<String>,
+    /// Scenes that are not joined yet, by index of their file.
+    read: BTreeMap<usize, ReadFile>,
+    /// Index of the next file to join.
+    next: usize,
+    scene: PushedScene,
 }
 
-/// Reads one file and appends it to the scene. If its content is refused for its Gaussians, they are
-/// in the report.
-fn add_file(
-    push: &Push,
-    scene: &mut PushedScene,
-    source: RequestedSource<'_>,
-    progress: &mut dyn FnMut(u64, u64),
-) -> Result<(), PushError> {
-    let RequestedSource { requested, file } = source;
-    let name = &file.name;
-    let report = &mut scene.report;
-    let refused = |error: IngestError| PushError::Content {
-        reason: format!("{name}: {error}"),
-        cells: Vec::new(),
-    };
-    let read = match read_scene(&file.path, &requested.axes, progress) {
-        Ok(read) => read,
-        Err(IngestError::Values(bad)) => {
-            report.gaussians += bad.gaussians;
-            report.files.push(FileReport {
-                name: name.clone(),
-                gaussians: bad.gaussians,
-                bad: bad.count,
-                first_bad: bad.first.clone(),
-            });
-            push.set_report(report.clone());
-            return Err(refused(IngestError::Values(bad)));
+/// A scene that is not joined yet.
+struct ReadFile {
+    scene: SourceScene,
+    options: [String; 2],
+}
+
+impl<'a> Reader<'a> {
+    fn new(push: &'a Push, files: &'a [SourceFile], memory_bytes: u64) -> Self {
+        // A name of two different files stands for neither.
+        let mut listed = ListedFiles::new();
+        let mut ambiguous = BTreeSet::new();
+        for file in files {
+            let known = listed.insert(file.name.clone(), file.path.clone());
+            if known.is_some_and(|path| path != file.path) {
+                ambiguous.insert(&file.name);
+            }
         }
-        Err(IngestError::File(cause)) => {
-            return Err(PushError::Unreadable { name: name.clone(), reason: cause.to_string() });
+        listed.retain(|name, _| !ambiguous.contains(name));
+        Self {
+            push,
+            files,
+            listed,
+            memory_bytes,
+            total_bytes: files.iter().map(|file| file.bytes).sum(),
+            read_bytes: 0,
+            parts: BTreeSet::new(),
+            read: BTreeMap::new(),
+            next: 0,
+            scene: PushedScene {
+                gaussians: Gaussians::default(),
+                hashes: Vec::with_capacity(files.len()),
+                options: Vec::new(),
+                report: PushReport::default(),
+            },
         }
-        Err(error) => return Err(refused(error)),
-    };
-    let SourceScene { gaussians, hash } = read;
-    let count = gaussians.len() as u64;
-    report.gaussians += count;
-    report.files.push(FileReport {
-        name: name.clone(),
-        gaussians: count,
-        bad: 0,
-        first_bad: Vec::new(),
-    });
-    check_count(name, report.gaussians).inspect_err(|_| push.set_report(report.clone()))?;
-    if scene.gaussians.is_empty() {
-        // The usual push has one file, which needs no copy.
-        scene.gaussians = gaussians;
-    } else {
-        scene.gaussians.append(&gaussians);
     }
-    scene.hashes.push(hash);
-    scene.options.extend_from_slice(requested.axes.options());
-    Ok(())
+
+    /// Reads one file, and joins it if all files before it are joined. If its content is refused for its
+    /// Gaussians, they are in the report.
+    fn read(&mut self, index: usize, requested: &RequestedFile) -> Result<(), PushError> {
+        let file = &self.files[index];
+        let name = &file.name;
+        let before = self.read_bytes;
+        let (push, total) = (self.push, self.total_bytes);
+        let progress = &mut |done: u64, _| push.set_progress(before + done, total);
+        let refused = |error: IngestError| PushError::Content {
+            reason: format!("{name}: {error}"),
+            cells: Vec::new(),
+        };
+        let limits = ReadLimits {
+            listed: Some(&self.listed),
+            memory_bytes: self.memory_bytes,
+            stop: push.stop_flag().clone(),
+            ..ReadLimits::of_own_file()
+        };
+        let read = match read_limited(&file.path, &requested.axes, &limits, progress) {
+            Ok(read) => read,
+            Err(IngestError::Values(bad)) => {
+                let report = &mut self.scene.report;
+                report.gaussians += bad.gaussians;
+                report.files.push(FileReport {
+                    name: name.clone(),
+                    gaussians: bad.gaussians,
+                    bad: bad.count,
+                    first_bad: bad.first.clone(),
+                });
+                self.push.set_report(report.clone());
+                return Err(refused(IngestError::Values(bad)));
+            }
+            Err(IngestError::File(cause)) => {
+                return Err(PushError::Unreadable {
+                    name: name.clone(),
+                    reason: cause.to_string(),
+                });
+            }
+            Err(error) => return Err(refused(error)),
+        };
+        self.read_bytes += file.bytes;
+        self.parts.extend(read.parts.iter().cloned());
+        self.read
+            .insert(index, ReadFile { scene: read, options: requested.axes.options().clone() });
+        if index == self.next {
+            self.join_read(index + 1)?;
+        }
+        Ok(())
+    }
+
+    /// Joins the scenes that were read of the files before `end`.
+    fn join_read(&mut self, end: usize) -> Result<(), PushError> {
+        while let Some(entry) = self.read.first_entry().filter(|entry| *entry.key() < end) {
+            let name = &self.files[*entry.key()].name;
+            let ReadFile { scene: read, options } = entry.remove();
+            let SourceScene { gaussians, hash, .. } = read;
+            let scene = &mut self.scene;
+            let count = gaussians.len() as u64;
+            scene.report.gaussians += count;
+            scene.report.files.push(FileReport {
+                name: name.clone(),
+                gaussians: count,
+                bad: 0,
+                first_bad: Vec::new(),
+            });
+            let total = scene.report.gaussians;
+            check_count(name, total).inspect_err(|_| self.push.set_report(scene.report.clone()))?;
+            if scene.gaussians.is_empty() {
+                // The usual push has one file, which needs no copy.
+                scene.gaussians = gaussians;
+            } else {
+                scene.gaussians.append(&gaussians);
+            }
+            scene.hashes.push(hash);
+            scene.options.extend(options);
+        }
+        self.next = self.next.max(end);
+        Ok(())
+    }
 }
 
 /// Refuses a push of too many Gaussians; `count` is how many it has with the file `name`.

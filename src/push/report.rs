@@ -3,11 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::{Gaussians, Manifest};
-use wildcity_session::PsnrPreview;
 use wildcity_twin::ingest::BadGaussian;
 
 use crate::error::PushError;
 use crate::limits;
+use crate::preview::psnr::PsnrPreview;
 use crate::request::CellSelection;
 
 /// What was found in the files of a push.

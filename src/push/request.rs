@@ -90,9 +90,9 @@ impl PushRequest {
             return out_of_range("note", format!("longer than {} characters", limits::NOTE_CHARS));
         }
         if let Some(poses) = &self.preview_poses
-            && poses.len() > limits::PREVIEW_POSES
+            && poses.len() > limits::PREVIEW_MAX_POSES
         {
-            let must = format!("{} poses; at most {}", poses.len(), limits::PREVIEW_POSES);
+            let must = format!("{} poses; at most {}", poses.len(), limits::PREVIEW_MAX_POSES);
             return out_of_range("golden.poses", must);
         }
         for (field, name) in [("id", self.id.as_ref()), ("twin", Some(&self.twin))] {

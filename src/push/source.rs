@@ -1,12 +1,15 @@
 //! Reads one scene file and converts it to the twin's axes.
 
 use std::any::Any;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
-use wildcity_twin::ingest::{self, Axes, IngestError, Progress, TrackedObject};
+use wildcity_twin::ingest::{
+    self, Axes, IngestError, Progress, ReadLimits, ReadScene, TrackedObject,
+};
 
 /// The axes and unit of a scene file, and how the user wrote them.
 #[derive(Clone, Debug)]
@@ -35,6 +38,8 @@ pub struct SourceScene {
     pub gaussians: Gaussians,
     /// BLAKE3 of the bytes that were read, in hex.
     pub hash: String,
+    /// The names of the files that the scene file names.
+    pub parts: BTreeSet<String>,
 }
 
 impl SourceAxes {
@@ -47,13 +52,21 @@ impl SourceAxes {
         Ok(Self { axes: axes.parse::<Axes>()?.scaled(scale)?, options })
     }
 
+    /// Converts what was read to the twin's axes.
+    fn apply(&self, read: ReadScene) -> SourceScene {
+        let ReadScene { mut gaussians, hash, parts } = read;
+        self.axes.apply(&mut gaussians);
+        SourceScene { gaussians, hash, parts }
+    }
+
     /// The axes and the scale as options, for the provenance of a version.
     pub fn options(&self) -> &[String; 2] {
         &self.options
     }
 }
 
-/// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes.
+/// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes. The scene
+/// may name the files below its folder.
 ///
 /// # Errors
 /// As [`ingest::read`].
@@ -62,9 +75,21 @@ pub fn read_scene(
     axes: &SourceAxes,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    let (mut gaussians, hash) = ingest::read_hashed(path, progress)?;
-    axes.axes.apply(&mut gaussians);
-    Ok(SourceScene { gaussians, hash })
+    let (gaussians, hash) = ingest::read_hashed(path, progress)?;
+    Ok(axes.apply(ReadScene { gaussians, hash, parts: BTreeSet::new() }))
+}
+
+/// As [`read_scene`], within limits.
+///
+/// # Errors
+/// As [`ingest::read_limited`].
+pub(crate) fn read_limited(
+    path: &Path,
+    axes: &SourceAxes,
+    limits: &ReadLimits<'_>,
+    progress: Progress<'_>,
+) -> Result<SourceScene, IngestError> {
+    ingest::read_limited(path, limits, progress).map(|read| axes.apply(read))
 }
 
 /// As [`read_scene`], with another number of Gaussians for the triangles of a mesh.
@@ -77,9 +102,8 @@ pub fn read_actor(
     mesh_gaussians: u32,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    let (mut gaussians, hash) = ingest::read_with(path, mesh_gaussians, progress)?;
-    axes.axes.apply(&mut gaussians);
-    Ok(SourceScene { gaussians, hash })
+    let limits = ReadLimits { mesh_gaussians, ..ReadLimits::of_own_file() };
+    read_limited(path, axes, &limits, progress)
 }
 
 /// The tracked objects of a recorded drive, each in its own axes, and the file's BLAKE3 in hex.

@@ -3,6 +3,9 @@
 use std::sync::Arc;
 
 use parking_lot::Mutex;
+use tokio::sync::Notify;
+
+use wildcity_twin::ingest::StopFlag;
 
 use crate::error::PushError;
 use crate::report::PushReport;
@@ -26,6 +29,20 @@ pub enum State {
     Refused,
     /// The server could not carry it out.
     Failed,
+}
+
+impl State {
+    /// Whether a push in this state waits or runs.
+    fn is_open(self) -> bool {
+        match self {
+            Self::Queued
+            | Self::Ingesting
+            | Self::Validating
+            | Self::Committing
+            | Self::Prefetching => true,
+            Self::Ready | Self::Refused | Self::Failed => false,
+        }
+    }
 }
 
 /// Work done within a state. The unit is bytes while files are read, else poses or Gaussians.
@@ -67,6 +84,9 @@ pub struct Push {
     /// Counts the pushes of a queue: the oldest is forgotten first.
     number: u64,
     status: Mutex<Status>,
+    /// Stops the threads that read its files.
+    stop: StopFlag,
+    cancelled: Notify,
 }
 
 impl Push {
@@ -78,7 +98,8 @@ impl Push {
             report: None,
             error: None,
         };
-        Self { request_hash, number, status: Mutex::new(status) }
+        let status = Mutex::new(status);
+        Self { request_hash, number, status, stop: StopFlag::default(), cancelled: Notify::new() }
     }
 
     pub(crate) fn request_hash(&self) -> blake3::Hash {
@@ -96,20 +117,45 @@ impl Push {
 
     /// Whether the push waits or runs.
     pub fn is_open(&self) -> bool {
-        match self.status.lock().state {
-            State::Queued
-            | State::Ingesting
-            | State::Validating
-            | State::Committing
-            | State::Prefetching => true,
-            State::Ready | State::Refused | State::Failed => false,
-        }
+        self.status.lock().state.is_open()
     }
 
-    /// Ends the push. An error that is a refusal gives [`State::Refused`], any other [`State::Failed`].
-    /// Returns the state.
+    /// Cancels the push: it ends with [`PushError::Cancelled`], and nothing of it is visible.
+    ///
+    /// # Errors
+    /// Says why it is too late: its version is being written, or it has ended.
+    pub fn cancel(&self) -> Result<(), &'static str> {
+        let mut status = self.status.lock();
+        match status.state {
+            State::Queued | State::Ingesting | State::Validating => {}
+            State::Committing | State::Prefetching => return Err("is being published"),
+            State::Ready | State::Refused | State::Failed => return Err("has ended"),
+        }
+        status.state = State::Failed;
+        status.error = Some(Arc::new(PushError::Cancelled));
+        drop(status);
+        self.stop.stop();
+        self.cancelled.notify_one();
+        Ok(())
+    }
+
+    /// Returns when the push is cancelled.
+    pub async fn cancelled(&self) {
+        self.cancelled.notified().await;
+    }
+
+    /// Stops the threads that read the push's files.
+    pub(crate) fn stop_flag(&self) -> &StopFlag {
+        &self.stop
+    }
+
+    /// Ends the push, unless it was cancelled before. An error that is a refusal gives [`State::Refused`], any
+    /// other [`State::Failed`]. Returns the state.
     pub fn end(&self, result: Result<PushedVersion, PushError>) -> State {
         let mut status = self.status.lock();
+        if !status.state.is_open() {
+            return status.state;
+        }
         match result {
             Ok(version) => {
                 status.state = State::Ready;
@@ -124,10 +170,17 @@ impl Push {
     }
 
     /// Enters a state, at its beginning.
-    pub(crate) fn enter(&self, state: State) {
+    ///
+    /// # Errors
+    /// [`PushError::Cancelled`] if the push was cancelled meanwhile.
+    pub(crate) fn enter(&self, state: State) -> Result<(), PushError> {
         let mut status = self.status.lock();
+        if !status.state.is_open() {
+            return Err(PushError::Cancelled);
+        }
         status.state = state;
         status.progress = Progress::default();
+        Ok(())
     }
 
     pub(crate) fn set_progress(&self, done: u64, total: u64) {

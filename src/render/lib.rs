@@ -248,6 +248,17 @@ pub trait Backend: Send + Sync {
         1
     }
 
+    /// Whether it can draw exact rays, which a profile may ask for.
+    fn draws_exact_rays(&self) -> bool {
+        false
+    }
+
+    /// Whether a small frame that is rendered while a large one is gets its share of the machine at once, so that it
+    /// need not wait for the large one, even if [`Backend::frames_in_flight`] is 1.
+    fn renders_beside(&self) -> bool {
+        false
+    }
+
     /// Renders all views into their targets, `targets[i]` for `views[i]`, and calls `on_view_done` for each.
     ///
     /// # Errors

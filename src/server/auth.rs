@@ -129,6 +129,11 @@ impl Tokens {
         Ok(Self(tokens))
     }
 
+    /// Number of tokens that may upload.
+    pub(crate) fn uploaders(&self) -> usize {
+        self.0.iter().filter(|token| token.grant.require(Role::Push).is_ok()).count()
+    }
+
     /// What the token in the value of an `Authorization` header allows.
     ///
     /// # Errors

@@ -5,8 +5,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use wildcity_push::QueueLimits;
 use wildcity_render::Backend;
 use wildcity_scene::ProfileOverrides;
+use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DiskCacheSettings;
 
 use crate::auth::Tokens;
@@ -24,6 +26,8 @@ pub struct Config {
     pub cache: Option<DiskCacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
+    /// Directory of the scenarios that can be opened by name; it need not exist.
+    pub scenarios: PathBuf,
     /// Directory where uploads are kept until they are pushed. One server uses it at a time.
     pub uploads: PathBuf,
     /// The tokens of clients; without tokens every client may do everything.
@@ -58,6 +62,10 @@ pub struct Limits {
     pub sessions: usize,
     /// Pushes that wait or run at once.
     pub pushes: usize,
+    /// Bytes of memory that running pushes may take together; a third of `resident_bytes` if there is no value.
+    pub push_memory_bytes: Option<u64>,
+    /// Time-out for reading and checking one push.
+    pub push: Duration,
     /// Bytes of memory that all twins in use may take; three quarters of the machine's memory if there
     /// is no value.
     pub resident_bytes: Option<u64>,
@@ -72,10 +80,25 @@ pub struct SpoolLimits {
     pub uploads: usize,
     /// Bytes of the largest upload.
     pub upload_bytes: u64,
-    /// Bytes of all uploads, as announced.
+    /// Bytes of all uploads.
     pub bytes: u64,
+    /// Bytes of the uploads of one token; if there is no value, half of all if several tokens may upload.
+    pub token_bytes: Option<u64>,
     /// How long an upload is kept after its last byte.
     pub age: Duration,
+}
+
+impl Limits {
+    /// The limits of the pushes.
+    pub(crate) fn queue(&self) -> QueueLimits {
+        let twins_bytes = self.resident_bytes.unwrap_or_else(default_memory_bytes);
+        let share_bytes = twins_bytes / wildcity_push::limits::MEMORY_SHARE_OF_TWINS;
+        QueueLimits {
+            open: self.pushes,
+            memory_bytes: self.push_memory_bytes.unwrap_or(share_bytes),
+            check_timeout: self.push,
+        }
+    }
 }
 
 impl Default for Limits {
@@ -90,6 +113,8 @@ impl Default for Limits {
             connections: limits::CONNECTIONS,
             sessions: wildcity_session::limits::SESSIONS,
             pushes: wildcity_push::limits::OPEN_PUSHES,
+            push_memory_bytes: None,
+            push: wildcity_push::limits::CHECK_TIMEOUT,
             resident_bytes: None,
             spool: SpoolLimits::default(),
         }
@@ -102,6 +127,7 @@ impl Default for SpoolLimits {
             uploads: limits::UPLOADS,
             upload_bytes: limits::UPLOAD_BYTES,
             bytes: limits::SPOOL_BYTES,
+            token_bytes: None,
             age: limits::UPLOAD_AGE,
         }
     }
@@ -109,13 +135,24 @@ impl Default for SpoolLimits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
-            self;
+        let Self {
+            listen,
+            twins,
+            cache,
+            episodes,
+            scenarios,
+            uploads,
+            tokens,
+            backend,
+            profile,
+            limits,
+        } = self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("twins", twins)
             .field("cache", cache)
             .field("episodes", episodes)
+            .field("scenarios", scenarios)
             .field("uploads", uploads)
             .field("tokens", &tokens.is_some())
             .field("backend", &backend.name())

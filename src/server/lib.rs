@@ -6,6 +6,7 @@
 //! shutdown       a running server, and stopping it without losing running steps
 //! state          what all connections share
 //! listen         accepts connections, a bounded number
+//! newcomers      the slots of connections, before and after authentication
 //! idle_deadline  closes HTTP connections that make no progress
 //! routes         HTTP routes, and the upgrade to WebSocket
 //! auth           tokens, their roles and twins
@@ -32,6 +33,7 @@ mod inbox;
 pub mod limits;
 mod listen;
 mod metrics;
+mod newcomers;
 mod routes;
 mod sessions;
 mod shutdown;

@@ -17,9 +17,19 @@ pub const RESUME_GRACE: Duration = Duration::from_secs(60);
 /// How long running steps may take to finish after SIGTERM.
 pub const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Connections in addition to [`CONNECTIONS`], which cannot become WebSockets. They are for health checks
-/// and refusals while all WebSocket connections are in use.
+/// Connections in addition to [`CONNECTIONS`], which cannot become WebSockets. They are for HTTP requests while all
+/// WebSocket connections are in use.
 pub const SPARE_CONNECTIONS: usize = 64;
+
+/// Connections that have not sent a request that a token allows. Each takes a file descriptor and 20 kB.
+pub const NEWCOMERS: usize = 512;
+
+/// Connections of one address among those, beyond which its oldest one is closed for the next.
+pub const NEWCOMERS_OF_ADDRESS: usize = 256;
+
+/// How long a new connection is not closed for another one. A client sends its request with its connection, and 512
+/// requests are read in a few milliseconds.
+pub const NEWCOMER_GRACE: Duration = Duration::from_millis(250);
 
 /// Bytes of pongs and of the close frame that a client has not read; each has at most 129 bytes.
 pub const PONGS_BYTES: usize = 4 << 10;
@@ -54,8 +64,21 @@ pub const UPLOAD_NAME_BYTES: usize = 255;
 /// Largest upload: 250 million Gaussians of 236 bytes are 59 GB.
 pub const UPLOAD_BYTES: u64 = 64 << 30;
 
-/// Bytes of all uploads, as announced: two of the largest.
+/// Bytes of all uploads: two of the largest.
 pub const SPOOL_BYTES: u64 = 2 * UPLOAD_BYTES;
+
+/// Part of the spool that each token may use, if several may: half of it, one of the largest uploads.
+pub const TOKEN_SHARE: u64 = 2;
+
+/// Bytes beyond those that have arrived that an active upload has room for: the bytes of a fast connection until
+/// room is next looked for, many times over.
+pub const RESERVED_BYTES: u64 = 16 << 20;
+
+/// How long after its last byte, or its announcement, an upload keeps that room.
+pub const RESERVED_FOR: Duration = Duration::from_secs(120);
+
+/// How long after its last byte an upload may not be removed to make room for those of another token.
+pub const KEPT_FOR: Duration = Duration::from_secs(600);
 
 /// How long an upload is kept after its last byte.
 pub const UPLOAD_AGE: Duration = Duration::from_secs(24 * 3600);

@@ -8,27 +8,25 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
 
 use crate::idle_deadline::IdleDeadline;
 use crate::limits;
+use crate::newcomers::Newcomers;
 use crate::routes;
 use crate::state::ServerState;
 
-/// Serves connections until the server stops. At the maximum number of connections, further ones wait
-/// in the kernel's backlog.
+/// Serves connections until the server stops.
 pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
-    let permits = Arc::new(Semaphore::new(state.limits.connections + limits::SPARE_CONNECTIONS));
+    let newcomers = Newcomers::new(state.limits.connections + limits::SPARE_CONNECTIONS);
     let app = routes::router(state.clone());
     loop {
         let accepted = async {
-            // The semaphore is never closed.
-            let permit = permits.clone().acquire_owned().await.ok()?;
-            Some((permit, listener.accept().await))
+            let (stream, address) = listener.accept().await?;
+            Ok::<_, std::io::Error>((stream, newcomers.admit(address.ip()).await))
         };
-        let (permit, stream) = tokio::select! {
-            Some((permit, accepted)) = accepted => match accepted {
-                Ok((stream, _)) => (permit, stream),
+        let (stream, slot) = tokio::select! {
+            accepted = accepted => match accepted {
+                Ok(accepted) => accepted,
                 Err(error) => {
                     // Most likely there are no file descriptors left; some will be closed.
                     tracing::warn!("cannot accept a connection: {error}");
@@ -40,10 +38,11 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
         };
         set_options(&stream);
         let deadline = Arc::new(IdleDeadline::new(state.limits.hello + state.limits.send));
-        // A WebSocket outlives its HTTP request, and keeps the permit that came with it.
+        // A WebSocket outlives its HTTP request, and keeps the slot that came with it.
+        let slot = Arc::new(slot);
         let app = app
             .clone()
-            .layer(axum::Extension(Arc::new(permit)))
+            .layer(axum::Extension(slot.clone()))
             .layer(axum::Extension(deadline.clone()));
         let connection = http1::Builder::new()
             .timer(TokioTimer::new())
@@ -56,6 +55,7 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
                 // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
                 _ = connection => {}
                 () = deadline.passed() => {}
+                () = slot.closed() => {}
                 () = state.stopped() => {}
             }
         });

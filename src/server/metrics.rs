@@ -95,7 +95,11 @@ impl Metrics {
         registry.register("connections", "WebSocket connections", m.connections.clone());
         registry.register("frames_queued", "Frames in the queue", m.frames_queued.clone());
         registry.register("uploads", "Uploads on disk", m.uploads.clone());
-        registry.register("spool_bytes", "Bytes announced of those", m.spool_bytes.clone());
+        registry.register(
+            "spool_bytes",
+            "Bytes of those that arrived or are reserved",
+            m.spool_bytes.clone(),
+        );
         registry.register("pushes_open", "Pushes that wait or run", m.pushes_open.clone());
         registry.register_collector(Box::new(Residency(engine)));
         Self { registry, ..metrics }

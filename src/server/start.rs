@@ -9,10 +9,11 @@ use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
 
 use wildcity_push::PushQueue;
-use wildcity_session::{Engine, EngineSettings, SessionError};
+use wildcity_session::{Engine, EngineSettings, Scenarios, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
+use crate::auth::Tokens;
 use crate::config::Config;
 use crate::metrics::Metrics;
 use crate::sessions::SessionRegistry;
@@ -64,8 +65,18 @@ pub enum ServerError {
 /// be used. A directory for uploads that cannot be used is only logged: the server starts and refuses
 /// uploads.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
-    let Config { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
-        config;
+    let Config {
+        listen,
+        twins,
+        cache,
+        episodes,
+        scenarios,
+        uploads,
+        tokens,
+        backend,
+        profile,
+        limits,
+    } = config;
     if tokens.is_none() && !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
@@ -75,8 +86,13 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
     let catalog = Catalog::open_cached(&twins, cache.as_ref())?;
     let cache = Cache::limited(catalog, limits.resident_bytes);
-    let engine =
-        Engine::start(EngineSettings { cache, episodes, backend, step_timeout: limits.step })?;
+    let engine = Engine::start(EngineSettings {
+        cache,
+        episodes,
+        scenarios: Scenarios::in_dir(scenarios),
+        backend,
+        step_timeout: limits.step,
+    })?;
 
     // The socket.
     let listen_error = |cause| ServerError::Listen { address: listen, cause };
@@ -84,7 +100,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     let address = listener.local_addr().map_err(listen_error)?;
 
     // Uploads. Agents can drive without them.
-    let spool = Spool::open(&uploads, limits.spool).map(Arc::new).map_err(|error| {
+    let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
+    let spool = Spool::open(&uploads, limits.spool, uploaders).map(Arc::new).map_err(|error| {
         let reason = format!("{}: {error}", uploads.display());
         tracing::warn!("uploads are refused: {reason}");
         reason
@@ -101,7 +118,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         profile,
         tokens,
         spool,
-        pushes: PushQueue::new(limits.pushes),
+        pushes: PushQueue::new(limits.queue()),
     });
     Ok(Running::new(state, listener, address, stop))
 }

@@ -1,6 +1,7 @@
 //! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
-//! A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
+//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues
+//! exactly as the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
 //! new one before it replaces the old, so that a step which fails on the way has not happened.
 
 use std::collections::VecDeque;
@@ -11,6 +12,7 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::Keyframe;
+use wildcity_sim::scenario::EndReason;
 use wildcity_sim::{Command, Ego, Ground};
 
 use crate::error::SessionError;
@@ -20,7 +22,8 @@ use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
 const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
 
 /// The state of an episode.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Episode {
     seed: u64,
     dt_us: i64,
@@ -34,7 +37,15 @@ pub struct Episode {
     /// Where the track began, in microseconds: 0, or the start of the warm-up, which is below 0.
     begin_us: i64,
     /// The least mean trust of an observation, of those that came with a trust.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     least_trust: Option<f64>,
+    /// Whether a rule of the scenario ended it because the ego failed.
+    #[serde(default, skip_serializing_if = "is_false")]
+    failed: bool,
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// Why an episode ended.
@@ -46,6 +57,8 @@ pub enum Outcome {
     /// As `Completed`, but the ego left the recorded area: the trust of an observation was below
     /// [`limits::OFF_MODEL_TRUST`]. Only in sessions whose observations have a trust.
     OffModel,
+    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    DrivingFailure,
     /// The agent broke the protocol, and the connection was closed.
     AgentError,
     /// The agent was silent for too long.
@@ -106,6 +119,7 @@ impl Episode {
             track,
             begin_us,
             least_trust: None,
+            failed: false,
         }
     }
 
@@ -120,21 +134,40 @@ impl Episode {
         ground: &Ground<'_>,
         terminate: bool,
     ) -> Result<Self, SessionError> {
+        self.followed(command, 1, ground, terminate)
+    }
+
+    /// The episode after one or more steps along a plan: a command that holds for all of them.
+    ///
+    /// # Errors
+    /// As [`Episode::stepped`].
+    pub fn followed(
+        &self,
+        command: &Command,
+        steps: usize,
+        ground: &Ground<'_>,
+        terminate: bool,
+    ) -> Result<Self, SessionError> {
         if self.terminated {
             return Err(SessionError::EpisodeOver { steps: self.step });
         }
         let mut next = self.clone();
-        next.ego = self.ego.stepped(command, self.dt_us, ground)?;
-        let world_from_rig = next.ego.world_from_rig();
-        let moved_m = world_from_rig.position_m - self.world_from_rig().position_m;
-        let time_us = self.time_us() + self.dt_us;
-        next.step += 1;
-        next.distance_m += moved_m.length();
+        for ego in self.ego.followed(command, self.dt_us, steps, ground)? {
+            let world_from_rig = ego.world_from_rig();
+            let moved_m = world_from_rig.position_m - next.world_from_rig().position_m;
+            let time_us = next.time_us() + self.dt_us;
+            next.step += 1;
+            next.distance_m += moved_m.length();
+            next.track.push_back(Keyframe { time_us, world_from_rig });
+            next.ego = ego;
+        }
         next.terminated = terminate;
-        next.track.push_back(Keyframe { time_us, world_from_rig });
-        // Keep one pose at or before the history's first, to interpolate from. The first step may still
-        // render frames of the warm-up, so it keeps all of that.
-        let reach_us = HISTORY_US.max(self.dt_us - self.begin_us);
+        // Keep one pose at or before the history's first, to interpolate from, for every step of the plan: the
+        // frames that were taken since its start are rendered at its end. The first plan may still render frames
+        // of the warm-up, so it keeps all of that.
+        let time_us = next.time_us();
+        let plan_us = time_us - self.time_us();
+        let reach_us = (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
         while next.track.len() > 2 && next.track[1].time_us <= time_us - reach_us {
             next.track.pop_front();
         }
@@ -143,25 +176,50 @@ impl Episode {
 
     /// The views of some cameras of a rig, selected by their indices, from a pose of the rig.
     ///
-    /// With `in_motion`, cameras with a rolling shutter move during the exposure: the ego's last motion is
-    /// transferred to that pose. Otherwise the rig stands still during the exposure, as in a warm-up and at
-    /// the start of an episode.
+    /// Cameras with a rolling shutter move during the exposure: the ego's motion up to the time `taken_us` is
+    /// transferred to that pose. In a warm-up (`taken_us` below 0) and at the start of an episode, the rig stands
+    /// still during the exposure.
     pub(crate) fn views(
         &self,
         cameras: &[RigCamera],
         selected: &[usize],
         world_from_rig: Pose,
-        in_motion: bool,
+        taken_us: i64,
     ) -> Vec<View> {
-        let now = self.world_from_rig();
+        let now = self.pose_at(taken_us);
         let all = View::of_moving_rig(cameras, world_from_rig, &|age_us| {
-            if !in_motion {
+            if taken_us < 0 {
                 return world_from_rig;
             }
-            let then = self.pose_at((self.time_us() - age_us).max(0));
+            let then = self.pose_at((taken_us - age_us).max(0));
             if world_from_rig == now { then } else { world_from_rig * (now.inverse() * then) }
         });
         selected.iter().map(|&camera| all[camera]).collect()
+    }
+
+    /// Checks a state that was read from a file. Returns what is wrong with it otherwise.
+    pub(crate) fn check(&self) -> Result<(), &'static str> {
+        let rising = self.track.iter().is_sorted_by(|a, b| a.time_us < b.time_us);
+        match self.track.back() {
+            None => Err("a state without a pose"),
+            Some(_) if !rising => Err("a state whose times do not rise"),
+            Some(_) if self.dt_us <= 0 => Err("a state whose steps take no time"),
+            Some(now) if now.world_from_rig != self.world_from_rig() => {
+                Err("a state whose last pose is not the ego's")
+            }
+            Some(_) => Ok(()),
+        }
+    }
+
+    /// The poses before its start, if it is still there.
+    pub(crate) fn warm_up(&self) -> Vec<Keyframe> {
+        let before = self.track.iter().filter(|key| self.step == 0 && key.time_us < 0);
+        before.copied().collect()
+    }
+
+    /// Whether it has its start alone: no step was made, and there is no warm-up before the start.
+    pub(crate) fn is_start_alone(&self) -> bool {
+        self.step == 0 && self.begin_us == 0
     }
 
     /// Seed of the episode.
@@ -211,13 +269,15 @@ impl Episode {
         outcome: Outcome,
         least_trust: Option<f64>,
     ) -> EpisodeSummary {
-        let completed =
-            self.terminated || matches!(outcome, Outcome::Completed | Outcome::OffModel);
+        let completed = self.terminated
+            || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
+        let failed = self.failed || outcome == Outcome::DrivingFailure;
         let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
-        let outcome = match (completed, off_model) {
-            (true, true) => Outcome::OffModel,
-            (true, false) => Outcome::Completed,
-            (false, _) => outcome,
+        let outcome = match (completed, off_model, failed) {
+            (true, true, _) => Outcome::OffModel,
+            (true, false, true) => Outcome::DrivingFailure,
+            (true, false, false) => Outcome::Completed,
+            (false, ..) => outcome,
         };
         EpisodeSummary {
             outcome,
@@ -226,6 +286,12 @@ impl Episode {
             distance_m: self.distance_m,
             least_trust,
         }
+    }
+
+    /// Ends the episode by a rule of the scenario.
+    pub(crate) fn end(&mut self, reason: EndReason) {
+        self.terminated = true;
+        self.failed = reason.is_failure();
     }
 
     /// Takes the trusts of an observation's images, 0 to 1 each, into account; there may be none.
@@ -345,7 +411,8 @@ mod tests {
     #[test]
     fn rolling_shutters_see_from_where_the_ego_was() {
         let views = |episode: &Episode, camera: &RigCamera, x_m: f64| {
-            episode.views(std::slice::from_ref(camera), &[0], at(x_m, 0.0), true)
+            let now_us = episode.time_us();
+            episode.views(std::slice::from_ref(camera), &[0], at(x_m, 0.0), now_us)
         };
         let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 4.0, cy: 3.0 };
         let mut camera = RigCamera::new("front", Camera::from_pinhole(8, 6, pinhole), at(1.5, 0.2));

@@ -10,6 +10,7 @@ use wildcity_twin::store::StoreError;
 
 use crate::options::Start;
 use crate::record::error::RecordError;
+use crate::scenario::load::ScenarioError;
 
 /// Why a request was refused. The session is then as it was before the request.
 #[derive(Debug, thiserror::Error)]
@@ -20,6 +21,9 @@ pub enum SessionError {
     /// What a frame needs does not fit into memory, or could not be loaded.
     #[error(transparent)]
     Residency(ResidencyError),
+    /// The scenario does not exist, is malformed, or does not fit the twin.
+    #[error(transparent)]
+    Scenario(#[from] ScenarioError),
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {
@@ -41,6 +45,30 @@ pub enum SessionError {
     /// A recorded drive of the twin is no route.
     #[error(transparent)]
     Route(#[from] RouteError),
+    /// The session has no snapshot of this name.
+    #[error("there is no snapshot {name:?}; there is {}", joined_or_none(known))]
+    UnknownSnapshot {
+        /// The field of the request that names it, as on the wire.
+        field: &'static str,
+        /// The requested name.
+        name: String,
+        /// The names of the session's snapshots.
+        known: Vec<String>,
+    },
+    /// There is no recorded episode of this name.
+    #[error(
+        "there is no recorded episode {name:?}; an episode is named SESSION-NUMBER, as its file"
+    )]
+    UnknownEpisode {
+        /// The requested name.
+        name: String,
+    },
+    /// A recorded episode cannot be continued.
+    #[error("the recorded episode cannot be continued: {reason}")]
+    Branch {
+        /// What prevents it.
+        reason: String,
+    },
     /// A camera was requested twice.
     #[error("camera {name:?} is requested twice; name each camera once")]
     CameraTwice {
@@ -60,6 +88,8 @@ pub enum SessionError {
     /// The twin has no trajectory of this name.
     #[error("the twin has no trajectory {name:?}; it has {}", joined_or_none(known))]
     UnknownTrajectory {
+        /// The field of the request that names it, as on the wire.
+        field: &'static str,
         /// The requested name.
         name: String,
         /// The names of the twin's trajectories.
@@ -142,6 +172,7 @@ impl SessionError {
                 let field = match start {
                     Start::Pose(_) => "start.pose",
                     Start::Station { .. } => "start.station_m",
+                    Start::Random(_) => "start.random.from_m",
                 };
                 let must = format!("too early for the session's warm_up_us, which is {must}");
                 Self::OutOfRange { field, must }

@@ -8,12 +8,13 @@
 //! |---|---|
 //! | `session` | a session: opening it, answering its requests |
 //! | `options`, `start` | what a client requests when it opens a session; where episodes start |
-//! | `episode` | the ego's pose, the simulated time, and the past poses |
+//! | `state`, `episode` | the parts of a session; the ego's pose, the simulated time, and the past poses |
+//! | `snapshot` | named states, to return to and to open other sessions from |
 //! | `engine` | the twins in memory, the render queue, the budget for answers |
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
-//! | `preview` | the preview of a push |
+//! | `scenario` | scenarios by name, and the files beside them |
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
@@ -24,15 +25,17 @@ pub mod limits;
 mod observe;
 mod options;
 mod prefetch;
-mod preview;
 mod record;
+mod scenario;
 mod session;
+mod snapshot;
 mod start;
+mod state;
 mod viewpoint;
 
-pub use engine::render_queue::Scratch;
-pub use engine::twin_summaries::{TrajectorySummary, TwinSummary};
-pub use engine::{Engine, EngineSettings, LatestPin};
+pub use engine::render_queue::{FrameCost, Scratch};
+pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};
+pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use observe::buffer::ObservationBuffer;
@@ -42,17 +45,25 @@ pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
 pub use observe::trust::{TrainingCoverage, Trust};
-pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
-pub use preview::{ProposedChange, PsnrPreview};
+pub use options::{
+    ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
+    SessionOptions, Start, StepOptions,
+};
+pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
 pub use record::error::RecordError;
 pub use record::format::{
-    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOutputs, RecordedVersion,
+    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOrigin, RecordedOutputs,
+    RecordedSettings, RecordedVersion, is_episode_name,
 };
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
     WrongValue,
 };
+pub use scenario::{
+    EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
+};
 pub use session::Session;
+pub use snapshot::{Snapshot, Snapshots};
 pub use viewpoint::viewpoints;

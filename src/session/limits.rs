@@ -2,6 +2,16 @@
 
 use std::time::Duration;
 
+/// Most events of one observation.
+pub const EVENTS: usize = 64;
+
+/// Room in the header of an observation for its events and the route: 64 events of at most 600 bytes, 20 points of 80,
+/// and a text of a command of at most 1,000 bytes, each twice at worst, since the metadata is a text within JSON.
+pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
+
+/// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
+pub const ACTOR_HEADER_BYTES: usize = 640;
+
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
@@ -27,6 +37,19 @@ pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 /// Sessions at once, both connected ones and ones that wait for their client to resume.
 pub const SESSIONS: usize = 256;
 
+/// Most steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of 64 bytes until the plan's end.
+pub const PLAN_STEPS: usize = 1_000;
+
+/// Longest plan, in microseconds: as long as the longest trajectory.
+pub const PLAN_US: i64 = wildcity_sim::limits::PATH_US;
+
+/// Largest notes of a step, in bytes of JSON. A line of the record has room for them.
+pub const NOTES_BYTES: usize = 64 << 10;
+
+/// Snapshots of one session. A snapshot holds the last frames of a bundle, which count against
+/// [`ANSWERS_BYTES`], and the poses of 1.5 s.
+pub const SNAPSHOTS: usize = 64;
+
 /// Poses of one `observe` request.
 pub const OBSERVE_POSES: usize = 16;
 
@@ -49,6 +72,9 @@ pub const BUNDLE_FRAMES: usize = HISTORY_POSES;
 /// raises it to the step.
 pub const BUNDLE_PERIOD_US: i64 = 10_000_000;
 
+/// Largest lateral jitter of a random start, in metres: the other side of a wide road.
+pub const START_LATERAL_M: f64 = 20.0;
+
 /// Longest warm-up, in microseconds: sixteen frames at 1 Hz, and more than twice what any known agent
 /// reads. At 100 Hz these are 2,000 poses of a recorded drive.
 pub const WARM_UP_US: i64 = 20_000_000;
@@ -62,6 +88,10 @@ pub const DT_MAX_US: i64 = 10_000_000;
 /// Frames that may wait for the renderer. A session waits for one at a time, and may leave an abandoned
 /// one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
+
+/// A frame of more pixels takes so long on processors, a second and more, that small frames are rendered beside it.
+/// Sixteen 1440x928 images are 21 million.
+pub const LARGE_PIXELS: u64 = 24 << 20;
 
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the sessions'
 /// overlays, which take 134 MB per session at worst. Enough for 100 sessions with six raw 1440x928 images,
@@ -119,12 +149,6 @@ pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 
 /// Most steps that prefetching looks ahead, even if the agent steps much faster than real time.
 pub const STEPS_AHEAD: usize = 256;
-
-/// Poses along the twin's trajectory at which a push is compared, unless the push names its own.
-pub const PREVIEW_POSES: usize = 4;
-
-/// Longest side of the images that are compared, in pixels.
-pub const PREVIEW_SIDE_PX: u32 = 320;
 
 /// How long a push may preload its version for the running sessions. After that the version counts as ready
 /// even if something is still missing.

@@ -9,6 +9,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
 
 use crate::observe::encode::Encoding;
+use crate::scenario::load::ScenarioSource;
 
 /// How to open a session. For a field that is `None`, the twin or this package's `limits` decide.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +40,23 @@ pub struct SessionOptions {
     pub warm_up_us: i64,
     /// How long one answer may take.
     pub deadline: Option<Duration>,
+    /// The scenario that is driven; without one there are no actors.
+    pub scenario: Option<ScenarioOptions>,
+}
+
+/// A scenario, and what of its ego section holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScenarioOptions {
+    /// Which scenario.
+    pub source: ScenarioSource,
+    /// Values of its sweep; the first ones where absent.
+    pub values: BTreeMap<String, serde_json::Value>,
+    /// Whether its dynamics hold: the request names none.
+    pub dynamics: bool,
+    /// Whether its warm-up holds: the request names none.
+    pub warm_up: bool,
+    /// Whether observations tell where the actors are.
+    pub actors: bool,
 }
 
 impl SessionOptions {
@@ -57,8 +75,20 @@ impl SessionOptions {
             decision_us: None,
             warm_up_us: 0,
             deadline: None,
+            scenario: None,
         }
     }
+}
+
+/// How a step is made, beside its command.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepOptions {
+    /// For how long the command is followed, in microseconds: a whole number of steps; one step if absent.
+    pub until_us: Option<i64>,
+    /// Whether the episode ends with it.
+    pub terminate: bool,
+    /// What the agent notes, for the record.
+    pub notes: Option<serde_json::Value>,
 }
 
 /// Where an episode starts.
@@ -73,6 +103,36 @@ pub enum Start {
         /// Distance along it in metres, from 0 to its length.
         station_m: f64,
     },
+    /// Somewhere along a recorded trajectory, drawn with the episode's seed.
+    Random(RandomStart),
+}
+
+/// A start that is drawn anew for each episode. Every draw is uniform.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RandomStart {
+    /// Name of the trajectory; the first one if absent.
+    pub trajectory: Option<String>,
+    /// Where the stations begin, in metres; at 0, or where a warm-up ends, if absent.
+    pub from_m: Option<f64>,
+    /// Where the stations end, in metres; at the trajectory's end if absent.
+    pub to_m: Option<f64>,
+    /// Largest distance to the left or right of the drive, in metres.
+    pub lateral_m: f64,
+    /// Largest angle to the drive's heading, in radians.
+    pub heading_rad: f64,
+}
+
+/// What `reset` changes for its episode.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ResetOptions {
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Where it starts; the session's start if absent.
+    pub start: Option<Start>,
+    /// How the ego moves; the session's dynamics if absent.
+    pub dynamics: Option<Dynamics>,
+    /// Speed at the start, in m/s, in place of that of the dynamics.
+    pub speed_m_s: Option<f64>,
 }
 
 /// Which rig.

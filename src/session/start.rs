@@ -1,6 +1,9 @@
 //! Where an episode starts, and the part of the recorded drive before it.
 
+use glam::{DQuat, DVec3};
+
 use wildcity_scene::geometry::Pose;
+use wildcity_scene::random::Random;
 use wildcity_scene::route::Route;
 use wildcity_scene::trajectory::Keyframe;
 use wildcity_scene::{Manifest, Trajectory};
@@ -9,7 +12,7 @@ use wildcity_sim::{Dynamics, Ego, Ground};
 use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
-use crate::options::Start;
+use crate::options::{RandomStart, Start};
 
 /// The start of an episode, resolved against a version of the twin.
 #[derive(Clone, Debug)]
@@ -21,7 +24,7 @@ pub(crate) struct EpisodeStart {
 }
 
 impl EpisodeStart {
-    /// Resolves a start. Without one, the episode starts where the first recorded drive begins, or after
+    /// Resolves a start; `seed` is that of the episode. Without a start, the episode starts where the first recorded drive begins, or after
     /// `warm_up_us` of that drive; on a twin without a drive, at the world's origin.
     ///
     /// # Errors
@@ -31,6 +34,7 @@ impl EpisodeStart {
         start: Option<&Start>,
         warm_up_us: i64,
         dynamics: Dynamics,
+        seed: u64,
     ) -> Result<Self, SessionError> {
         let drives = &manifest.trajectories;
         let mut resolved = match start {
@@ -38,6 +42,7 @@ impl EpisodeStart {
             Some(Start::Station { trajectory, station_m }) => {
                 Self::at_station(drives, trajectory, *station_m, warm_up_us)?
             }
+            Some(Start::Random(random)) => Self::at_random(drives, random, warm_up_us, seed)?,
             None => Self::at_first_drive(drives, warm_up_us)?,
         };
         let ground = Ground::from_drives(drives);
@@ -61,10 +66,7 @@ impl EpisodeStart {
         warm_up_us: i64,
     ) -> Result<Self, SessionError> {
         check_warm_up(warm_up_us)?;
-        let drive = drives.iter().find(|drive| drive.name == name).ok_or_else(|| {
-            let known = drives.iter().map(|drive| drive.name.clone()).collect();
-            SessionError::UnknownTrajectory { name: name.to_owned(), known }
-        })?;
+        let drive = drive_of(drives, "start.trajectory", name)?;
         let length_m = drive.length_m();
         if !(0.0..=length_m).contains(&station_m) {
             let must = format!("{station_m} m; {name:?} is from 0 to {length_m} m long");
@@ -76,6 +78,71 @@ impl EpisodeStart {
         }
         let start_us = Route::new(drive)?.at(station_m).time_us;
         Self::with_warm_up(drive, start_us, warm_up_us)
+    }
+
+    /// Draws a start. With a warm-up, the drive before it is moved and turned with it.
+    fn at_random(
+        drives: &[Trajectory],
+        random: &RandomStart,
+        warm_up_us: i64,
+        seed: u64,
+    ) -> Result<Self, SessionError> {
+        let RandomStart { trajectory, from_m, to_m, lateral_m, heading_rad } = random;
+        check_warm_up(warm_up_us)?;
+        let drive = match (trajectory, drives.first()) {
+            (Some(name), _) => drive_of(drives, "start.random.trajectory", name)?,
+            (None, Some(first)) => first,
+            (None, None) => {
+                let must = "a draw along a trajectory, and the twin has none".to_owned();
+                return Err(SessionError::OutOfRange { field: "start.random", must });
+            }
+        };
+        check_jitter("start.random.lateral_m", *lateral_m, limits::START_LATERAL_M)?;
+        check_jitter("start.random.heading_rad", *heading_rad, std::f64::consts::PI)?;
+
+        // The stations between which the start is drawn.
+        let route = Route::new(drive)?;
+        let length_m = route.length_m();
+        let begin_us = drive.keyframes.first().map_or(0, |first| first.time_us);
+        let warm_m = match warm_up_us {
+            0 => 0.0,
+            _ => route.station_at(begin_us.saturating_add(warm_up_us)),
+        };
+        let first_m = from_m.unwrap_or(warm_m);
+        let last_m = to_m.unwrap_or(length_m);
+        if !(warm_m..=length_m).contains(&first_m) {
+            let must = format!("{first_m} m; {warm_m} to {length_m} m are accepted");
+            return Err(SessionError::OutOfRange { field: "start.random.from_m", must });
+        }
+        if !(first_m..=length_m).contains(&last_m) {
+            let must = format!("{last_m} m; {first_m} to {length_m} m are accepted");
+            return Err(SessionError::OutOfRange { field: "start.random.to_m", must });
+        }
+
+        // One stream for each draw, so that a change of one range does not change the other draws.
+        let draw = |name: &str, low: f64, high: f64| match low < high {
+            true => Random::new(seed, name, 0).range(low, high),
+            false => low,
+        };
+        let station_m = draw("start station", first_m, last_m);
+        let aside_m = draw("start lateral", -lateral_m, *lateral_m);
+        let turn_rad = draw("start heading", -heading_rad, *heading_rad);
+
+        let drawn = Self::at_station(drives, &drive.name, station_m, warm_up_us)?;
+        let offset = Pose {
+            position_m: DVec3::new(0.0, aside_m, 0.0),
+            rotation: DQuat::from_rotation_z(turn_rad),
+        };
+        Ok(drawn.moved_by(offset))
+    }
+
+    /// The same start with the rig, and the drive before it, moved by an offset in the rig's frame.
+    fn moved_by(self, offset: Pose) -> Self {
+        let world_from_rig = self.world_from_rig * offset;
+        let moved = world_from_rig * self.world_from_rig.inverse();
+        let moved_key =
+            |key: Keyframe| Keyframe { world_from_rig: moved * key.world_from_rig, ..key };
+        Self { warm_up: self.warm_up.into_iter().map(moved_key).collect(), world_from_rig }
     }
 
     fn at_first_drive(drives: &[Trajectory], warm_up_us: i64) -> Result<Self, SessionError> {
@@ -114,6 +181,19 @@ impl EpisodeStart {
         Ok(Self { warm_up: std::iter::once(first).chain(between).collect(), world_from_rig })
     }
 
+    /// The start of a recorded episode; `state` is the one at the beginning of its file.
+    pub(crate) fn recorded(world_from_rig: Pose, state: Option<&Episode>) -> Self {
+        let warm_up = state.map(Episode::warm_up).unwrap_or_default();
+        Self { warm_up, world_from_rig }
+    }
+
+    /// The same start for other dynamics, on the ground if they need one.
+    pub(crate) fn placed(&self, manifest: &Manifest, dynamics: Dynamics) -> Self {
+        let ground = Ground::from_drives(&manifest.trajectories);
+        let world_from_rig = dynamics.start_pose(self.world_from_rig, &ground);
+        Self { warm_up: self.warm_up.clone(), world_from_rig }
+    }
+
     /// `world_from_rig` of the start.
     pub(crate) fn world_from_rig(&self) -> Pose {
         self.world_from_rig
@@ -124,6 +204,25 @@ impl EpisodeStart {
         let ego = Ego::new(dynamics, self.world_from_rig);
         Episode::with_warm_up(seed, ego, &self.warm_up, dt_us)
     }
+}
+
+/// The drive of a name; `field` is the field of the request that has the name.
+fn drive_of<'a>(
+    drives: &'a [Trajectory],
+    field: &'static str,
+    name: &str,
+) -> Result<&'a Trajectory, SessionError> {
+    drives.iter().find(|drive| drive.name == name).ok_or_else(|| {
+        let known = drives.iter().map(|drive| drive.name.clone()).collect();
+        SessionError::UnknownTrajectory { field, name: name.to_owned(), known }
+    })
+}
+
+fn check_jitter(field: &'static str, value: f64, most: f64) -> Result<(), SessionError> {
+    if (0.0..=most).contains(&value) {
+        return Ok(());
+    }
+    Err(SessionError::OutOfRange { field, must: format!("{value}; 0 to {most} are accepted") })
 }
 
 fn check_warm_up(warm_up_us: i64) -> Result<(), SessionError> {

@@ -86,7 +86,8 @@ fn t29(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
     };
     // The balls of an actor are 4 to 6 m from its origin.
     let places: [(&str, f64, Vec<Pose>); 4] = [
-        ("around the camera", 120.0, vec![pose(0.2, 0.1, -5.0, 0.1)]),
+        // Turned, the middle of the balls is 0.6 m ahead of the camera.
+        ("around the camera", 120.0, vec![pose(-0.48, 1.48, -4.15, 0.1)]),
         ("under the road", 120.0, vec![pose(0.0, 5.0, 3.0, 0.6)]),
         ("1,000 m away", 20_000.0, vec![pose(300.0, 0.0, 1_000.0, 2.0)]),
         ("overlapping", 120.0, vec![pose(0.0, 0.0, 2.0, 0.2), pose(0.3, 0.0, 2.2, 0.5)]),

@@ -103,6 +103,11 @@ pub fn cases(
                 },
             )
             .map_err(wrong)?;
+            if !resolved.traffic.actors.is_empty() {
+                let message =
+                    "suites drive without other traffic yet; remove the actors and the tracks";
+                return Err(wrong(FileError { path: "actors".into(), message: message.into() }));
+            }
             cases.push(
                 Case::new(suite, name, case.seed, case.values, resolved, &version)
                     .map_err(wrong)?,

@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use wildcity_render::Backend;
 use wildcity_scene::ProfileOverrides;
 use wildcity_server::{Config, Limits, Running};
-use wildcity_session::{Engine, EngineSettings, Outcome, Session};
+use wildcity_session::{Engine, EngineSettings, Outcome, Scenarios, Session};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
@@ -150,6 +150,7 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
     Ok(Engine::start(EngineSettings {
         cache: Cache::new(settings.catalog.clone()),
         episodes: settings.episodes.clone(),
+        scenarios: Scenarios::in_dir(""),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
     })?)
@@ -161,6 +162,7 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
         twins: settings.twins.clone(),
         cache: settings.cache.clone(),
         episodes: settings.episodes.clone(),
+        scenarios: settings.episodes.join(".scenarios"),
         uploads: settings.episodes.join(".uploads"),
         tokens: None,
         backend: settings.backend.clone(),

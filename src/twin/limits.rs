@@ -46,6 +46,9 @@ pub const MESH_PARTS: usize = 400_000;
 /// memory. The tracks of a log are 100,000.
 pub const NUREC_VALUES: usize = 1 << 20;
 
+/// The most layers of static Gaussians of a NuRec payload. NVIDIA's scenes have fewer than ten.
+pub const NUREC_LAYERS: usize = 1024;
+
 /// The most Gaussians of one import, because their order within the twin is stored as u32.
 pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 

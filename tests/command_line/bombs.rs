@@ -58,6 +58,12 @@ fn decompression_bombs_are_refused_in_bounded_memory() {
     let json =
         json.replacen(r#"{"nodes":[0]}"#, &format!(r#"{{"nodes":[{}]}}"#, shown.join(",")), 1);
     write("instances.glb", &glb((json, buffer)));
+    // 5 kB name one file of 64 MiB two hundred times; the last time with one byte more than it has.
+    std::fs::File::create(dir.path().join("big.bin")).unwrap().set_len(64 << 20).unwrap();
+    let named = |bytes: u64| format!(r#"{{"uri":"big.bin","byteLength":{bytes}}}"#);
+    let buffers = [vec![named(1); 199], vec![named((64 << 20) + 1)]].concat().join(",");
+    let json = format!(r#"{{"asset":{{"version":"2.0"}},"buffers":[{buffers}]}}"#);
+    write("named.gltf", json.as_bytes());
 
     for (name, wanted, limit_mb) in [
         ("honest.spz", "SPZ, the gzip stream: ", 60),
@@ -66,6 +72,7 @@ fn decompression_bombs_are_refused_in_bounded_memory() {
         ("means.zip", "zip, means_l.webp: ", 60),
         ("images.sog", "SOG, means_l.webp: ", 60),
         ("instances.glb", "glTF, node ", 700),
+        ("named.gltf", "glTF body: the header promises 67108865 bytes (buffer 199)", 150),
     ] {
         let path = dir.path().join(name);
         let file_mb = std::fs::metadata(&path).unwrap().len() >> 20;

@@ -64,6 +64,7 @@ fn a_killed_import_leaves_the_old_version_or_the_new_one() {
             let counts: Vec<_> = catalog
                 .twins()
                 .unwrap()
+                .twins
                 .iter()
                 .map(|twin| catalog.version(&twin.name, None).unwrap().manifest.gaussians())
                 .collect();

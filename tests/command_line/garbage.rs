@@ -37,6 +37,17 @@ fn gc_fsck_list_and_log_print_their_results() {
     assert_eq!(said.lines().count(), 3);
     let (_, said) = run(&["log", "street"]);
     assert!(said.contains("push of 2"), "{said}");
+    // A damaged record is listed with its reason, and set aside on demand.
+    std::fs::write(place.twins().join("street/log/0000000004"), "").unwrap();
+    let (code, said) = run(&["list"]);
+    assert_eq!(code, Some(0));
+    assert!(
+        said.contains("street") && said.contains("damaged: ") && said.contains("log/0000000004"),
+        "{said}"
+    );
+    assert_eq!(run(&["fsck", "street"]).0, Some(1));
+    assert_eq!(run(&["fsck", "street", "--repair"]).0, Some(0));
+    assert!(run(&["list"]).1.contains("version 3"));
     std::fs::remove_file(place.twins().join("street/log/0000000001")).unwrap();
     let (code, said) = run(&["fsck", "street"]);
     assert_eq!(code, Some(1));

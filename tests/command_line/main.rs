@@ -53,6 +53,7 @@ mod replay;
 mod report;
 mod rig;
 mod route;
+mod scenario;
 mod sky;
 mod twin;
 

@@ -1,8 +1,12 @@
 //! The demo street, and cities: the same every time, within the bounds of a twin, drivable, and closed.
 
+#[path = "../support/root.rs"]
+mod root;
+
 mod city;
 mod drive;
 mod pictures;
+mod scenarios;
 
 use std::sync::LazyLock;
 

@@ -4,7 +4,7 @@
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use wildcity_scene::Gaussians;
-use wildcity_twin::ingest;
+use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, StopFlag};
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, usdz, zip_of,
@@ -326,5 +326,74 @@ fn progress_of_every_format_ends_at_all_bytes() {
         let read = case.files.iter().filter(|(name, _)| !name.starts_with("coarse/"));
         let bytes = read.map(|(name, _)| dir.path().join(name).metadata().unwrap().len()).sum();
         assert_eq!(reports.last(), Some(&(bytes, bytes)), "{}", case.name);
+    }
+}
+
+/// Each naming counts for nothing: neither the time to read a file nor the memory for it.
+#[test]
+fn a_file_that_a_scene_names_often_is_read_once() {
+    let g = gaussians(20, 0, 20.0, 1);
+    let (json, buffer) = gltf(&g, "", r#""uri":"scene.bin","#);
+    let named = format!(r#"{{"uri":"scene.bin","byteLength":{}}}"#, buffer.len());
+    let often = format!(r#""buffers":[{}{}"#, format!("{named},").repeat(39), r#"{"uri""#);
+    let json = json.replacen(r#""buffers":[{"uri""#, &often, 1);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.gltf");
+    std::fs::write(&path, &json).unwrap();
+    std::fs::write(dir.path().join("scene.bin"), &buffer).unwrap();
+    let mut read_bytes = 0;
+    let read = ingest::read(&path, &mut |done, _| read_bytes = done).unwrap();
+    assert_eq!(read.len(), 20);
+    assert_eq!(read_bytes, (json.len() + buffer.len()) as u64);
+}
+
+/// A file from an untrusted source names nothing that is not listed.
+#[test]
+fn a_listed_scene_reads_listed_files_only() {
+    let g = gaussians(20, 0, 20.0, 1);
+    let (json, buffer) = gltf(&g, "", r#""uri":"scene.bin","#);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.gltf");
+    let elsewhere = dir.path().join("elsewhere");
+    std::fs::write(&path, &json).unwrap();
+    std::fs::write(dir.path().join("scene.bin"), &buffer).unwrap();
+    std::fs::write(&elsewhere, &buffer).unwrap();
+    let read = |listed: &ListedFiles| {
+        let limits = ReadLimits { listed: Some(listed), ..ReadLimits::of_own_file() };
+        ingest::read_limited(&path, &limits, &mut |_, _| {})
+    };
+    let error = read(&ListedFiles::new()).unwrap_err().to_string();
+    assert!(
+        error.starts_with("part \"scene.bin\": is not the name of exactly one file"),
+        "{error}"
+    );
+    let read = read(&ListedFiles::from([("scene.bin".to_owned(), elsewhere)])).unwrap();
+    assert_eq!((read.gaussians.len(), read.parts.len()), (20, 1));
+    assert_eq!(read.hash, ingest::read_hashed(&path, &mut |_, _| {}).unwrap().1);
+}
+
+/// What is unpacked counts against the memory of the reader, and reading stops when it is told to.
+#[test]
+fn a_reader_has_a_budget_and_can_be_stopped() {
+    let g = gaussians(2_000, 3, 20.0, 1);
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in [
+        ("gzip.spz", gzip(&spz_plain(&g, 3))),
+        ("zstd.spz", spz4(&g)),
+        ("scene.glb", glb(gltf(&g, "", ""))),
+        ("scene.sog", zip_of(&sog(&g, 2), false)),
+        ("scene.usdz", usdz(nurec_plain(&g, false))),
+    ] {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let read = |limits: ReadLimits<'_>| ingest::read_limited(&path, &limits, &mut |_, _| {});
+        assert_eq!(read(ReadLimits::of_own_file()).unwrap().gaussians.len(), 2_000);
+        let error = read(ReadLimits { memory_bytes: 10_000, ..ReadLimits::of_own_file() });
+        let error = error.unwrap_err().to_string();
+        assert!(error.contains("10000 may be used"), "{name}: {error}");
+        let stop = StopFlag::default();
+        stop.stop();
+        let error = read(ReadLimits { stop, ..ReadLimits::of_own_file() }).unwrap_err().to_string();
+        assert!(error.contains("reading was stopped"), "{name}: {error}");
     }
 }

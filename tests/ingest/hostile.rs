@@ -332,3 +332,72 @@ fn a_splat_file_is_detected_by_its_first_record() {
         );
     }
 }
+
+/// A NuRec payload of empty layers, each of six arrays with their shapes.
+fn empty_layers(count: usize) -> Vec<u8> {
+    let text = |text: &str| [&[0xd9, text.len() as u8], text.as_bytes()].concat();
+    let long = |kind: u8, length: usize| [&[kind][..], &(length as u32).to_be_bytes()].concat();
+    let fields = [
+        ("positions", 3),
+        ("rotations", 4),
+        ("scales", 3),
+        ("densities", 1),
+        ("features_albedo", 3),
+        ("features_specular", 0),
+    ];
+    let mut state = long(0xdf, count * 2 * fields.len());
+    for layer in 0..count {
+        for (field, columns) in fields {
+            let key = format!(".gaussians_nodes.{layer}.{field}");
+            state.extend([text(&key), vec![0xc4, 0]].concat());
+            state.extend([text(&format!("{key}.shape")), vec![0x92, 0, columns]].concat());
+        }
+    }
+    let state = [&[0x81][..], &text("state_dict"), &state].concat();
+    usdz([&[0x81][..], &text("nre_data"), &state].concat())
+}
+
+/// The time to read layers is linear in their number, which has a limit.
+#[test]
+fn many_empty_layers_take_no_time() {
+    assert_eq!(crate::read(&empty_layers(1_024)).unwrap().len(), 0);
+    let file = empty_layers(29_000);
+    let begun = std::time::Instant::now();
+    let text = refusal(&file);
+    let took = begun.elapsed();
+    assert!(text.ends_with("29000 layers; at most 1024 are read"), "{text}");
+    assert!(took.as_secs_f64() < 1.0, "{took:?}");
+}
+
+/// What follows the content is damage, or hides something.
+#[test]
+fn bytes_after_the_end_and_wrong_counts_are_refused() {
+    let g = gaussians(COUNT, 0, 20.0, 1);
+    let with = |mut file: Vec<u8>, more: &[u8]| {
+        file.extend(more);
+        file
+    };
+    let payload = with(gzip(&nurec_plain(&g, false)), b"more");
+    let usdz = zip_of(&[("scene.nurec".to_owned(), payload)], false);
+    let mut counted = ksplat(&g, 0);
+    counted[16] += 1;
+    // Four bytes within the length that the header says.
+    let mut padded = with(glb(gltf(&g, "", "")), &[0; 4]);
+    let length = padded.len() as u32;
+    padded[8..12].copy_from_slice(&length.to_le_bytes());
+    for (file, wanted) in [
+        (with(gzip(&spz_plain(&g, 3)), b"more"), "SPZ body, the end: more than the gzip stream"),
+        (
+            with(gzip(&spz_plain(&g, 3)), &gzip(b"x")),
+            "SPZ body, the end: more than the gzip stream",
+        ),
+        (usdz, "NuRec body, the gzip stream: is followed by 4 bytes"),
+        (with(zip_of(&sog(&g, 2), false), &[0]), "zip body, the end of the directory: is not at"),
+        (counted, ".ksplat header, bytes 16 to 19: 7 Gaussians; the sections have 6"),
+        (with(splat(&g), &[0; 32]), ".splat body, record 6: is all zeros"),
+        (padded, "glTF header, chunks: 4 bytes after the last one"),
+    ] {
+        let text = refusal(&file);
+        assert!(text.starts_with(wanted), "{text}\n{wanted}");
+    }
+}

@@ -157,7 +157,7 @@ fn what_a_record_cannot_hold_is_counted_and_refused_with_its_name() {
         error => panic!("{error}"),
     }
     assert_eq!(
-        wildcity_twin::store::Catalog::open(dir.path()).unwrap().twins().unwrap()[0].number,
+        wildcity_twin::store::Catalog::open(dir.path()).unwrap().twins().unwrap().twins[0].number,
         1
     );
     commit(dir.path(), &scene, StorageOptions { record: RecordFormat::H52, levels: false })

@@ -36,7 +36,7 @@ fn absent_fields_have_defaults() {
     let step = parse(&format!(r#"{{"type":"step","seq":2,{pose}}}"#)).unwrap();
     assert!(matches!(step, Request::Step { terminate: false, .. }));
     let reset = parse(r#"{"type":"reset","seq":3}"#).unwrap();
-    assert_eq!(reset, Request::Reset { seq: 3, seed: 0, start: None });
+    assert_eq!(reset, Request::Reset { seq: 3, seed: 0, start: None, dynamics: None, speed: None });
     // Unknown fields of requests are mistakes, not extensions.
     let unknown = format!(r#"{{"type":"step","seq":2,{pose},"speed":3}}"#);
     assert!(parse(&unknown).unwrap_err().to_string().contains("speed"));
@@ -154,6 +154,12 @@ fn requests() -> Vec<(&'static str, Request)> {
         ..front()
     };
     let rig = Rig { name: "pair".into(), cameras: vec![seen, rear()] };
+    let section = DriveSection {
+        name: "log".into(),
+        from_m: Some(12.5),
+        to_m: Some(62.5),
+        every_m: Some(0.5),
+    };
     let open = Open {
         seq: 1,
         version: Some(3),
@@ -175,12 +181,15 @@ fn requests() -> Vec<(&'static str, Request)> {
             normals: Some(true),
             frames: Some(4),
             trust: Some(true),
+            actors: None,
             period_us: Some([("rear".to_owned(), 200_000)].into()),
         },
         dt_us: Some(100_000),
         deadline_ms: Some(20_000),
         decision_us: Some(500_000),
+        scenario: None,
         warm_up_us: Some(1_600_000),
+        trajectory: Some(section),
         ..Open::twin("street")
     };
     let preset = Open {
@@ -199,10 +208,21 @@ fn requests() -> Vec<(&'static str, Request)> {
         pose,
         trajectory,
         action,
+        until_us: None,
+        notes: None,
         terminate,
     };
     let ahead =
         |time_us, x_m| TimedPose { time_us, pose: pose([x_m, 0.5, 0.0], [1.0, 0.0, 0.0, 0.0]) };
+    let until = Request::Step {
+        seq: 3,
+        pose: None,
+        trajectory: Some(vec![ahead(500_000, 1.5), ahead(1_000_000, 3.25)]),
+        action: None,
+        until_us: Some(1_000_000),
+        notes: Some(json!({ "confidence": 0.75, "reasoning": "a clear road" })),
+        terminate: false,
+    };
     let planned = vec![ahead(100_000, 1.5), ahead(200_000, 3.25)];
     let action = Action { acceleration: -1.5, curvature: 0.025 };
     let there = pose([12.5, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]);
@@ -210,6 +230,25 @@ fn requests() -> Vec<(&'static str, Request)> {
     let start = Start::Pose { pose: there };
     let client = ClientInfo { name: "golden".into(), version: "0.1.0".into() };
     let protocols = vec![PROTOCOL.to_owned()];
+    let reset = |seq, seed, start| Request::Reset { seq, seed, start, dynamics: None, speed: None };
+    let random = RandomStart {
+        trajectory: Some("log".into()),
+        from_m: Some(20.0),
+        to_m: Some(300.0),
+        lateral_m: Some(0.5),
+        heading_rad: Some(0.0625),
+    };
+    let dynamics = Dynamics { model: DynamicsModel::Kinematic, speed: 3.0, reverse: false };
+    let drawn = Request::Reset {
+        seq: 8,
+        seed: 10,
+        start: Some(Start::Random { random }),
+        dynamics: Some(DynamicsChoice::Full(dynamics)),
+        speed: Some(8.5),
+    };
+    let taken =
+        BranchPoint::Snapshot { session: "run-17".into(), snapshot: "before-junction".into() };
+    let recorded = BranchPoint::Recorded { episode: "run-17-1".into(), step: 40 };
     vec![
         ("hello", Request::Hello { seq: 0, client, protocols }),
         ("open", Request::Open(Box::new(open))),
@@ -220,16 +259,38 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("step_terminate", step(4, Some(there), None, None, true)),
         ("step_trajectory", step(3, None, Some(planned), None, false)),
         ("step_action", step(3, None, None, Some(action), false)),
+        ("step_until", until),
         ("observe", Request::Observe { seq: 5, poses: vec![there, above] }),
         ("prefetch", Request::Prefetch { seq: 6, poses: vec![there, above] }),
-        ("reset", Request::Reset { seq: 2, seed: 7, start: None }),
-        ("reset_pose", Request::Reset { seq: 6, seed: 8, start: Some(start) }),
-        ("reset_station", Request::Reset { seq: 7, seed: 9, start: Some(station) }),
+        ("reset", reset(2, 7, None)),
+        ("reset_pose", reset(6, 8, Some(start))),
+        ("reset_station", reset(7, 9, Some(station))),
+        ("reset_random", drawn),
         ("switch_version", Request::SwitchVersion { seq: 8, version: Some(4) }),
         ("switch_latest", Request::SwitchVersion { seq: 8, version: None }),
+        ("snapshot", Request::Snapshot { seq: 9, name: "before-junction".into() }),
+        ("restore", Request::Restore { seq: 10, name: "before-junction".into() }),
+        ("branch", Request::Branch(Branch { seq: 1, from: taken, session: Some("run-18".into()) })),
+        ("branch_recorded", Request::Branch(Branch { seq: 1, from: recorded, session: None })),
         ("close", Request::Close { seq: 8 }),
         ("resume", Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4 }),
     ]
+}
+
+/// Two poses of a drive.
+pub(crate) fn drive() -> Drive {
+    let at = |station_m: f64, time_us, x_m| DrivePose {
+        station_m,
+        time_us,
+        pose: pose([x_m, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]),
+    };
+    Drive {
+        name: "log".into(),
+        version: 3,
+        version_hash: blake3::hash(b"a manifest").to_hex().to_string(),
+        length_m: 350.5,
+        poses: vec![at(12.5, 1_250_000, 12.5), at(13.0, 1_300_000, 13.0)],
+    }
 }
 
 fn answers() -> Vec<(&'static str, Answer)> {
@@ -284,11 +345,14 @@ fn answers() -> Vec<(&'static str, Answer)> {
             opacity: true,
             frames: Some(4),
             trust: Some(true),
+            actors: None,
             period_us: Some([("front".to_owned(), 100_000), ("rear".to_owned(), 200_000)].into()),
             ..Outputs::default()
         },
         trajectories: vec![trajectory],
         reserved_bytes: 36_000_000,
+        scenario: None,
+        trajectory: Some(drive()),
     };
     let switched = Answer::Switched {
         seq: 8,
@@ -297,7 +361,14 @@ fn answers() -> Vec<(&'static str, Answer)> {
         profile_hash: opened.profile_hash.clone(),
         profile: opened.profile.clone(),
     };
-    let session = "run-17".to_owned();
+    let resumed = Answer::Resumed {
+        seq: 1,
+        session: "run-17".to_owned(),
+        last_seq: 4,
+        step: 2,
+        time_us: 200_000,
+        opened: Some(Box::new(Opened { trajectory: None, ..opened.clone() })),
+    };
     let summary = Summary {
         outcome: Outcome::OffModel,
         steps: 2,
@@ -324,7 +395,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
     vec![
         ("welcome", welcome),
         ("opened", Answer::Opened(Box::new(opened))),
-        ("resumed", Answer::Resumed { seq: 1, session, last_seq: 4, step: 2, time_us: 200_000 }),
+        ("resumed", resumed),
         ("ok", Answer::Ok { seq: 6 }),
         ("switched", switched),
         ("closed", Answer::Closed { seq: 8, summary }),

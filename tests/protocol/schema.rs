@@ -2,18 +2,20 @@
 
 use schemars::transform::{RecursiveTransform, Transform};
 use schemars::{JsonSchema, Schema, schema_for};
+use serde_json::Value;
 use wildcity_protocol::{http, message, observation};
 
 use super::check_json;
 
 #[test]
 fn schemas_are_up_to_date() {
-    // The server refuses unknown fields at any depth; clients ignore them.
+    // The server refuses unknown fields and `null` at any depth; clients ignore unknown fields.
     check_closed::<message::Request>("request");
     check_closed::<http::NewUpload>("new_upload");
     check_closed::<http::NewPush>("new_push");
     check_closed::<http::Rollback>("rollback");
     check::<message::Answer>("answer");
+    check::<message::Drive>("drive");
     check::<observation::ObservationMetadata>("observation");
     check::<http::Upload>("upload");
     check::<http::Push>("push");
@@ -25,6 +27,7 @@ fn schemas_are_up_to_date() {
 fn check_closed<T: JsonSchema>(name: &str) {
     let mut schema = schema_for!(T);
     RecursiveTransform(closed).transform(&mut schema);
+    RecursiveTransform(without_null).transform(&mut schema);
     check_json(&format!("schema/{name}.json"), &schema);
 }
 
@@ -35,5 +38,26 @@ fn check<T: JsonSchema>(name: &str) {
 fn closed(schema: &mut Schema) {
     if schema.get("properties").is_some() && schema.get("$ref").is_none() {
         schema.insert("additionalProperties".to_owned(), false.into());
+    }
+}
+
+/// An option that is not set is left out. schemars says that it may be `null` as well.
+fn without_null(schema: &mut Schema) {
+    if let Some(Value::Array(types)) = schema.get_mut("type") {
+        types.retain(|name| name != "null");
+        if let [one] = &types[..] {
+            let one = one.clone();
+            schema.insert("type".to_owned(), one);
+        }
+    }
+    if let Some(Value::Array(choices)) = schema.get_mut("anyOf") {
+        choices.retain(|choice| choice["type"] != "null");
+        if let [Value::Object(one)] = &choices[..] {
+            let one = one.clone();
+            schema.remove("anyOf");
+            for (keyword, value) in one {
+                schema.insert(keyword, value);
+            }
+        }
     }
 }

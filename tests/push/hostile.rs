@@ -2,7 +2,10 @@
 
 use serde_json::json;
 
-use crate::http::{get, post, send};
+use wildcity_client::PushState;
+
+use crate::gltf_files::gltf;
+use crate::http::{client, get, in_cell, post, push_of, send};
 use crate::support::TestServer;
 
 #[tokio::test]
@@ -90,4 +93,44 @@ async fn hostile_bodies() {
     }
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
     server.still_serves().await;
+}
+
+/// A pushed scene may name the other files of its push, and nothing else that the server keeps.
+#[tokio::test]
+async fn a_pushed_scene_names_only_files_of_its_push() {
+    let server = TestServer::start().await;
+    let client = client(&server);
+    let dir = tempfile::tempdir().unwrap();
+    let upload = async |name: &str, bytes: &[u8]| {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        client.upload(&path, &mut |_, _| {}).await.unwrap().id
+    };
+    let pushed = async |uploads: &[&str]| {
+        let begun = client.push("test", &push_of(uploads)).await.unwrap();
+        client.wait_for_push(begun, &mut |_| {}).await.unwrap()
+    };
+    let scene = in_cell([0, 0], 40, 1);
+    let (json, buffer) = gltf(&scene, "", r#""uri":"block.bin","#);
+    let buffer_id = upload("block.bin", &buffer).await;
+    let scene_id = upload("block.gltf", json.as_bytes()).await;
+    // Another upload, by the name of its file in the server's directory.
+    let stolen = json.replace("block.bin", &format!("{buffer_id}.data"));
+    let stolen_id = upload("stolen.gltf", stolen.as_bytes()).await;
+
+    for (uploads, part) in
+        [(&stolen_id, format!("{buffer_id}.data")), (&scene_id, "block.bin".into())]
+    {
+        let refused = pushed(&[uploads]).await;
+        assert_eq!(refused.state, PushState::Refused, "{refused:?}");
+        let reason = refused.error.unwrap().message;
+        assert!(reason.contains(&format!("part {part:?}: is not the name of")), "{reason}");
+    }
+    // The file that another one names is no scene, wherever it is listed.
+    for uploads in [[&*buffer_id, &*scene_id], [&*scene_id, &*buffer_id]] {
+        let ready = pushed(&uploads).await;
+        assert_eq!(ready.state, PushState::Ready, "{ready:?}");
+        let report = ready.report.unwrap();
+        assert_eq!((report.gaussians, report.files.len()), (40, 1));
+    }
 }

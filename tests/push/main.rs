@@ -1,6 +1,8 @@
 //! Uploads and pushes over HTTP: what is pushed is what agents see, whole, when they ask for it; and
 //! whatever goes wrong on the way changes nothing.
 
+#[path = "../support/gltf.rs"]
+mod gltf_files;
 #[path = "../support/push.rs"]
 mod http;
 #[path = "../support/scene_files.rs"]

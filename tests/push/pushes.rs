@@ -3,14 +3,17 @@
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use serde_json::json;
 use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushState};
 use wildcity_protocol::error::Code;
 use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::Gaussians;
+use wildcity_server::Limits;
 use wildcity_twin::store::Catalog;
 
-use crate::http::{client, get, in_cell, post, push, push_of, write};
+use crate::http::{client, get, in_cell, post, push, push_of, send, write};
 use crate::scene_files::gaussians;
 use crate::support::TestServer;
 
@@ -230,4 +233,56 @@ async fn a_crash_while_comparing_fails_the_push_and_nothing_else() {
     let again = push(&server, &in_cell([0, 0], 40, 1), |push| push.id = Some("p".into())).await;
     assert_eq!((again.state, again.version), (PushState::Ready, Some(2)), "{again:?}");
     server.still_serves().await;
+}
+
+/// A push that takes long delays no push of another twin, and can be cancelled.
+#[tokio::test]
+async fn a_slow_push_delays_no_other_twin_and_can_be_cancelled() {
+    let server = TestServer::start().await;
+    let client = client(&server);
+    let dir = tempfile::tempdir().unwrap();
+    let upload = async |name: &str, gaussians: Gaussians| {
+        let path = write(dir.path(), name, &gaussians);
+        client.upload(&path, &mut |_, _| {}).await.unwrap().id
+    };
+    let slow_id = upload("slow.ply", in_cell([0, 0], 40, 1)).await;
+    let other_id = upload("other.ply", in_cell([0, 0], 20, 2)).await;
+    // The preview of a push renders eight frames.
+    server.painter.slow_ms.store(1_000, Ordering::SeqCst);
+    let slow = NewPush { id: Some("slow".to_owned()), ..push_of(&[&slow_id]) };
+    let begun = client.push("test", &slow).await.unwrap();
+    let other = client.push("other", &push_of(&[&other_id])).await.unwrap();
+    let other = client.wait_for_push(other, &mut |_| {}).await.unwrap();
+    assert_eq!(other.state, PushState::Ready, "{other:?}");
+    let path = format!("/v1/twins/test/pushes/{}", begun.id);
+    let state = get(&server, &path).await.body["state"].clone();
+    assert!(["ingesting", "validating"].contains(&state.as_str().unwrap()), "{state}");
+
+    let delete = format!("DELETE {path} HTTP/1.1");
+    let cancelled = send(server.address(), &delete, b"").await;
+    assert_eq!((cancelled.status, &cancelled.body["state"]), (200, &json!("failed")));
+    assert_eq!(cancelled.body["error"]["code"], "conflict", "{cancelled:?}");
+    send(server.address(), &delete, b"").await.refused(409, "conflict");
+    assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 1);
+
+    // It is not in the way of the same push, sent again.
+    server.painter.slow_ms.store(0, Ordering::SeqCst);
+    let again = client.push("test", &slow).await.unwrap();
+    let again = client.wait_for_push(again, &mut |_| {}).await.unwrap();
+    assert_eq!((again.state, again.version), (PushState::Ready, Some(2)), "{again:?}");
+    send(server.address(), &delete, b"").await.refused(409, "conflict");
+}
+
+/// A push that takes too long to check is refused, and the next one has its turn.
+#[tokio::test]
+async fn a_push_has_a_time_limit() {
+    let limits = Limits { push: Duration::from_millis(500), ..Limits::default() };
+    let server = TestServer::with(limits).await;
+    server.painter.slow_ms.store(1_000, Ordering::SeqCst);
+    let refused = push(&server, &in_cell([0, 0], 40, 1), |_| {}).await;
+    assert_eq!(refused.state, PushState::Refused);
+    let reason = refused.error.unwrap().message;
+    assert!(reason.contains("took longer than"), "{reason}");
+    server.painter.slow_ms.store(0, Ordering::SeqCst);
+    assert_eq!(push(&server, &in_cell([0, 0], 41, 1), |_| {}).await.state, PushState::Ready);
 }

@@ -3,7 +3,7 @@
 use serde_json::json;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use wildcity_client::{Client, ConnectOptions, HttpClient};
-use wildcity_server::Tokens;
+use wildcity_server::{SpoolLimits, Tokens};
 
 use crate::http::{Reply, push_of, send};
 use crate::support::TestServer;
@@ -12,23 +12,30 @@ const DRIVER: &str = "driver-driver-driver";
 const PUSHER: &str = "pusher-pusher-pusher";
 const ADMIN: &str = "admin-admin-admin-admin";
 const ELSEWHERE: &str = "elsewhere-elsewhere";
+const RIVAL: &str = "rival-rival-rival";
 
 fn with_token(token: &str) -> ConnectOptions {
     ConnectOptions::with_token(Some(token.to_owned()))
 }
 
 async fn guarded() -> TestServer {
+    guarded_with(SpoolLimits::default()).await
+}
+
+async fn guarded_with(spool: SpoolLimits) -> TestServer {
     let hash = blake3::hash(PUSHER.as_bytes());
     let text = json!({ "tokens": [
         { "name": "driver", "role": "drive", "token": DRIVER },
         { "name": "pusher", "role": "push", "hash": format!("blake3:{hash}") },
         { "name": "admin", "role": "admin", "token": ADMIN },
+        { "name": "rival", "role": "push", "token": RIVAL },
         { "name": "elsewhere", "role": "admin", "token": ELSEWHERE, "twins": ["other"] },
     ]});
     let tokens = Tokens::parse(text.to_string().as_bytes()).unwrap();
     // A public address: with tokens it is allowed.
     TestServer::configured(|config| {
         config.tokens = Some(tokens);
+        config.limits.spool = spool;
         config.listen = "0.0.0.0:0".parse().unwrap();
     })
     .await
@@ -169,4 +176,80 @@ async fn web_pages_from_elsewhere_may_not_push() {
     let head = format!("{request}\r\nContent-Length: {}", body.len());
     send(server.address(), &head, body.as_bytes()).await.refused(403, "forbidden");
     assert_eq!(crate::http::get(&server, "/v1/twins/test").await.body["version"], 1);
+}
+
+fn announcement(content: &[u8], size: u64) -> String {
+    let digest = format!("blake3:{}", blake3::hash(content).to_hex());
+    json!({ "name": "x", "size": size, "digest": digest }).to_string()
+}
+
+#[tokio::test]
+async fn announcements_alone_keep_no_other_token_from_uploading() {
+    let server = guarded().await;
+    for byte in 0..2 {
+        // The largest uploads that are accepted, and no byte of them.
+        let huge = announcement(&[byte], 64 << 30);
+        assert_eq!(ask(&server, "POST /v1/uploads", Some(RIVAL), &huge).await.status, 201);
+    }
+    let content = b"a scene";
+    let own = announcement(content, 7);
+    let begun = ask(&server, "POST /v1/uploads", Some(PUSHER), &own).await;
+    assert_eq!(begun.status, 201, "{begun:?}");
+    let path = begun.header("location").unwrap();
+    let sent = send_part(&server, &format!("PATCH {path}"), PUSHER, content).await;
+    assert_eq!(sent.body["complete"], true, "{sent:?}");
+}
+
+/// Sends the first bytes of an upload.
+async fn send_part(server: &TestServer, request: &str, token: &str, body: &[u8]) -> Reply {
+    let head = format!(
+        "{request} HTTP/1.1\r\nUpload-Offset: 0\r\nContent-Length: {}\r\nAuthorization: Bearer {token}",
+        body.len()
+    );
+    send(server.address(), &head, body).await
+}
+
+#[tokio::test]
+async fn an_upload_is_that_of_its_token() {
+    let server = guarded().await;
+    let content = b"a scene";
+    // The rival announces the same content, of a wrong size.
+    let wrong = announcement(content, 8);
+    assert_eq!(ask(&server, "POST /v1/uploads", Some(RIVAL), &wrong).await.status, 201);
+    let right = announcement(content, 7);
+    let begun = ask(&server, "POST /v1/uploads", Some(PUSHER), &right).await;
+    assert_eq!(begun.status, 201, "{begun:?}");
+    let path = begun.header("location").unwrap().to_owned();
+
+    // What it does to that id is done to its own upload.
+    let deleted = ask(&server, &format!("DELETE {path}"), Some(RIVAL), "").await;
+    assert_eq!(deleted.status, 204);
+    ask(&server, &format!("DELETE {path}"), Some(RIVAL), "").await.refused(404, "unknown_upload");
+    ask(&server, &format!("GET {path}"), Some(RIVAL), "").await.refused(404, "unknown_upload");
+    let sent = send_part(&server, &format!("PATCH {path}"), PUSHER, content).await;
+    assert_eq!(sent.body["complete"], true, "{sent:?}");
+
+    // Nor can it push what is not its own.
+    let push = json!({ "files": [{ "upload": begun.body["id"] }] }).to_string();
+    let pushes = "POST /v1/twins/test/pushes";
+    ask(&server, pushes, Some(RIVAL), &push).await.refused(404, "unknown_upload");
+    assert_eq!(ask(&server, pushes, Some(PUSHER), &push).await.status, 202);
+}
+
+#[tokio::test]
+async fn a_token_has_a_quota() {
+    let server = guarded_with(SpoolLimits { bytes: 1000, ..SpoolLimits::default() }).await;
+    let begin = async |token: &'static str, byte: u8, size: u64| {
+        ask(&server, "POST /v1/uploads", Some(token), &announcement(&[byte], size)).await
+    };
+    assert_eq!(begin(RIVAL, 1, 400).await.status, 201);
+    let full = begin(RIVAL, 2, 200).await;
+    full.refused(507, "storage_full");
+    let reason = full.body["message"].as_str().unwrap();
+    assert!(reason.contains("this token keeps 1 uploads of 400 bytes"), "{reason}");
+    begin(RIVAL, 3, 501).await.refused(507, "storage_full");
+    assert_eq!(begin(PUSHER, 4, 500).await.status, 201);
+    // All tokens together have a limit, too.
+    begin(ADMIN, 5, 200).await.refused(507, "storage_full");
+    assert_eq!(begin(ADMIN, 6, 100).await.status, 201);
 }

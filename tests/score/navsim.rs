@@ -132,7 +132,7 @@ fn a_standing_ego_is_never_at_fault_even_when_hit_in_front() {
     let input = serde_json::json!({
         "ego": { "width": 2.297, "length": 5.176, "rear_axle_to_center": 1.461 },
         "states": vec![vec![0.0; 11]; STATES],
-        "tracks": [{ "x": 20.0, "y": 0.0, "vx": -15.0, "vy": 0.0, "yaw": 3.14, "length": 4.0,
+        "tracks": [{ "x": 20.0, "y": 0.0, "vx": -15.0, "vy": 0.0, "yaw": std::f64::consts::PI, "length": 4.0,
             "width": 2.0, "class": "vehicle" }],
         "reference_progress_m": 0.0,
         "lanes": [["own", -50.0, 150.0, -1.75, 1.75, true]],

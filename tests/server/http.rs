@@ -20,7 +20,7 @@ async fn request(server: &TestServer, text: &str) -> (u16, String) {
     (status, answer)
 }
 
-async fn get(server: &TestServer, path: &str) -> (u16, String) {
+pub(crate) async fn get(server: &TestServer, path: &str) -> (u16, String) {
     request(server, &format!("GET {path} HTTP/1.1\nHost: localhost\n\n")).await
 }
 
@@ -201,6 +201,7 @@ async fn public_addresses_are_refused() {
         twins: server.twins.path().to_owned(),
         cache: None,
         episodes: server.episodes.path().to_owned(),
+        scenarios: server.twins.path().join(".scenarios"),
         uploads: server.twins.path().join(".uploads"),
         tokens: None,
         backend: server.painter.clone(),
@@ -212,4 +213,43 @@ async fn public_addresses_are_refused() {
     let taken =
         wildcity_server::start(Config { listen: server.address(), ..config }).await.unwrap_err();
     assert!(matches!(taken, ServerError::Listen { .. }), "{taken}");
+}
+
+/// Sockets that are opened and not used do not keep health checks and agents away.
+#[tokio::test]
+async fn idle_sockets_take_no_slot_from_others() {
+    let limits = Limits { connections: 8, ..Limits::default() };
+    let server = TestServer::with(limits).await;
+    let mut idle = Vec::new();
+    for round in 0..14 {
+        for _ in 0..90 {
+            idle.push(TcpStream::connect(server.address()).await.unwrap());
+        }
+        let health = tokio::time::timeout(Duration::from_secs(2), get(&server, "/healthz"));
+        let (status, _) = health.await.unwrap_or_else(|_| panic!("no answer in round {round}"));
+        assert_eq!(status, 200);
+    }
+    server.still_serves().await;
+}
+
+/// DNS rebinding: a page's own host name, made to stand for 127.0.0.1.
+#[tokio::test]
+async fn a_server_without_tokens_answers_for_its_own_host_only() {
+    let server = TestServer::start().await;
+    for (host, status) in [
+        ("localhost", 200),
+        ("LOCALHOST:8080", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:8080", 200),
+        ("evil.example", 403),
+        ("evil.example:8080", 403),
+        ("localhost.evil.example", 403),
+        ("127.0.0.1.evil.example", 403),
+        ("", 403),
+    ] {
+        let text = format!("GET /v1/twins HTTP/1.1\nHost: {host}\n\n");
+        assert_eq!(request(&server, &text).await.0, status, "{host}");
+        let text = format!("GET /healthz HTTP/1.1\nHost: {host}\n\n");
+        assert_eq!(request(&server, &text).await.0, 200, "{host}");
+    }
 }

@@ -118,7 +118,7 @@ async fn the_header_has_the_size_of_its_contents() {
         let length = u64::from_le_bytes(seen.bytes[..8].try_into().unwrap()) as usize;
         let header = &seen.bytes[8..8 + length];
         let spaces = header.iter().rev().take_while(|&&byte| byte == b' ').count();
-        assert!(length % 8 == 0 && spaces < 8, "{length} bytes with {spaces} spaces");
+        assert!(length.is_multiple_of(8) && spaces < 8, "{length} bytes with {spaces} spaces");
         assert!(seen.bytes.len() < at_most, "{} bytes", seen.bytes.len());
         if images == 0 {
             assert_eq!(seen.bytes.len(), 8 + length + 4 * 16 * 12);

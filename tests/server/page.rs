@@ -55,7 +55,7 @@ fn limits_are_those_of_the_configuration() {
         ),
         format!("| pushes that wait or run | {} |", wildcity_push::limits::OPEN_PUSHES),
         format!("| files of a push | {} |", wildcity_push::limits::PUSH_FILES),
-        format!("| poses compared | {} |", wildcity_push::limits::PREVIEW_POSES),
+        format!("| poses compared | {} |", wildcity_push::limits::PREVIEW_MAX_POSES),
         format!(
             "frames up to {} GiB",
             wildcity_protocol::limits::OBSERVATION_BYTES as f64 / f64::from(1 << 30)

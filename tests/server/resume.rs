@@ -45,7 +45,9 @@ async fn a_session_outlives_its_connection() {
     let last = agent.step(2.0).await;
     let last_seq = agent.seq - 1;
     drop(agent);
-    let (mut agent, resumed) = resume(&server, "a", last_seq).await;
+    let (mut agent, mut resumed) = resume(&server, "a", last_seq).await;
+    let settings = resumed.as_object_mut().expect("an object").remove("opened");
+    assert_eq!(settings.expect("the settings")["session"], "a");
     let expected = json!({
         "type": "resumed", "seq": 1, "session": "a",
         "last_seq": last_seq, "step": 2, "time_us": 200_000,

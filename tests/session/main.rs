@@ -8,5 +8,6 @@ mod source;
 mod streaming;
 
 mod driving;
+mod fairness;
 mod long;
 mod trust;

@@ -10,7 +10,7 @@ use wildcity_twin::residency::{Cache, PinnedScene, ResidencyError, Viewpoint};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::scene_files::gaussians;
-use crate::versions::{commit, street};
+use crate::versions::{commit, street, street_named};
 
 struct Twin {
     dir: tempfile::TempDir,
@@ -148,4 +148,93 @@ fn a_later_format_is_named_as_such() {
             .ends_with("has format 9; this build reads format 1: import the twin again"),
         "{error}"
     );
+}
+
+/// Ways in which the newest record of a twin cannot be read.
+const DAMAGE: [(&str, &str); 5] = [
+    ("an empty file", "is damaged: EOF while parsing"),
+    ("a link to itself", "it is a symbolic link"),
+    ("a link to another record", "it is a symbolic link"),
+    ("a pipe", "it is not a regular file"),
+    ("a directory", "it is not a regular file"),
+];
+
+/// Puts something that cannot be read in the place of a record.
+fn damage(how: &str, record: &Path, other: &Path) {
+    fs::remove_file(record).ok();
+    match how {
+        "an empty file" => fs::write(record, "").unwrap(),
+        "a link to itself" => std::os::unix::fs::symlink(record, record).unwrap(),
+        "a link to another record" => std::os::unix::fs::symlink(other, record).unwrap(),
+        "a pipe" => {
+            let made = std::process::Command::new("mkfifo").arg(record).status().unwrap();
+            assert!(made.success());
+        }
+        _ => fs::create_dir(record).unwrap(),
+    }
+}
+
+#[test]
+fn the_damage_of_one_twin_is_not_that_of_others() {
+    for (how, wanted) in DAMAGE {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = gaussians(100, 0, 20.0, 1);
+        for name in ["avenue", "broken", "street"] {
+            commit(dir.path(), street_named(name, &scene)).unwrap();
+        }
+        let record = |name: &str, number: u64| dir.path().join(format!("{name}/log/{number:010}"));
+        damage(how, &record("broken", 2), &record("street", 1));
+        // What a killed commit left of the same twin cannot be looked at either.
+        let staging = dir.path().join(".staging/broken@killed");
+        fs::create_dir(&staging).unwrap();
+        damage(how, &staging.join("lock"), &record("street", 1));
+
+        let catalog = Catalog::open(dir.path()).unwrap();
+        let list = catalog.twins().unwrap();
+        let names: Vec<_> = list.twins.iter().map(|twin| twin.name.as_str()).collect();
+        assert_eq!(names, ["avenue", "street"], "{how}");
+        let damaged: Vec<_> = list.damaged.iter().map(|twin| twin.name.as_str()).collect();
+        assert_eq!(damaged, ["broken"], "{how}");
+        let reason = list.damaged[0].error.to_string();
+        assert!(reason.contains(wanted) && reason.contains("broken/log/0000000002"), "{reason}");
+        // The others can be read and written; of the broken one, its older versions.
+        catalog.version("street", None).unwrap();
+        commit(dir.path(), street_named("avenue", &gaussians(50, 0, 20.0, 2))).unwrap();
+        catalog.version("broken", Some(1)).unwrap();
+        catalog.version("broken", None).unwrap_err();
+
+        let aside = catalog.repair_log("broken").unwrap();
+        assert_eq!((aside.len(), aside[0].number), (1, 2), "{how}");
+        assert!(fs::symlink_metadata(&aside[0].path).is_ok(), "{how}: nothing is deleted");
+        assert_eq!(catalog.version("broken", None).unwrap().number, 1);
+        assert_eq!(catalog.twins().unwrap().damaged.len(), 0);
+        fs::remove_dir_all(&staging).ok();
+        assert_eq!(
+            commit(dir.path(), street_named("broken", &gaussians(50, 0, 20.0, 3))).unwrap().number,
+            2
+        );
+    }
+}
+
+/// A manifest, a table or a chunk that is a pipe is an error and no wait.
+#[test]
+fn a_pipe_in_the_place_of_an_object_is_not_waited_for() {
+    let twin = twin();
+    let chunk = &twin.version.manifest.chunks[0].object;
+    let table = &twin.version.manifest.table.object;
+    for hash in [chunk, table, &twin.version.hash] {
+        let path = twin.object(hash);
+        let bytes = fs::read(&path).unwrap();
+        damage("a pipe", &path, &path);
+        let error = everything(Catalog::open(twin.dir.path()).unwrap()).unwrap_err().to_string();
+        assert!(error.contains("it is not a regular file"), "{error}");
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, bytes).unwrap();
+    }
+    let lease = twin.dir.path().join("street/leases/pipe");
+    fs::create_dir_all(lease.parent().unwrap()).unwrap();
+    damage("a pipe", &lease, &lease);
+    let keep = wildcity_twin::store::Retention { versions: 1, grace: std::time::Duration::ZERO };
+    let collected = Catalog::open(twin.dir.path()).unwrap().collect("street", keep, false);
+    assert!(collected.unwrap_err().to_string().contains("it is not a regular file"));
 }

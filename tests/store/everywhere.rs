@@ -28,7 +28,7 @@ fn a_version_comes_back() {
         let first = commit(&place.catalog(), &scene);
         let catalog = place.catalog();
         assert_eq!(catalog.version("street", None).unwrap(), first);
-        assert_eq!(catalog.twins().unwrap()[0].hash, first.hash);
+        assert_eq!(catalog.twins().unwrap().twins[0].hash, first.hash);
         assert_eq!(read_all(&catalog, &first), 3_000);
         assert_eq!(place.objects().len(), first.manifest.chunks.len() + 2);
         // The same content is the same version; a missing version is an error.
@@ -139,7 +139,7 @@ fn what_cannot_be_used_leaves_nothing() {
         scene.ln_scales[7][0] = f32::NAN;
         catalog.commit(whole(&scene), &mut |_, _| {}).unwrap_err();
         assert_eq!(place.objects(), [""; 0].map(PathBuf::from));
-        assert_eq!(catalog.twins().unwrap(), []);
+        assert_eq!(catalog.twins().unwrap().twins, []);
     });
 }
 

@@ -6,7 +6,7 @@ use wildcity_twin::store::{Catalog, ObjectTotals, Retention, StoreError};
 
 use crate::places::{Place, cells_alone, change, commit, everywhere};
 use crate::scene_files::gaussians;
-use crate::versions::turn;
+use crate::versions::{files, turn};
 
 const NOW: Duration = Duration::ZERO;
 const DAY: Duration = Duration::from_secs(86_400);
@@ -72,6 +72,28 @@ fn garbage_is_removed_in_two_steps_and_kept_versions_are_not() {
     });
 }
 
+/// Ends the locks of all leases, as the kernel does when their processes end.
+fn end_locks(place: &Place) {
+    let mut locks = files(&place.twins().join("street/leases"));
+    locks.retain(|path| path.extension().is_some_and(|extension| extension == "lock"));
+    locks.iter().for_each(|path| std::fs::remove_file(path).unwrap());
+}
+
+/// In a directory, a lease holds as long as its process lives, whatever the clock says.
+#[test]
+fn a_version_in_use_is_kept_though_its_lease_expired() {
+    let place = Place::Directory(tempfile::tempdir().unwrap());
+    let catalog = twin(&place, 3);
+    let keep = Retention { versions: 1, grace: NOW };
+    let lease = catalog.lease("street", 2, "a test", Duration::ZERO).unwrap();
+    for _ in 0..2 {
+        assert_eq!(catalog.collect("street", keep, false).unwrap().kept, [2, 3]);
+    }
+    drop(lease);
+    assert_eq!(catalog.collect("street", keep, false).unwrap().kept, [3]);
+    assert!(files(&place.twins().join("street/leases")).is_empty(), "nothing is left of the lease");
+}
+
 #[test]
 fn a_leased_version_is_kept_however_old() {
     everywhere(|place| {
@@ -79,9 +101,10 @@ fn a_leased_version_is_kept_however_old() {
         let keep = Retention { versions: 1, grace: NOW };
         let error = catalog.lease("street", 9, "test", DAY).unwrap_err();
         assert!(matches!(error, StoreError::NoVersion { number: 9, .. }), "{error}");
-        let mut lease = catalog.lease("street", 2, "a test", DAY).unwrap();
         // A lease that expired without being dropped.
         std::mem::forget(catalog.lease("street", 3, "killed", Duration::ZERO).unwrap());
+        end_locks(place);
+        let mut lease = catalog.lease("street", 2, "a test", DAY).unwrap();
         lease.renew().unwrap();
         for _ in 0..2 {
             let found = place.catalog().collect("street", keep, false).unwrap();
@@ -166,6 +189,7 @@ fn a_collected_version_cannot_be_leased() {
     everywhere(|place| {
         let catalog = twin(place, 3);
         let mut ended = catalog.lease("street", 2, "late", Duration::ZERO).unwrap();
+        end_locks(place);
         for _ in 0..2 {
             catalog.collect("street", Retention { versions: 1, grace: NOW }, false).unwrap();
         }

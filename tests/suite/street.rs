@@ -102,6 +102,7 @@ impl Bench {
     }
 
     /// The cases of a suite's file.
+    #[expect(clippy::result_large_err, reason = "the package's own error, built once per test")]
     pub(crate) fn cases(&self, path: &Path) -> Result<Vec<Case>, SuiteError> {
         let (suite, scenarios) = SuiteFile::read(path)?;
         cases(&suite, &scenarios, &self.catalog(), false)

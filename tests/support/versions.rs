@@ -15,6 +15,11 @@ pub(crate) fn street(gaussians: &Gaussians) -> NewVersion<'_> {
     NewVersion { storage, ..NewVersion::of("street", gaussians, provenance) }
 }
 
+/// As [`street`], of another name.
+pub(crate) fn street_named<'a>(name: &'a str, gaussians: &'a Gaussians) -> NewVersion<'a> {
+    NewVersion { name, ..street(gaussians) }
+}
+
 pub(crate) fn commit(dir: &Path, new: NewVersion<'_>) -> Result<Version, StoreError> {
     Catalog::open(dir)?.commit(new, &mut |_, _| {})
 }

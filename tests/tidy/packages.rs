@@ -22,12 +22,13 @@ const CRATES: &[(&str, &[&str])] = &[
 ];
 
 /// Files that may open files: those of a twin only `store/local`; the others scenes and settings of the
-/// user, episodes, uploads, pictures, and how much memory there is.
+/// user, episodes, uploads, scenarios, pictures, and how much memory there is.
 const FILES: &[&str] = &[
     "src/twin/store/local",
     "src/twin/residency/budget.rs",
     "src/twin/ingest",
     "src/session/record",
+    "src/session/scenario/load.rs",
     "src/episode",
     "src/suite",
     "src/server/start.rs",

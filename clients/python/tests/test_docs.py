@@ -19,8 +19,10 @@ PAGES = [
     "README.md",
     "docs/actors.md",
     "docs/agents.md",
+    "docs/alpamayo.md",
     "docs/operators.md",
     "docs/pipelines.md",
+    "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",
 ]

@@ -398,7 +398,7 @@ def test_a_message_that_is_too_large(url: str) -> None:
 
 
 def send_quietly(connection: ClientConnection, text: str) -> None:
-    with contextlib.suppress(websockets.exceptions.ConnectionClosed):
+    with contextlib.suppress(websockets.exceptions.ConnectionClosed, OSError):
         connection.send(text)
 
 

@@ -16,6 +16,7 @@ from wildcity import (
     BadFrame,
     Camera,
     Code,
+    DriveSection,
     Dynamics,
     Exposure,
     ImagePart,
@@ -24,8 +25,11 @@ from wildcity import (
     Outputs,
     Pose,
     ProtocolError,
+    RandomStart,
+    RecordedPoint,
     Rig,
     Shutter,
+    SnapshotPoint,
     Station,
     TimedPose,
     Trajectory,
@@ -38,6 +42,9 @@ HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
 PLANNED = Trajectory(
     (TimedPose(100_000, Pose((1.5, 0.5, 0.0))), TimedPose(200_000, Pose((3.25, 0.5, 0.0))))
+)
+LONGER = Trajectory(
+    (TimedPose(500_000, Pose((1.5, 0.5, 0.0))), TimedPose(1_000_000, Pose((3.25, 0.5, 0.0))))
 )
 LOG = Station("log", 12.5)
 FRONT = Camera("front", 4, 3, 3.5, 3.5, 2.0, 1.5, Pose((1.6, 0.0, 1.5), (0.5, -0.5, 0.5, -0.5)))
@@ -80,12 +87,16 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
         deadline_ms=20_000,
         decision_us=500_000,
         warm_up_us=1_600_000,
+        trajectory=DriveSection("log", 12.5, 62.5, 0.5),
     ),
     "open_preset": lambda c: c.open("street", rig="vehicle6", profile={"tau_px": 2.0}),
     "open_dynamics": lambda c: c.open("street", dynamics=Dynamics("dynamic", 8.25, reverse=True)),
     "open_model": lambda c: c.open("street", dynamics="kinematic"),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
     "step_trajectory": lambda c: c.step(PLANNED, False),
+    "step_until": lambda c: c.step(
+        LONGER, False, 1_000_000, {"confidence": 0.75, "reasoning": "a clear road"}
+    ),
     "step": lambda c: c.step(HERE, False),
     "step_terminate": lambda c: c.step(HERE, True),
     "observe": lambda c: c.observe([HERE, ABOVE]),
@@ -93,8 +104,15 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "reset": lambda c: c.reset(7, None),
     "reset_pose": lambda c: c.reset(8, HERE),
     "reset_station": lambda c: c.reset(9, LOG),
+    "reset_random": lambda c: c.reset(
+        10, RandomStart("log", 20.0, 300.0, 0.5, 0.0625), Dynamics("kinematic", 3.0), 8.5
+    ),
     "switch_version": lambda c: c.switch_version(4),
     "switch_latest": lambda c: c.switch_version(None),
+    "snapshot": lambda c: c.snapshot("before-junction"),
+    "restore": lambda c: c.restore("before-junction"),
+    "branch": lambda c: c.branch(SnapshotPoint("run-17", "before-junction"), "run-18"),
+    "branch_recorded": lambda c: c.branch(RecordedPoint("run-17-1", 40), None),
     "close": lambda c: c.close(),
     "resume": lambda c: c.resume("run-17", 4),
 }
@@ -174,8 +192,9 @@ def test_observations_decode_to_their_contents(name: str) -> None:
 
 def without_absent(metadata: dict[str, Any]) -> dict[str, Any]:
     """Without the fields that the server omits: an empty history, and `back` of current frames."""
-    if not metadata["history"]:
-        del metadata["history"]
+    for name in ("history", "events"):
+        if not metadata[name]:
+            del metadata[name]
     for image in metadata["images"]:
         assert image.pop("back") == 0
     return metadata
@@ -360,13 +379,15 @@ ACTION = {"acceleration": 0.0, "curvature": 0.0}
         {"type": "open", "seq": 1, "twin": "../etc"},
         {"type": "open", "seq": 1, "twin": "a", "session": "A b"},
         {"type": "open", "seq": 1, "twin": "a", "dt_us": 999},
+        {"type": "open", "seq": 1, "twin": "a", "dt_us": None},
+        {"type": "open", "seq": 1, "twin": "a", "start": None},
         {"type": "open", "seq": 1, "twin": "a", "outputs": {"quality": 0}},
         {"type": "open", "seq": 1, "twin": "a", "outputs": {"frames": 17}},
         {"type": "open", "seq": 1, "twin": "a", "rig": {"name": "r", "cameras": []}},
     ],
     ids=str,
 )
-def test_the_schema_has_ranges_and_exactly_one_of(request_: dict[str, Any]) -> None:
+def test_the_schema_refuses_what_the_server_refuses(request_: dict[str, Any]) -> None:
     schema = json.loads((PROTOCOL / "schema/request.json").read_text())
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(request_, schema)

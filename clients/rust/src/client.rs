@@ -7,8 +7,8 @@ use wildcity_protocol::PROTOCOL;
 use wildcity_protocol::error::Code;
 use wildcity_protocol::limits::HELLO_TIMEOUT;
 use wildcity_protocol::message::{
-    Action, Answer, ClientInfo, Limits, Open, Opened, Pose, Request, ServerInfo, Start, Summary,
-    TimedPose, TwinInfo,
+    Action, Answer, Branch, BranchPoint, ClientInfo, DynamicsChoice, Limits, Open, Opened, Pose,
+    Request, ServerInfo, Start, Summary, TimedPose, TwinInfo,
 };
 
 use crate::connection::{Connection, Endpoint, Incoming};
@@ -68,6 +68,31 @@ pub enum Movement {
     Action(Action),
 }
 
+/// How a step is made, beside its movement.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepOptions {
+    /// For how long the movement, a trajectory or an action, is followed, in microseconds: a whole number of
+    /// steps. One step if `None`.
+    pub until_us: Option<i64>,
+    /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
+    pub notes: Option<serde_json::Value>,
+    /// Whether the episode ends with this step.
+    pub terminate: bool,
+}
+
+/// How an episode starts.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ResetOptions {
+    /// Its seed.
+    pub seed: u64,
+    /// Where it starts; the session's start if `None`.
+    pub start: Option<Start>,
+    /// How the ego moves in this episode; as in the session if `None`.
+    pub dynamics: Option<DynamicsChoice>,
+    /// Speed at the start, in m/s, in place of that of the dynamics.
+    pub speed: Option<f64>,
+}
+
 /// The server's answer to `hello`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Welcome {
@@ -92,6 +117,8 @@ pub struct Resumed {
     pub step: u64,
     /// Simulated time since the start of the episode, in microseconds.
     pub time_us: i64,
+    /// The settings of the session, as [`Client::open`] returned them; `None` if it is closed.
+    pub opened: Option<Box<Opened>>,
 }
 
 /// The server's answer to `switch_version`: the version that the session shows from the next step on.
@@ -205,6 +232,48 @@ impl Client {
         }
     }
 
+    /// Opens a session in a state of another episode, with that episode's settings: a snapshot of a session that
+    /// still exists, or a step of an episode that the server has recorded. The new session has that state as its
+    /// snapshot `start`.
+    ///
+    /// # Errors
+    /// [`Code::UnknownState`] if there is no such state; otherwise as [`Client::open`].
+    pub async fn branch(
+        &mut self,
+        from: BranchPoint,
+        session: Option<String>,
+    ) -> Result<Opened, ClientError> {
+        let request = Request::Branch(Branch { seq: self.next_seq, from, session });
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Opened(opened)) => {
+                self.session = Some(opened.session.clone());
+                Ok(*opened)
+            }
+            other => Err(self.unexpected_answer("opened", &other)),
+        }
+    }
+
+    /// Stores the state of the episode under a name, in place of an earlier snapshot of that name.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn snapshot(&mut self, name: &str) -> Result<(), ClientError> {
+        let request = Request::Snapshot { seq: self.next_seq, name: name.to_owned() };
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Ok { .. }) => Ok(()),
+            other => Err(self.unexpected_answer("ok", &other)),
+        }
+    }
+
+    /// Returns to a snapshot of this session, and renders it.
+    ///
+    /// # Errors
+    /// [`Code::UnknownState`] if there is no such snapshot; otherwise as [`Client::step`].
+    pub async fn restore(&mut self, name: &str) -> Result<Observation, ClientError> {
+        let request = Request::Restore { seq: self.next_seq, name: name.to_owned() };
+        self.exchange_for_observation(&request).await
+    }
+
     /// Moves the ego to `pose` (`world_from_rig`), advances the simulated time by one step, and returns the
     /// observation there. Only with the dynamics `teleport`, which is the default.
     ///
@@ -233,18 +302,27 @@ impl Client {
         movement: Movement,
         terminate: bool,
     ) -> Result<Observation, ClientError> {
-        let seq = self.next_seq;
-        let request = match movement {
-            Movement::Pose(pose) => {
-                Request::Step { seq, pose: Some(pose), trajectory: None, action: None, terminate }
-            }
-            Movement::Trajectory(poses) => {
-                Request::Step { seq, pose: None, trajectory: Some(poses), action: None, terminate }
-            }
-            Movement::Action(action) => {
-                Request::Step { seq, pose: None, trajectory: None, action: Some(action), terminate }
-            }
+        self.follow(movement, StepOptions { terminate, ..StepOptions::default() }).await
+    }
+
+    /// As [`Client::drive`], with notes for the record, or for several steps: the observation is the one at the end
+    /// of the plan.
+    ///
+    /// # Errors
+    /// As [`Client::drive`].
+    pub async fn follow(
+        &mut self,
+        movement: Movement,
+        options: StepOptions,
+    ) -> Result<Observation, ClientError> {
+        let StepOptions { until_us, notes, terminate } = options;
+        let (pose, trajectory, action) = match movement {
+            Movement::Pose(pose) => (Some(pose), None, None),
+            Movement::Trajectory(poses) => (None, Some(poses), None),
+            Movement::Action(action) => (None, None, Some(action)),
         };
+        let seq = self.next_seq;
+        let request = Request::Step { seq, pose, trajectory, action, until_us, notes, terminate };
         self.exchange_for_observation(&request).await
     }
 
@@ -280,7 +358,16 @@ impl Client {
         seed: u64,
         start: Option<Start>,
     ) -> Result<Observation, ClientError> {
-        let request = Request::Reset { seq: self.next_seq, seed, start };
+        self.reset_with(ResetOptions { seed, start, ..ResetOptions::default() }).await
+    }
+
+    /// As [`Client::reset`], with dynamics or a speed for this episode alone.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, ClientError> {
+        let ResetOptions { seed, start, dynamics, speed } = options;
+        let request = Request::Reset { seq: self.next_seq, seed, start, dynamics, speed };
         self.exchange_for_observation(&request).await
     }
 
@@ -364,11 +451,15 @@ impl Client {
         match incoming {
             // One request is under way at a time, so the session has carried out either the request with
             // number `last_seq` or the one after it.
-            Incoming::Answer(Answer::Resumed { last_seq: session_seq, step, time_us, .. })
-                if session_seq == last_seq || Some(session_seq) == last_seq.checked_add(1) =>
-            {
+            Incoming::Answer(Answer::Resumed {
+                last_seq: session_seq,
+                step,
+                time_us,
+                opened,
+                ..
+            }) if session_seq == last_seq || Some(session_seq) == last_seq.checked_add(1) => {
                 self.connection = Some(connection);
-                Ok(Resumed { last_seq: session_seq, step, time_us })
+                Ok(Resumed { last_seq: session_seq, step, time_us, opened })
             }
             other => Err(self.unexpected_answer("resumed, at most one request ahead", &other)),
         }

@@ -39,7 +39,7 @@ mod options;
 mod tls;
 mod upload;
 
-pub use client::{Client, Movement, Resumed, Switched, Welcome};
+pub use client::{Client, Movement, ResetOptions, Resumed, StepOptions, Switched, Welcome};
 pub use error::{ClientError, FrameError};
 pub use http::{HttpClient, HttpError};
 pub use observation::{ImageView, Observation};
@@ -50,5 +50,6 @@ pub use wildcity_protocol::http::{
     PushState, Upload,
 };
 pub use wildcity_protocol::message::{
-    Action, Dynamics, DynamicsChoice, DynamicsModel, Open, Pose, Start, TimedPose,
+    Action, BranchPoint, Drive, DrivePose, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,
+    Open, Pose, RandomStart, Start, TimedPose,
 };

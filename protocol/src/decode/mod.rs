@@ -9,7 +9,7 @@
 //! - `null` is refused everywhere: an option that is not set is left out. Where a number belongs, `null` counts as
 //!   NaN, because JavaScript writes NaN so.
 //! - A number with a point or an exponent is an integer if its value is one, as in JSON Schema: `1e5`.
-//! - NaN and infinities, which JSON cannot represent, are found in all usual spellings ([`non_finite`]).
+//! - NaN and infinities, which JSON cannot represent, are found in all usual spellings (`non_finite`).
 //! - A message is nested at most 128 deep (`serde_json`'s limit).
 //!
 //! Every [`Mistake`] has the path of the field, for example `rig.cameras[2].lens.k[1]`. Ranges of numbers, counts

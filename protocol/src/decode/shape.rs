@@ -92,10 +92,7 @@ impl Shape {
         if let Some(word) = keywords.get("const").or(keywords.get("enum")) {
             return Self::Word(strings(word));
         }
-        // `null` stands for an option that is not set. The protocol leaves such a field out.
-        let types = keywords.get("type").map(strings).unwrap_or_default();
-        let mut types = types.iter().map(String::as_str).filter(|name| *name != "null");
-        match types.next() {
+        match keywords.get("type").and_then(Value::as_str) {
             None => Self::Any,
             Some("boolean") => Self::Boolean,
             Some("number") => Self::Number,
@@ -114,11 +111,7 @@ impl Shape {
     }
 
     fn of_alternatives(alternatives: &[Value]) -> Self {
-        let not_null = alternatives.iter().filter(|schema| schema["type"] != "null");
-        let mut shapes: Vec<Self> = not_null.map(Self::of).collect();
-        if shapes.len() == 1 {
-            return shapes.remove(0);
-        }
+        let shapes: Vec<Self> = alternatives.iter().map(Self::of).collect();
         if shapes.iter().all(|shape| matches!(shape, Self::Word(_))) {
             let words = shapes.into_iter().flat_map(|shape| match shape {
                 Self::Word(words) => words,

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::drive::DriveSection;
 use super::pose::Pose;
 use crate::camera::{Exposure, Lens, Shutter, Windshield};
 
@@ -85,11 +86,17 @@ pub struct Open {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 10_000_000)))]
     pub decision_us: Option<i64>,
+    /// The scenario to drive. If absent, there are no actors and no route.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<ScenarioChoice>,
     /// Length of the recorded drive before the start, in microseconds. Its poses are the ego's history, and
     /// its frames are in the first bundle. If absent, 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 0, max = 20_000_000)))]
     pub warm_up_us: Option<i64>,
+    /// A part of a recorded drive that the answer is to have.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<DriveSection>,
 }
 
 impl Open {
@@ -120,7 +127,9 @@ impl Open {
             dt_us: None,
             deadline_ms: None,
             decision_us: None,
+            scenario: None,
             warm_up_us: None,
+            trajectory: None,
         }
     }
 }
@@ -144,6 +153,45 @@ pub enum Start {
         #[cfg_attr(feature = "schema", schemars(range(min = 0.0)))]
         station_m: f64,
     },
+    /// Somewhere along a recorded trajectory, drawn anew for each episode with its seed.
+    Random {
+        /// What is drawn.
+        random: RandomStart,
+    },
+}
+
+/// A start that is drawn with the episode's seed. Every draw is uniform.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct RandomStart {
+    /// Name of the trajectory. If absent, the twin's first.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<String>,
+    /// Least distance from the start of the trajectory, in metres. If absent, 0, or where the warm-up ends.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from_m: Option<f64>,
+    /// Largest distance from the start of the trajectory. If absent, its length.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub to_m: Option<f64>,
+    /// Largest distance to the left or right of the drive, in metres, 0 to 20.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lateral_m: Option<f64>,
+    /// Largest angle to the drive's heading, in radians, 0 to π.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub heading_rad: Option<f64>,
+}
+
+/// The scenario of a session.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub enum ScenarioChoice {
+    /// A scenario of the server, by name, with the first values of its sweep.
+    Name(String),
+    /// The scenario itself, in the format `wildcity.scenario/1`; or, without the field `format`, the `name` of one of the
+    /// server's with `values` of its sweep.
+    Object(serde_json::Map<String, serde_json::Value>),
 }
 
 /// The cameras of a session.
@@ -266,6 +314,9 @@ pub struct Outputs {
     /// Whether to add a confidence to each image. If absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub trust: Option<bool>,
+    /// Whether to tell where the actors of the scenario are. If absent, false.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub actors: Option<bool>,
     /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps. If
     /// absent, every camera takes a frame with every step.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -284,6 +335,7 @@ impl Default for Outputs {
             normals: None,
             frames: None,
             trust: None,
+            actors: None,
             period_us: None,
         }
     }

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::open::{Open, Start};
+use super::branch::Branch;
+use super::open::{DynamicsChoice, Open, Start};
 use super::pose::Pose;
 
 /// A message from the client. Every request gets exactly one answer with the same `seq`.
@@ -25,7 +26,7 @@ pub enum Request {
     },
     /// Opens a session on a twin. Answer: `opened`.
     Open(Box<Open>),
-    /// Moves the ego, advances the time by `dt_us` and renders. Exactly one of `pose`, `trajectory` and
+    /// Moves the ego, advances the time by `dt_us` or to `until_us`, and renders. Exactly one of `pose`, `trajectory` and
     /// `action` is given. Answer: an observation.
     #[cfg_attr(feature = "schema", schemars(transform = super::one_movement))]
     Step {
@@ -41,6 +42,13 @@ pub enum Request {
         /// Acceleration and curvature of the ego. Only with kinematic or dynamic dynamics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         action: Option<Action>,
+        /// For how long the trajectory or the action is followed, in microseconds since the start of the step: a
+        /// whole number of `dt_us`. The answer is the observation at its end. If absent, `dt_us`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        until_us: Option<i64>,
+        /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        notes: Option<serde_json::Value>,
         /// Whether the episode ends with this step.
         #[serde(default)]
         terminate: bool,
@@ -74,6 +82,12 @@ pub enum Request {
         /// Where to start. If absent, the session's start.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         start: Option<Start>,
+        /// How the ego moves in this episode. If absent, as in the session.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        dynamics: Option<DynamicsChoice>,
+        /// Speed at the start of this episode, in m/s, in place of that of the dynamics.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        speed: Option<f64>,
     },
     /// Shows another version of the twin from the next step on. The episode continues. Answer: `switched`.
     SwitchVersion {
@@ -83,6 +97,22 @@ pub enum Request {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         version: Option<u64>,
     },
+    /// Stores the state of the episode under a name, in place of an earlier snapshot of that name. Answer: `ok`.
+    Snapshot {
+        /// Number of this request.
+        seq: u64,
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Returns to a snapshot of this session. Answer: an observation of that state.
+    Restore {
+        /// Number of this request.
+        seq: u64,
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Opens a session in a state of another episode. Answer: `opened`.
+    Branch(Branch),
     /// Ends the session. Answer: `closed`.
     Close {
         /// Number of this request.

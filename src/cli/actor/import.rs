@@ -98,7 +98,7 @@ impl Import {
         let cannot = || format!("cannot import {}", self.source.display());
         let bar = progress::bytes("reading");
         let read = read_actor(&self.source, &axes, self.gaussians, &mut progress::show(&bar));
-        let SourceScene { mut gaussians, hash } = read.with_context(cannot)?;
+        let SourceScene { mut gaussians, hash, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
         let box_ = center(&mut gaussians).with_context(cannot)?;
 

@@ -37,6 +37,15 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "N", default_value_t = Limits::default().pushes, value_parser = count())]
     pushes: usize,
 
+    /// Memory that running pushes may take together, in GiB [default: a third of --memory-gib]. A push waits until what
+    /// it may need is free: 24 times the size of its files, and 0.25 GiB.
+    #[arg(long, value_name = "GIB", value_parser = gib)]
+    push_memory_gib: Option<f64>,
+
+    /// Seconds that reading and checking one push may take.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().push.as_secs_f64(), value_parser = seconds)]
+    push_timeout_s: f64,
+
     /// Seconds within which a new connection must send its first message.
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().hello.as_secs_f64(), value_parser = seconds)]
     hello_timeout_s: f64,
@@ -75,6 +84,10 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().bytes), value_parser = gib)]
     spool_gib: f64,
 
+    /// Size of the uploads of one token, in GiB [default: half of --spool-gib if several tokens may upload, else all]
+    #[arg(long, value_name = "GIB", value_parser = gib)]
+    token_spool_gib: Option<f64>,
+
     /// Seconds that an upload is kept after its last byte.
     #[arg(long, value_name = "SECONDS", default_value_t = SpoolLimits::default().age.as_secs_f64(), value_parser = seconds)]
     upload_age_s: f64,
@@ -94,11 +107,14 @@ impl LimitOptions {
             connections: self.connections,
             sessions: self.sessions,
             pushes: self.pushes,
+            push_memory_bytes: self.push_memory_gib.map(bytes_of_gib),
+            push: seconds(self.push_timeout_s),
             resident_bytes,
             spool: SpoolLimits {
                 uploads: self.max_uploads,
                 upload_bytes: bytes_of_gib(self.upload_gib),
                 bytes: bytes_of_gib(self.spool_gib),
+                token_bytes: self.token_spool_gib.map(bytes_of_gib),
                 age: seconds(self.upload_age_s),
             },
         }

@@ -14,11 +14,12 @@ use tracing_subscriber::EnvFilter;
 use wildcity_server::Tokens;
 use wildcity_twin::ingest;
 use wildcity_twin::residency::default_memory_bytes;
+use wildcity_twin::store::DamagedTwin;
 
 use limit_options::{LimitOptions, gib_of};
 
 use super::backend_options::{BackendOptions, bytes_of_gib, gib};
-use super::directories::{Episodes, Twins, Uploads};
+use super::directories::{Episodes, Scenarios, Twins, Uploads};
 use super::profile_options::read_profile;
 
 /// Serve twins to agents over WebSocket.
@@ -44,6 +45,9 @@ pub(super) struct Serve {
 
     #[command(flatten)]
     episodes: Episodes,
+
+    #[command(flatten)]
+    scenarios: Scenarios,
 
     #[command(flatten)]
     uploads: Uploads,
@@ -115,6 +119,7 @@ impl Serve {
         Ok(match id {
             "twins" => text(self.twins.dir()?),
             "episodes" => text(self.episodes.dir()?),
+            "scenarios" => text(self.scenarios.dir()?),
             "uploads" => text(self.uploads.dir()?),
             "cache_dir" => self.twins.cache().and_then(|cache| text(cache.dir)),
             "memory_gib" => Some(gib_of(default_memory_bytes()).to_string()),
@@ -141,7 +146,11 @@ impl Serve {
             "--twins {} is not a directory",
             twins.display()
         );
-        if self.twins.catalog()?.twins()?.is_empty() {
+        let found = self.twins.catalog()?.twins()?;
+        for DamagedTwin { name, error } in &found.damaged {
+            tracing::error!(twin = name, "damaged, not served: {error}");
+        }
+        if found.twins.is_empty() {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
@@ -151,6 +160,7 @@ impl Serve {
             twins,
             cache: self.twins.cache(),
             episodes: self.episodes.dir()?,
+            scenarios: self.scenarios.dir()?,
             uploads: self.uploads.dir()?,
             tokens,
             backend: Arc::from(self.backend.backend()?),

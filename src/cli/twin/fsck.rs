@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 use crate::cli::progress;
-use wildcity_twin::store::FsckReport;
+use wildcity_twin::store::{FsckReport, RecordSetAside};
 
 /// Check a twin: read every object of every version and compare it with its hash, and check the log.
 ///
@@ -12,7 +12,9 @@ use wildcity_twin::store::FsckReport;
 /// everything is as it was committed, and 1 otherwise. To repair objects, import the same source again with
 /// the same options. Objects without a version are not damage: `wildcity twin gc` removes them.
 #[derive(Debug, clap::Args)]
-#[command(after_long_help = "Example:\n  wildcity twin fsck street && wildcity serve")]
+#[command(
+    after_long_help = "Examples:\n  wildcity twin fsck street && wildcity serve\n  wildcity twin fsck street --repair"
+)]
 pub(super) struct Fsck {
     /// The twin's name.
     #[arg(value_name = "TWIN")]
@@ -20,6 +22,11 @@ pub(super) struct Fsck {
 
     #[command(flatten)]
     twins: Twins,
+
+    /// Set the newest log record aside if it cannot be read, and those before it that cannot; then check. The version
+    /// before them is the latest again.
+    #[arg(long)]
+    repair: bool,
 
     /// Print the result as one JSON object.
     #[arg(long)]
@@ -29,6 +36,15 @@ pub(super) struct Fsck {
 impl Fsck {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
+        if self.repair {
+            for RecordSetAside { number, error, path } in catalog.repair_log(&self.twin)? {
+                let path = path.display();
+                writeln!(
+                    io::stderr(),
+                    "set the record of version {number} aside as {path}: {error}"
+                )?;
+            }
+        }
         let bar = progress::bytes("checking");
         let checked = catalog.fsck(&self.twin, &mut progress::show(&bar))?;
         bar.finish_and_clear();

@@ -1,13 +1,13 @@
 //! `wildcity twin generate`.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
 
 use crate::cli::directories::Twins;
-use crate::cli::progress;
+use crate::cli::{output, progress};
 use wildcity_generate::CitySettings;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig};
@@ -41,6 +41,10 @@ pub(in crate::cli) struct Generate {
     #[arg(long, value_name = "M_PER_S", default_value_t = 10.0)]
     speed_m_s: f64,
 
+    /// Also write a map of the city to this file: lanes, crosswalks, intersections.
+    #[arg(long, value_name = "FILE")]
+    map: Option<PathBuf>,
+
     #[command(flatten)]
     twins: Twins,
 }
@@ -53,7 +57,7 @@ on disk, including levels of detail:
   20 km at density 12  240 million Gaussians    8.0 GiB
 
 Examples:
-  wildcity twin generate --twin town --length-km 1
+  wildcity twin generate --twin town --length-km 1 --map town.map.json
   wildcity twin generate --twin city --length-km 20 --density 5
   wildcity render town --cameras views.json --out images";
 
@@ -101,6 +105,9 @@ impl Generate {
             )),
         };
         let version = commit.replace(None, parts)?;
+        if let Some(path) = &self.map {
+            output::write(path, wildcity_generate::city_map(&settings)?.to_json().as_bytes())?;
+        }
         bar.finish_and_clear();
 
         let seconds = begun.elapsed().as_secs_f64();

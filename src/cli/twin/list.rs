@@ -2,9 +2,12 @@
 
 use std::io::{self, Write};
 
+use wildcity_twin::store::DamagedTwin;
+
 use crate::cli::directories::Twins;
 
-/// List all twins with the number and hash of their latest versions.
+/// List all twins with the number and hash of their latest versions. A twin whose newest log record cannot be read is
+/// listed as damaged; `wildcity twin fsck --repair` sets the record aside.
 #[derive(Debug, clap::Args)]
 #[command(
     after_long_help = "Examples:\n  wildcity twin list\n  wildcity twin list --twins s3://fleet/twins --json"
@@ -13,7 +16,7 @@ pub(super) struct List {
     #[command(flatten)]
     twins: Twins,
 
-    /// Print one JSON object per line: name, number, hash.
+    /// Print one JSON object per line: name, number, hash; or name, damaged.
     #[arg(long)]
     json: bool,
 }
@@ -21,7 +24,8 @@ pub(super) struct List {
 impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
-        for twin in self.twins.catalog()?.twins()? {
+        let list = self.twins.catalog()?.twins()?;
+        for twin in list.twins {
             if self.json {
                 let line = serde_json::json!({
                     "name": twin.name, "number": twin.number, "hash": twin.hash,
@@ -29,6 +33,14 @@ impl List {
                 writeln!(out, "{line}")?;
             } else {
                 writeln!(out, "{:<24} version {:<6} {}", twin.name, twin.number, twin.hash)?;
+            }
+        }
+        for DamagedTwin { name, error } in list.damaged {
+            if self.json {
+                let line = serde_json::json!({ "name": name, "damaged": error.to_string() });
+                writeln!(out, "{line}")?;
+            } else {
+                writeln!(out, "{name:<24} damaged: {error}")?;
             }
         }
         Ok(())

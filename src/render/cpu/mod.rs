@@ -18,10 +18,11 @@ mod rasterize;
 mod resolve;
 mod sort;
 
+use std::sync::OnceLock;
 use std::time::Instant;
 
 use fearless_simd::Level;
-use parking_lot::Mutex;
+use parking_lot::{Mutex, MutexGuard};
 use rayon::ThreadPool;
 
 use crate::limits;
@@ -35,9 +36,24 @@ use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 /// The f32 backend.
 #[derive(Debug)]
 pub struct Cpu {
-    pool: ThreadPool,
+    main: Lane,
+    /// For frames that are rendered while another one is; `None` if its threads cannot be started.
+    side: OnceLock<Option<Lane>>,
     level: Level,
+}
+
+/// Threads and buffers for one frame at a time. With threads of its own, a frame gets its share of the cores; tasks of
+/// two frames in one pool would wait for each other.
+#[derive(Debug)]
+struct Lane {
+    pool: ThreadPool,
     scratch: Mutex<Scratch>,
+}
+
+/// A lane that renders a frame.
+struct BusyLane<'a> {
+    pool: &'a ThreadPool,
+    scratch: MutexGuard<'a, Scratch>,
 }
 
 /// Instruction sets that can be requested; the default is the best one of the machine.
@@ -101,10 +117,18 @@ impl Cpu {
             _ => None,
         };
         let level = level.ok_or(CpuError::NoSuchSimd(simd))?;
-        let name = |i| format!("render-{i}");
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build();
-        let pool = pool.map_err(CpuError::Threads)?;
-        Ok(Self { pool, level, scratch: Mutex::default() })
+        let main = Lane::new(threads, "render").map_err(CpuError::Threads)?;
+        Ok(Self { main, side: OnceLock::new(), level })
+    }
+
+    /// A lane that is free, or the main one as soon as it is.
+    fn lane(&self) -> BusyLane<'_> {
+        if let Some(free) = self.main.try_take() {
+            return free;
+        }
+        let threads = self.main.pool.current_num_threads();
+        let side = self.side.get_or_init(|| Lane::new(threads, "render-side").ok());
+        side.as_ref().and_then(Lane::try_take).unwrap_or_else(|| self.main.take())
     }
 
     /// Runs the stages up to and including `last`, and returns their outputs, for another backend to continue
@@ -119,10 +143,10 @@ impl Cpu {
     ) -> Result<(StageOutputs, FrameStats), RenderError> {
         frame.check_views()?;
         frame.check_splats(self.name())?;
-        let mut scratch = self.scratch.lock();
+        let BusyLane { pool, mut scratch } = self.lane();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
-        self.pool.install(|| {
+        pool.install(|| {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
             let mut timer = StageTimer::start();
@@ -130,6 +154,23 @@ impl Cpu {
             timer.finish("hand over", &mut stats);
             Ok((outputs, stats))
         })
+    }
+}
+
+impl Lane {
+    fn new(threads: usize, name: &'static str) -> Result<Self, rayon::ThreadPoolBuildError> {
+        let name = move |i| format!("{name}-{i}");
+        let pool =
+            rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(name).build()?;
+        Ok(Self { pool, scratch: Mutex::default() })
+    }
+
+    fn try_take(&self) -> Option<BusyLane<'_>> {
+        self.scratch.try_lock().map(|scratch| BusyLane { pool: &self.pool, scratch })
+    }
+
+    fn take(&self) -> BusyLane<'_> {
+        BusyLane { pool: &self.pool, scratch: self.scratch.lock() }
     }
 }
 
@@ -174,7 +215,11 @@ impl Backend for Cpu {
     }
 
     fn threads(&self) -> usize {
-        self.pool.current_num_threads()
+        self.main.pool.current_num_threads()
+    }
+
+    fn renders_beside(&self) -> bool {
+        true
     }
 
     fn render(
@@ -188,9 +233,9 @@ impl Backend for Cpu {
         // Outside of the pool: baking a sky waits for other threads, and a thread that waits within its own
         // rayon pool may start unrelated work of the pool.
         let backgrounds = Background::of(frame)?;
-        let mut scratch = self.scratch.lock();
+        let BusyLane { pool, mut scratch } = self.lane();
         let scratch = &mut *scratch;
-        self.pool.install(|| {
+        pool.install(|| {
             let mut stats = FrameStats::default();
             let part = FramePart { frame: *frame, backgrounds: &backgrounds, first_view: 0 };
             self.render_part(scratch, part, targets, finished, &mut stats)?;

@@ -26,6 +26,10 @@ use wildcity_scene::Rays;
 pub struct Reference;
 
 impl Backend for Reference {
+    fn draws_exact_rays(&self) -> bool {
+        true
+    }
+
     fn name(&self) -> &'static str {
         "reference"
     }

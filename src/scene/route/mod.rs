@@ -5,6 +5,7 @@
 
 mod box_index;
 mod clock;
+mod section;
 mod sub_trajectory;
 
 use std::ops::Range;
@@ -14,6 +15,7 @@ use super::trajectory::{Keyframe, TrajectoryError};
 
 pub use box_index::BoxIndex;
 pub use clock::{Association, TimePair, associate};
+pub use section::{MAX_SECTION_POSES, RoutePose, RouteSection};
 pub use sub_trajectory::{MAX_SUB_TRAJECTORIES, SubTrajectory, length_label, sub_trajectories};
 
 /// Distance between keyframes of a route, in metres.
@@ -143,6 +145,19 @@ impl<'a> Route<'a> {
         let to_m = self.stations_m[after];
         let t = ((station_m - from_m) / (to_m - from_m)).min(1.0);
         between(&keyframes[before], &keyframes[after], t)
+    }
+
+    /// The station at a time of the drive's clock, in microseconds, clamped to the ends of the route.
+    pub fn station_at(&self, time_us: i64) -> f64 {
+        let keyframes = &self.trajectory.keyframes;
+        let after = keyframes.partition_point(|keyframe| keyframe.time_us < time_us);
+        let Some(before) = after.checked_sub(1) else { return 0.0 };
+        let Some(to) = keyframes.get(after) else { return self.length_m() };
+        let from = &keyframes[before];
+        // i128, since the difference of two i64 times may overflow i64.
+        let span_us = |from_us: i64, to_us: i64| (i128::from(to_us) - i128::from(from_us)) as f64;
+        let t = span_us(from.time_us, time_us) / span_us(from.time_us, to.time_us);
+        self.stations_m[before] + t * (self.stations_m[after] - self.stations_m[before])
     }
 
     /// The route in chunks of 5 km, without chunks that have no keyframe.

@@ -7,18 +7,21 @@ use serde::Serialize;
 
 use crate::config::Limits as ServerLimits;
 use crate::fault::Fault;
+use crate::sessions::ClosedSession;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    Encoding, EpisodeSummary, Outcome, PixelMaps, Session, TrajectorySummary, TwinSummary,
+    DamagedSummary, Encoding, EpisodeSummary, EpisodeTraffic, Outcome, PixelMaps, Session,
+    TrajectorySummary, TwinSummaries, TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
 use super::camera::{exposure_to, lens_and_windshield_to, shutter_to};
+use super::drive::{DriveRequest, drive};
 
 /// Name of the server in `welcome`.
 const SERVER_NAME: &str = "wildcity";
@@ -52,10 +55,20 @@ pub(crate) fn welcome(
     })
 }
 
-/// The answer to `open`.
-pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
+/// The answer to `open`, with a part of a recorded drive if the client asked for one.
+pub(crate) fn opened(
+    seq: u64,
+    session: &Session,
+    section: Option<&DriveRequest>,
+) -> Result<String, Fault> {
+    text(&Answer::Opened(Box::new(settings(seq, session, section)?)))
+}
+
+/// All settings of a session.
+fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Result<Opened, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
+    let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let PixelMaps { depth, opacity, normals } = session.maps();
@@ -69,11 +82,12 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
         normals: Some(normals),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
+        actors: session.tells_actors().then_some(true),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
         cameras: Some(names),
         images: BTreeMap::new(),
     };
-    text(&Answer::Opened(Box::new(Opened {
+    Ok(Opened {
         seq,
         session: session.name().to_owned(),
         twin: manifest.twin.clone(),
@@ -98,18 +112,39 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),
-    })))
+        scenario: session.traffic().map(opened_scenario),
+        trajectory: trajectory.transpose()?,
+    })
+}
+
+fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
+    message::OpenedScenario {
+        name: traffic.loaded().scenario.file.name.clone(),
+        hash: traffic.loaded().hash.clone(),
+        actors: traffic.specs().len() as u64,
+    }
 }
 
 /// The answer to `resume`.
 pub(crate) fn resumed(
     seq: u64,
-    session: &str,
+    name: &str,
     last_seq: u64,
-    step: u64,
-    time_us: i64,
+    session: Result<&Session, &ClosedSession>,
 ) -> Result<String, Fault> {
-    text(&Answer::Resumed { seq, session: session.to_owned(), last_seq, step, time_us })
+    let (step, time_us) = match session {
+        Ok(open) => (open.episode().step(), open.episode().time_us()),
+        Err(closed) => (closed.steps, closed.time_us),
+    };
+    let opened = session.ok().map(|session| settings(seq, session, None)).transpose()?;
+    text(&Answer::Resumed {
+        seq,
+        session: name.to_owned(),
+        last_seq,
+        step,
+        time_us,
+        opened: opened.map(Box::new),
+    })
 }
 
 /// The answer to `prefetch`.
@@ -135,6 +170,7 @@ pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
         Outcome::OffModel => message::Outcome::OffModel,
+        Outcome::DrivingFailure => message::Outcome::DrivingFailure,
         Outcome::AgentError => message::Outcome::AgentError,
         Outcome::AgentTimeout => message::Outcome::AgentTimeout,
         Outcome::AgentLost => message::Outcome::AgentLost,
@@ -145,8 +181,14 @@ pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault
 }
 
 /// The body of `GET /v1/twins`.
-pub(crate) fn twins(twins: &[Arc<TwinSummary>]) -> serde_json::Value {
-    serde_json::json!({ "twins": twins.iter().map(|twin| twin_info(twin)).collect::<Vec<_>>() })
+pub(crate) fn twins(list: &TwinSummaries) -> serde_json::Value {
+    let twins: Vec<_> = list.twins.iter().map(|twin| twin_info(twin)).collect();
+    if list.damaged.is_empty() {
+        return serde_json::json!({ "twins": twins });
+    }
+    let damaged = |DamagedSummary { name, reason }: &DamagedSummary| serde_json::json!({ "name": name, "reason": reason });
+    let damaged: Vec<_> = list.damaged.iter().map(damaged).collect();
+    serde_json::json!({ "twins": twins, "damaged": damaged })
 }
 
 /// The body of `GET /v1/twins/{twin}`: one twin.

@@ -13,7 +13,7 @@ use wildcity_render::RenderError;
 use wildcity_scene::geometry::PoseError;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::RigError;
-use wildcity_session::SessionError;
+use wildcity_session::{ScenarioError, SessionError};
 use wildcity_sim::EgoError;
 use wildcity_twin::ingest::IngestError;
 use wildcity_twin::residency::ResidencyError;
@@ -118,6 +118,7 @@ fn status_of(code: Code) -> StatusCode {
         | Code::PoseNotFinite
         | Code::PoseInvalid
         | Code::CameraInvalid
+        | Code::ScenarioInvalid
         | Code::OutOfRange => StatusCode::BAD_REQUEST,
         Code::Unauthorized => StatusCode::UNAUTHORIZED,
         Code::Forbidden => StatusCode::FORBIDDEN,
@@ -127,6 +128,8 @@ fn status_of(code: Code) -> StatusCode {
         | Code::UnknownCamera
         | Code::UnknownTrajectory
         | Code::UnknownSession
+        | Code::UnknownState
+        | Code::UnknownScenario
         | Code::UnknownUpload
         | Code::UnknownPush => StatusCode::NOT_FOUND,
         Code::TimedOut => StatusCode::REQUEST_TIMEOUT,
@@ -174,6 +177,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::SessionState(_) => at(Code::SessionState, "type"),
         Fault::Replaced => plain(Code::SessionState),
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
+        Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
+        Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
@@ -228,6 +233,8 @@ pub(super) fn of_push(error: &PushError) -> WireFault {
         PushError::Content { .. } => plain(Code::PushRefused),
         PushError::UnknownPush { .. } => plain(Code::UnknownPush),
         PushError::Busy { .. } => plain(Code::Busy),
+        PushError::TimedOut { .. } => plain(Code::PushRefused),
+        PushError::Cancelled | PushError::TooLate { .. } => plain(Code::Conflict),
         PushError::ShuttingDown => plain(Code::ShuttingDown),
         PushError::Session(error) => of_session(error),
         PushError::Unreadable { .. } | PushError::Crashed => plain(Code::Internal),
@@ -239,13 +246,20 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Twin(error) => of_store(error),
         SessionError::Residency(error) => of_residency(error),
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
+        SessionError::Scenario(error) => match error {
+            ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
+            _ => at(Code::ScenarioInvalid, &error.field()),
+        },
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
         SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),
         SessionError::CameraTwice { index, .. } => {
             at(Code::InvalidName, &format!("outputs.cameras[{index}]"))
         }
+        SessionError::UnknownSnapshot { field, .. } => at(Code::UnknownState, field),
+        SessionError::UnknownEpisode { .. } => at(Code::UnknownState, "from.episode"),
+        SessionError::Branch { .. } => at(Code::UnknownState, "from"),
         SessionError::CameraOption { field, .. } => at(Code::OutOfRange, field),
-        SessionError::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "start.trajectory"),
+        SessionError::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         SessionError::Profile(error) => of_profile(error),
         SessionError::Sky(_) => at(Code::OutOfRange, "profile.sky_error"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
@@ -264,6 +278,7 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Busy { .. } => plain(Code::Busy),
         SessionError::DeadlineExceeded => plain(Code::DeadlineExceeded),
         SessionError::Render(error) => of_render(error),
+        SessionError::Record(error) if is_full(&error.cause) => plain(Code::StorageFull),
         SessionError::Encode { .. }
         | SessionError::Record(_)
         | SessionError::Crashed
@@ -326,8 +341,8 @@ fn of_render(error: &RenderError) -> WireFault {
         RenderError::TooMany { .. } => plain(Code::AnswerTooLarge),
         // The device may have room again when other sessions have ended.
         RenderError::DeviceMemory { .. } => at(Code::Busy, "twin"),
+        RenderError::ExactRays { .. } => at(Code::OutOfRange, "profile"),
         RenderError::Views { .. }
-        | RenderError::ExactRays { .. }
         | RenderError::TargetSize { .. }
         | RenderError::Normals { .. }
         | RenderError::Overlay { .. }

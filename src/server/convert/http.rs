@@ -59,7 +59,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     let files = files.into_iter().enumerate();
     let preview_poses = preview
         .poses
-        .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_POSES));
+        .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES));
     let request = PushRequest {
         id,
         twin,

@@ -1,6 +1,9 @@
 //! Parses text frames as commands.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
+
+use serde_json::Value;
 
 use crate::fault::Fault;
 use wildcity_protocol::PROTOCOL;
@@ -8,12 +11,15 @@ use wildcity_protocol::decode::{Refused, decode};
 use wildcity_protocol::message::{self, Request};
 use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
+use wildcity_session::is_episode_name;
 use wildcity_session::{
-    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
+    Encoding, ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
+    ScenarioSource, SessionError, SessionOptions, Start, StepOptions,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
 
+use super::drive::DriveRequest;
 use super::field::{name_of, pose_of, poses_of};
 use super::rig::rig_of;
 
@@ -45,13 +51,15 @@ pub(crate) enum Command {
         name: Option<String>,
         /// What is opened.
         opening: Box<SessionOptions>,
+        /// The part of a recorded drive that the answer is to have.
+        drive: Option<DriveRequest>,
     },
     /// Carries out a step.
     Step {
         /// How the ego moves.
         movement: wildcity_sim::Command,
-        /// Whether it is the last step.
-        terminate: bool,
+        /// How long, whether it is the last step, and notes.
+        options: StepOptions,
     },
     /// Renders images of poses.
     Observe {
@@ -65,15 +73,30 @@ pub(crate) enum Command {
     },
     /// Begins a new episode.
     Reset {
-        /// Its seed.
-        seed: u64,
-        /// Its start.
-        start: Option<Start>,
+        /// Seed, start and dynamics.
+        options: ResetOptions,
     },
     /// Switches to another version of the twin.
     SwitchVersion {
         /// The version; the latest if there is none.
         version: Option<u64>,
+    },
+    /// Stores the state of the episode.
+    Snapshot {
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Returns to a snapshot.
+    Restore {
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Opens a session in a state of another episode.
+    Branch {
+        /// Its name, if the client chose one.
+        name: Option<String>,
+        /// The state.
+        from: BranchPoint,
     },
     /// Ends the session.
     Close,
@@ -83,6 +106,25 @@ pub(crate) enum Command {
         session: String,
         /// Number of the last request with an answer that arrived.
         last_seq: u64,
+    },
+}
+
+/// A state of an episode, with names that are checked.
+#[derive(Debug)]
+pub(crate) enum BranchPoint {
+    /// A snapshot of a session.
+    Snapshot {
+        /// The session.
+        session: String,
+        /// The snapshot.
+        snapshot: String,
+    },
+    /// A step of a recorded episode.
+    Recorded {
+        /// The episode.
+        episode: String,
+        /// Steps done.
+        step: u64,
     },
 }
 
@@ -112,9 +154,10 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, command)
         }
         Request::Open(open) => (open.seq, open_command(*open)),
-        Request::Step { seq, pose, trajectory, action, terminate } => {
+        Request::Step { seq, pose, trajectory, action, until_us, notes, terminate } => {
             let movement = movement_of(pose, trajectory, action);
-            (seq, movement.map(|movement| Command::Step { movement, terminate }))
+            let options = StepOptions { until_us, terminate, notes };
+            (seq, movement.map(|movement| Command::Step { movement, options }))
         }
         Request::Observe { seq, poses } => {
             let poses = poses_of("poses", &poses, wildcity_session::limits::OBSERVE_POSES);
@@ -124,11 +167,18 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             let poses = poses_of("poses", &poses, wildcity_session::limits::PREFETCH_POSES);
             (seq, poses.map(|poses| Command::Prefetch { poses }))
         }
-        Request::Reset { seq, seed, start } => {
-            let start = start.map(start_of).transpose();
-            (seq, start.map(|start| Command::Reset { seed, start }))
+        Request::Reset { seq, seed, start, dynamics, speed } => {
+            let options = reset_options(seed, start, dynamics, speed);
+            (seq, options.map(|options| Command::Reset { options }))
         }
         Request::SwitchVersion { seq, version } => (seq, Ok(Command::SwitchVersion { version })),
+        Request::Snapshot { seq, name } => {
+            (seq, name_of("name", name).map(|name| Command::Snapshot { name }))
+        }
+        Request::Restore { seq, name } => {
+            (seq, name_of("name", name).map(|name| Command::Restore { name }))
+        }
+        Request::Branch(branch) => (branch.seq, branch_command(branch)),
         Request::Close { seq } => (seq, Ok(Command::Close)),
         Request::Resume { seq, session, last_seq } => {
             let command =
@@ -155,6 +205,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         normals,
         frames,
         trust,
+        actors,
         period_us,
     } = open.outputs;
     let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
@@ -164,6 +215,19 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         }
         message::Encoding::Png => Encoding::Png,
         message::Encoding::Raw => Encoding::Raw,
+    };
+    let scenario = match open.scenario {
+        None => None,
+        Some(choice) => {
+            let (source, values) = scenario_of(choice)?;
+            Some(ScenarioOptions {
+                source,
+                values,
+                dynamics: open.dynamics.is_none(),
+                warm_up: open.warm_up_us.is_none(),
+                actors: actors.unwrap_or(false),
+            })
+        }
     };
     let opening = SessionOptions {
         twin: name_of("twin", open.twin)?,
@@ -181,13 +245,79 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             trust: trust.unwrap_or(false),
             periods_us: period_us.unwrap_or_default(),
         },
+        scenario,
         dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
         decision_us: open.decision_us,
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
-    Ok(Command::Open { name, opening: Box::new(opening) })
+    Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
+}
+
+/// A scenario's name, its name with values, or the scenario itself, which has a format.
+fn scenario_of(
+    choice: message::ScenarioChoice,
+) -> Result<(ScenarioSource, BTreeMap<String, Value>), Fault> {
+    let mut object = match choice {
+        message::ScenarioChoice::Name(name) => {
+            return Ok((ScenarioSource::Named(name), BTreeMap::new()));
+        }
+        message::ScenarioChoice::Object(object) => object,
+    };
+    if object.contains_key("format") {
+        return Ok((ScenarioSource::Inline(Value::Object(object)), BTreeMap::new()));
+    }
+    let wrong = |field: &str, reason: &str| Fault::InvalidRequest {
+        reason: format!("scenario{field}: {reason}"),
+        field: Some(format!("scenario{field}")),
+    };
+    let Some(Value::String(name)) = object.remove("name") else {
+        return Err(wrong(
+            "",
+            "write the format of a scenario, or the name of one of the server's",
+        ));
+    };
+    let values = match object.remove("values") {
+        None => serde_json::Map::new(),
+        Some(Value::Object(values)) => values,
+        Some(_) => return Err(wrong(".values", "write an object of values by their names")),
+    };
+    if let Some(field) = object.keys().next() {
+        return Err(wrong(&format!(".{field}"), "there is no such field; name and values are"));
+    }
+    Ok((ScenarioSource::Named(name), values.into_iter().collect()))
+}
+
+fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
+    let name = branch.session.map(|name| name_of("session", name)).transpose()?;
+    let from = match branch.from {
+        message::BranchPoint::Snapshot { session, snapshot } => BranchPoint::Snapshot {
+            session: name_of("from.session", session)?,
+            snapshot: name_of("from.snapshot", snapshot)?,
+        },
+        message::BranchPoint::Recorded { episode, step } => {
+            if !is_episode_name(&episode) {
+                return Err(Fault::InvalidName { field: "from.episode".into(), name: episode });
+            }
+            BranchPoint::Recorded { episode, step }
+        }
+    };
+    Ok(Command::Branch { name, from })
+}
+
+fn reset_options(
+    seed: u64,
+    start: Option<message::Start>,
+    dynamics: Option<message::DynamicsChoice>,
+    speed_m_s: Option<f64>,
+) -> Result<ResetOptions, Fault> {
+    Ok(ResetOptions {
+        seed,
+        start: start.map(start_of).transpose()?,
+        dynamics: dynamics.map(dynamics_of).transpose()?,
+        speed_m_s,
+    })
 }
 
 fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {
@@ -244,6 +374,16 @@ fn start_of(start: message::Start) -> Result<Start, Fault> {
         message::Start::Pose { pose } => Start::Pose(pose_of("start.pose", &pose)?),
         message::Start::Station { trajectory, station_m } => {
             Start::Station { trajectory, station_m }
+        }
+        message::Start::Random { random } => {
+            let message::RandomStart { trajectory, from_m, to_m, lateral_m, heading_rad } = random;
+            Start::Random(RandomStart {
+                trajectory,
+                from_m,
+                to_m,
+                lateral_m: lateral_m.unwrap_or(0.0),
+                heading_rad: heading_rad.unwrap_or(0.0),
+            })
         }
     })
 }

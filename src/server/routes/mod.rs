@@ -20,6 +20,7 @@ use axum::{Json, Router};
 use crate::auth::Grant;
 use crate::convert;
 use crate::fault::Fault;
+use crate::newcomers::ConnectionSlot;
 use crate::state::ServerState;
 
 use refusal::Refusal;
@@ -33,9 +34,10 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .route("/v1/twins", get(twins::list))
         .route("/v1/twins/{twin}", get(twins::show))
         .route("/v1/twins/{twin}/versions", get(twins::versions))
+        .route("/v1/twins/{twin}/trajectories/{name}", get(twins::trajectory))
         .route("/v1/twins/{twin}/rollback", post(twins::rollback))
         .route("/v1/twins/{twin}/pushes", post(pushes::begin))
-        .route("/v1/twins/{twin}/pushes/{id}", get(pushes::show))
+        .route("/v1/twins/{twin}/pushes/{id}", get(pushes::show).delete(pushes::cancel))
         .route("/v1/uploads", post(uploads::begin))
         // The body of an upload is not held in memory: it is written to disk as it arrives.
         .route(
@@ -69,8 +71,14 @@ async fn authorize(
             let authorization = request.headers().get(header::AUTHORIZATION);
             tokens.grant(authorization.map(|value| value.as_bytes()))?
         }
-        None => Grant::everything(),
+        None => {
+            check_host(&request)?;
+            Grant::everything()
+        }
     };
+    if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
+        slot.become_known()?;
+    }
     request.extensions_mut().insert(grant);
     Ok(next.run(request).await)
 }
@@ -82,6 +90,22 @@ fn check_origin(headers: &HeaderMap) -> Result<(), Fault> {
         Some(origin) if !origin.to_str().is_ok_and(is_local) => {
             let origin = String::from_utf8_lossy(origin.as_bytes()).into_owned();
             Err(Fault::ForbiddenOrigin { origin })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Refuses requests for other hosts, on a server without tokens. A web page can let the name of its own host stand
+/// for 127.0.0.1 (DNS rebinding); then its requests have no foreign `Origin`, but still that name as the host.
+fn check_host(request: &Request) -> Result<(), Fault> {
+    let header = request.headers().get(header::HOST).map(|host| host.to_str().unwrap_or_default());
+    let host = request.uri().authority().map(|authority| authority.as_str()).or(header);
+    match host {
+        Some(host) if !is_local_authority(host) => {
+            let reason = format!(
+                "requests for host {host:?} are refused; without tokens, localhost is served"
+            );
+            Err(Fault::Forbidden { field: "host", reason })
         }
         _ => Ok(()),
     }
@@ -108,12 +132,16 @@ async fn no_method(method: Method, uri: Uri) -> Refusal {
 
 /// Whether an origin is a page served from this machine.
 fn is_local(origin: &str) -> bool {
-    let Some((_, authority)) = origin.split_once("://") else { return false };
+    origin.split_once("://").is_some_and(|(_, authority)| is_local_authority(authority))
+}
+
+/// Whether a host, with or without a port, is this machine.
+fn is_local_authority(authority: &str) -> bool {
     let host = match authority.rsplit_once(':') {
         Some((host, port)) if port.bytes().all(|b| b.is_ascii_digit()) => host,
         _ => authority,
     };
-    ["localhost", "127.0.0.1", "[::1]"].contains(&host)
+    host.eq_ignore_ascii_case("localhost") || ["127.0.0.1", "[::1]"].contains(&host)
 }
 
 #[cfg(test)]

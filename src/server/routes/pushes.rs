@@ -36,13 +36,14 @@ pub(super) async fn begin(
     };
     let id = request.id.clone().unwrap_or_else(|| wildcity_push::default_id(&request, latest));
     let twin = request.twin.clone();
-    let push = match state.pushes.begin(&request, &id, || find_uploads(&state, &request))? {
-        Begun::Known(push) => push,
-        Begun::New { push, files } => {
-            tokio::spawn(run(state.clone(), push.clone(), request, files));
-            push
-        }
-    };
+    let push =
+        match state.pushes.begin(&request, &id, || find_uploads(&state, &grant.name, &request))? {
+            Begun::Known(push) => push,
+            Begun::New { push, files } => {
+                tokio::spawn(run(state.clone(), push.clone(), request, files));
+                push
+            }
+        };
     Ok(answer(StatusCode::ACCEPTED, &id, &twin, &push))
 }
 
@@ -58,6 +59,19 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &id, &twin, &push))
 }
 
+/// `DELETE /v1/twins/{twin}/pushes/{id}`: cancels a push, and answers with its last status.
+pub(super) async fn cancel(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path((twin, id)): Path<(String, String)>,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&twin)?;
+    let push = state.pushes.get(&twin, &id).map_err(Fault::from)?;
+    push.cancel().map_err(|why| Fault::from(PushError::TooLate { id: id.clone(), why }))?;
+    Ok(answer(StatusCode::OK, &id, &twin, &push))
+}
+
 /// Runs a push to its end and records the result.
 async fn run(
     state: Arc<ServerState>,
@@ -70,6 +84,7 @@ async fn run(
         wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints);
     let result = tokio::select! {
         result = published => result,
+        () = push.cancelled() => Err(PushError::Cancelled),
         () = state.stopped() => Err(PushError::ShuttingDown),
     };
     let reason = result.as_ref().err().map(ToString::to_string);
@@ -85,13 +100,17 @@ async fn run(
     state.metrics.push_ended(outcome);
 }
 
-/// The finished uploads of a push. An upload is not removed while its file is held.
-fn find_uploads(state: &ServerState, request: &PushRequest) -> Result<Vec<SourceFile>, Fault> {
+/// The finished uploads of a push, which belong to its token. An upload is not removed while its file is held.
+fn find_uploads(
+    state: &ServerState,
+    owner: &str,
+    request: &PushRequest,
+) -> Result<Vec<SourceFile>, Fault> {
     let spool = state.spool()?;
     let mut files = Vec::with_capacity(request.files.len());
     for (index, file) in request.files.iter().enumerate() {
         let field = format!("files[{index}].upload");
-        let upload = spool.get(&file.upload).map_err(|fault| match fault {
+        let upload = spool.get(owner, &file.upload).map_err(|fault| match fault {
             Fault::UnknownUpload { id, .. } => Fault::UnknownUpload { id, field: Some(field) },
             fault => fault,
         })?;

@@ -37,7 +37,7 @@ pub(super) async fn begin(
     grant.require(Role::Push)?;
     let announced = convert::new_upload(&body)?;
     let spool = state.spool()?.clone();
-    let upload = blocking(move || spool.begin(announced)).await?;
+    let upload = blocking(move || spool.begin(&grant.name, announced)).await?;
     state.metrics.uploads_begun.inc();
     let status = if upload.is_complete() { StatusCode::OK } else { StatusCode::CREATED };
     Ok(answer(status, &upload))
@@ -50,7 +50,7 @@ pub(super) async fn show(
     Path(id): Path<String>,
 ) -> HttpResult {
     grant.require(Role::Push)?;
-    Ok(answer(StatusCode::OK, &*state.spool()?.get(&id)?))
+    Ok(answer(StatusCode::OK, &*state.spool()?.get(&grant.name, &id)?))
 }
 
 /// `DELETE /v1/uploads/{id}`.
@@ -60,7 +60,7 @@ pub(super) async fn delete(
     Path(id): Path<String>,
 ) -> HttpResult {
     grant.require(Role::Push)?;
-    let upload = state.spool()?.get(&id)?;
+    let upload = state.spool()?.get(&grant.name, &id)?;
     let writer = upload.write().await?;
     let spool = state.spool()?.clone();
     blocking(move || {
@@ -84,7 +84,7 @@ pub(super) async fn append(
 ) -> HttpResult {
     grant.require(Role::Push)?;
     let spool = state.spool()?.clone();
-    let upload = spool.get(&id)?;
+    let upload = spool.get(&grant.name, &id)?;
 
     // What the headers announce must continue the upload.
     let start = number(&headers, &UPLOAD_OFFSET)?;
@@ -166,12 +166,15 @@ async fn receive(
             sha256.update(&full);
             let spool = state.spool()?.clone();
             let upload = upload.clone();
-            writer = blocking(move || match writer.append(&full) {
-                Ok(()) => Ok(writer),
-                Err(fault) => {
-                    // The disk is full: keeping the upload would keep it full.
-                    spool.remove(&upload);
-                    Err(fault)
+            writer = blocking(move || {
+                spool.make_room(&upload, full.len() as u64)?;
+                match writer.append(&full) {
+                    Ok(()) => Ok(writer),
+                    Err(fault) => {
+                        // The disk is full: keeping the upload would keep it full.
+                        spool.remove(&upload);
+                        Err(fault)
+                    }
                 }
             })
             .await?;

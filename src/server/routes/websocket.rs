@@ -9,13 +9,13 @@ use axum::response::IntoResponse as _;
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
 use tokio::net::TcpStream;
-use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::auth::{Grant, Role};
 use crate::connection;
 use crate::convert;
 use crate::fault::Fault;
+use crate::newcomers::ConnectionSlot;
 use crate::socket::Socket;
 use crate::state::ServerState;
 
@@ -25,7 +25,7 @@ use super::refusal::HttpResult;
 /// [`connection`].
 pub(super) async fn upgrade(
     State(state): State<Arc<ServerState>>,
-    Extension(http_permit): Extension<Arc<OwnedSemaphorePermit>>,
+    Extension(slot): Extension<Arc<ConnectionSlot>>,
     Extension(grant): Extension<Arc<Grant>>,
     mut request: Request,
 ) -> HttpResult {
@@ -37,8 +37,8 @@ pub(super) async fn upgrade(
     };
     let upgrade = hyper::upgrade::on(&mut request);
     tokio::spawn(async move {
-        // Both permits are held until the connection ends.
-        let _http_permit = http_permit;
+        // Both are held until the connection ends.
+        let _slot = slot;
         let _websocket_permit = websocket_permit;
         match upgrade.await.map(into_tcp) {
             Ok(Ok((stream, read_ahead))) => {

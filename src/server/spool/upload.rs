@@ -5,7 +5,7 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::SystemTime;
+use std::time::{Duration, Instant, SystemTime};
 
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
@@ -24,12 +24,17 @@ const COMPLETE: u64 = u64::MAX;
 #[derive(Debug)]
 pub(crate) struct Upload {
     id: String,
+    stem: String,
+    /// Name of the token that announced it; empty on a server without tokens.
+    owner: String,
     announced: Announced,
     dir: PathBuf,
     /// Bytes on disk; [`COMPLETE`] once they are checked.
     held: AtomicU64,
     /// When the last byte arrived, or the upload was last announced.
     used: Mutex<SystemTime>,
+    /// When the last byte arrived, or the upload was begun or found.
+    active: Mutex<Instant>,
     writing: Arc<AsyncMutex<()>>,
     /// Asks the connection that writes to release the upload to another one.
     release: Notify,
@@ -43,19 +48,37 @@ pub(crate) struct Announced {
     pub(crate) digest: Digest,
 }
 
+/// The JSON file of an upload.
+#[derive(Serialize, Deserialize)]
+struct AnnouncedBy {
+    #[serde(flatten)]
+    announced: Announced,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    owner: String,
+}
+
+/// The name of the files of an upload, without their endings.
+pub(super) fn stem(owner: &str, id: &str) -> String {
+    if owner.is_empty() {
+        return id.to_owned();
+    }
+    let owner = blake3::hash(owner.as_bytes()).to_hex();
+    format!("{id}-{}", &owner[..16])
+}
+
 impl Upload {
-    /// A new upload in a directory, without its files.
-    pub(super) fn new(dir: &Path, announced: Announced) -> Self {
-        Self::with(dir, announced, 0, SystemTime::now())
+    /// A new upload of a token in a directory, without its files.
+    pub(super) fn new(dir: &Path, owner: &str, announced: Announced) -> Self {
+        Self::with(dir, owner.to_owned(), announced, 0, SystemTime::now())
     }
 
-    /// The upload of an id that an earlier server left in the directory, if its files are valid.
-    pub(super) fn found(dir: &Path, id: &str) -> Option<Self> {
-        let path = |kind: &str| dir.join(format!("{id}.{kind}"));
+    /// The upload of these files that an earlier server left in the directory, if they are valid.
+    pub(super) fn found(dir: &Path, stem: &str) -> Option<Self> {
+        let path = |kind: &str| dir.join(format!("{stem}.{kind}"));
         let metadata = |kind: &str| fs::metadata(path(kind)).ok();
         let text = fs::read(path("json")).ok()?;
-        let announced: Announced = serde_json::from_slice(&text).ok()?;
-        if announced.digest.id() != id {
+        let AnnouncedBy { announced, owner } = serde_json::from_slice(&text).ok()?;
+        if self::stem(&owner, &announced.digest.id()) != stem {
             return None;
         }
         let size = announced.size;
@@ -67,16 +90,20 @@ impl Upload {
             (None, None) => return None,
         };
         let used = file.modified().unwrap_or_else(|_| SystemTime::now());
-        Some(Self::with(dir, announced, held, used))
+        Some(Self::with(dir, owner, announced, held, used))
     }
 
-    fn with(dir: &Path, announced: Announced, held: u64, used: SystemTime) -> Self {
+    fn with(dir: &Path, owner: String, announced: Announced, held: u64, used: SystemTime) -> Self {
+        let id = announced.digest.id();
         Self {
-            id: announced.digest.id(),
+            stem: stem(&owner, &id),
+            id,
+            owner,
             announced,
             dir: dir.to_owned(),
             held: held.into(),
             used: Mutex::new(used),
+            active: Mutex::new(Instant::now()),
             writing: Arc::default(),
             release: Notify::new(),
         }
@@ -84,6 +111,16 @@ impl Upload {
 
     pub(crate) fn id(&self) -> &str {
         &self.id
+    }
+
+    /// The name of its files, without their endings.
+    pub(super) fn stem(&self) -> &str {
+        &self.stem
+    }
+
+    /// Name of the token that announced it.
+    pub(super) fn owner(&self) -> &str {
+        &self.owner
     }
 
     pub(crate) fn announced(&self) -> &Announced {
@@ -125,7 +162,9 @@ impl Upload {
     /// Makes the files of a new upload.
     pub(super) fn create(&self) -> Result<(), Fault> {
         let create = || {
-            fs::write(self.file("json"), serde_json::to_vec(&self.announced)?)?;
+            let announced = self.announced.clone();
+            let announced = AnnouncedBy { announced, owner: self.owner.clone() };
+            fs::write(self.file("json"), serde_json::to_vec(&announced)?)?;
             File::create(self.file("part"))
         };
         create().map_err(|cause| io_fault("write to", cause))?;
@@ -152,12 +191,17 @@ impl Upload {
     /// Renames the files, so that a new upload can have the same id at once. They are deleted when the
     /// result is dropped.
     pub(super) fn set_aside(&self) -> RemovedFiles {
-        RemovedFiles::of(&self.dir, &self.id)
+        RemovedFiles::of(&self.dir, &self.stem)
     }
 
     /// Notes that the upload is used now.
     pub(super) fn touch(&self) {
         *self.used.lock() = SystemTime::now();
+    }
+
+    /// Time since the last byte arrived, or the upload was begun or found.
+    pub(super) fn idle(&self) -> Duration {
+        self.active.lock().elapsed()
     }
 
     /// When the upload was last used.
@@ -166,7 +210,7 @@ impl Upload {
     }
 
     fn file(&self, kind: &str) -> PathBuf {
-        self.dir.join(format!("{}.{kind}", self.id))
+        self.dir.join(format!("{}.{kind}", self.stem))
     }
 }
 
@@ -189,6 +233,7 @@ impl Writer {
             Ok(()) => {
                 self.upload.held.store(start + bytes.len() as u64, Ordering::Release);
                 self.upload.touch();
+                *self.upload.active.lock() = Instant::now();
                 Ok(())
             }
             Err(cause) => {
@@ -236,8 +281,8 @@ fn io_fault(action: &'static str, cause: io::Error) -> Fault {
 pub(super) struct RemovedFiles(PathBuf);
 
 impl RemovedFiles {
-    pub(super) fn of(dir: &Path, id: &str) -> Self {
-        let path = |kind: &str| dir.join(format!("{id}.{kind}"));
+    pub(super) fn of(dir: &Path, stem: &str) -> Self {
+        let path = |kind: &str| dir.join(format!("{stem}.{kind}"));
         let gone = path("gone");
         // The announcement is removed last: if the process is killed before, the next start removes the rest.
         for kind in ["part", "data"] {

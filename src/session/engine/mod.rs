@@ -8,13 +8,14 @@ pub(crate) mod twin_summaries;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use parking_lot::Mutex;
 use tokio::time::{Instant, sleep};
 
-use wildcity_render::Backend;
-use wildcity_scene::RenderProfile;
+use wildcity_render::{Backend, RenderError};
+use wildcity_scene::{Rays, RenderProfile};
 use wildcity_twin::residency::{
     Cache, Prefetcher, Reservation, ResidencyError, Resident, RigExtent, Stats, Urgency, Viewpoint,
 };
@@ -22,11 +23,15 @@ use wildcity_twin::store::Catalog;
 
 use self::answer_budget::AnswerBudget;
 use self::leases::Leases;
-use self::render_queue::{RenderQueue, Scratch};
-use self::twin_summaries::{SummaryCache, TwinSummary};
+use self::render_queue::{FrameCost, RenderQueue, Scratch};
+use self::twin_summaries::{SummaryCache, TwinSummaries};
 use crate::blocking::run_blocking;
 use crate::error::SessionError;
 use crate::limits;
+use crate::scenario::load::Scenarios;
+
+/// The [`FrameCost::session`] of frames that are rendered for pushes.
+pub const PUSHES: u64 = 0;
 
 /// The parts and settings of an [`Engine`].
 pub struct EngineSettings {
@@ -34,6 +39,8 @@ pub struct EngineSettings {
     pub cache: Cache,
     /// Directory of the episodes' files.
     pub episodes: PathBuf,
+    /// The scenarios that can be opened by name.
+    pub scenarios: Scenarios,
     /// The backend that renders.
     pub backend: Arc<dyn Backend>,
     /// How long one step may take, time in queues included.
@@ -46,8 +53,10 @@ pub struct Engine {
     cache: Cache,
     leases: Arc<Leases>,
     episodes: PathBuf,
+    scenarios: Scenarios,
     step_timeout: Duration,
     queue: RenderQueue,
+    session_numbers: AtomicU64,
     answer_budget: AnswerBudget,
     /// By twin: the version that counts as its latest while a newer one is loaded.
     pins: Mutex<BTreeMap<String, u64>>,
@@ -66,29 +75,35 @@ impl Engine {
     /// # Errors
     /// [`SessionError::Thread`] if a thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { cache, episodes, backend, step_timeout } = settings;
+        let EngineSettings { cache, episodes, scenarios, backend, step_timeout } = settings;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),
             cache,
             episodes,
+            scenarios,
             step_timeout,
             queue: RenderQueue::start(backend)?,
+            session_numbers: AtomicU64::new(PUSHES + 1),
             answer_budget: AnswerBudget::default(),
             pins: Mutex::default(),
         }))
     }
 
-    /// The version of every twin that `latest` stands for, in order of the twins' names. A damaged twin
-    /// is logged and left out, so that it does not hide the others.
+    /// The version of every twin that `latest` stands for, and the damaged twins, which are also logged.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
-    pub async fn twins(self: &Arc<Self>) -> Result<Vec<Arc<TwinSummary>>, SessionError> {
+    pub async fn twins(self: &Arc<Self>) -> Result<TwinSummaries, SessionError> {
         let engine = self.clone();
         let pinned = move |twin: &str| engine.pinned_latest(twin);
         let summaries = self.summaries.clone();
         Ok(run_blocking(move || summaries.read(&pinned)).await??)
+    }
+
+    /// The scenarios that can be opened by name.
+    pub fn scenarios(&self) -> &Scenarios {
+        &self.scenarios
     }
 
     /// Checks that twins can be listed.
@@ -169,6 +184,18 @@ impl Engine {
         Ok(())
     }
 
+    /// Checks that the backend can draw as a profile asks.
+    ///
+    /// # Errors
+    /// [`RenderError::ExactRays`].
+    pub(crate) fn check_profile(&self, profile: &RenderProfile) -> Result<(), SessionError> {
+        let backend = self.queue.backend();
+        if profile.rays == Rays::Exact && !backend.draws_exact_rays() {
+            return Err(RenderError::ExactRays { backend: backend.name() }.into());
+        }
+        Ok(())
+    }
+
     /// Name of the backend.
     pub fn backend(&self) -> &'static str {
         self.queue.backend().name()
@@ -239,18 +266,25 @@ impl Engine {
         run_blocking(move || resident.worst_case_bytes_with(extent, &profile)).await
     }
 
-    /// Runs `work` on a render thread in its turn. Returns its result and how long it was queued.
+    /// Runs `work` on a render thread in its session's turn. Returns its result and how long it was queued.
     ///
     /// # Errors
-    /// [`SessionError::Busy`] if the queue is full, [`SessionError::Crashed`] if `work` panicked, and
-    /// [`SessionError::DeadlineExceeded`] if there is no result by the deadline. Work that has not
+    /// [`SessionError::Busy`] if the queue is full, or the frames before it leave it no time;
+    /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
+    /// result by the deadline. Work that has not
     /// started by then never starts; work that has is finished, and its result is discarded.
     pub async fn run<T: Send + 'static>(
         &self,
+        cost: FrameCost,
         deadline: Instant,
         work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
     ) -> Result<(T, Duration), SessionError> {
-        self.queue.run(deadline, work).await
+        self.queue.run(cost, deadline, work).await
+    }
+
+    /// A number for a session, which no other one has: its frames share one turn.
+    pub(crate) fn new_session_number(&self) -> u64 {
+        self.session_numbers.fetch_add(1, Ordering::Relaxed)
     }
 
     /// How long one step may take, time in queues included.

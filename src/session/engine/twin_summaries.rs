@@ -6,7 +6,7 @@ use std::sync::Arc;
 use parking_lot::Mutex;
 
 use wildcity_scene::Trajectory;
-use wildcity_twin::store::{Catalog, StoreError, Version};
+use wildcity_twin::store::{Catalog, StoreError, TwinList, Version};
 
 /// The latest version of a twin, summarized.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,6 +23,24 @@ pub struct TwinSummary {
     pub sh_degree: u8,
     /// Its recorded trajectories.
     pub trajectories: Vec<TrajectorySummary>,
+}
+
+/// The twins of a catalog, summarized.
+#[derive(Clone, Debug, Default)]
+pub struct TwinSummaries {
+    /// Those that can be opened, in order of name.
+    pub twins: Vec<Arc<TwinSummary>>,
+    /// Those whose latest version is damaged, in order of name.
+    pub damaged: Vec<DamagedSummary>,
+}
+
+/// A twin that cannot be opened.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DamagedSummary {
+    /// Name of the twin.
+    pub name: String,
+    /// What is wrong.
+    pub reason: String,
 }
 
 /// A recorded trajectory, summarized.
@@ -49,16 +67,18 @@ impl SummaryCache {
         Self { catalog, known: Mutex::default() }
     }
 
-    /// The latest version of every twin in order of name, or the version that `pinned` returns for a twin.
-    /// A damaged twin is logged and left out, so that it does not hide the others.
+    /// The latest version of every twin, or the version that `pinned` returns for a twin; and the damaged
+    /// twins, which do not hide the others.
     ///
     /// # Errors
     /// The directory of twins cannot be read.
     pub(crate) fn read(
         &self,
         pinned: &dyn Fn(&str) -> Option<u64>,
-    ) -> Result<Vec<Arc<TwinSummary>>, StoreError> {
-        let listed = self.catalog.twins()?;
+    ) -> Result<TwinSummaries, StoreError> {
+        let TwinList { twins: listed, damaged } = self.catalog.twins()?;
+        let mut damaged: Vec<DamagedSummary> =
+            damaged.into_iter().map(|twin| DamagedSummary::of(twin.name, &twin.error)).collect();
         // The lock is held while manifests are read, so that simultaneous requests read each one once.
         let mut known = self.known.lock();
         let mut fresh = BTreeMap::new();
@@ -76,7 +96,7 @@ impl SummaryCache {
                 None => match self.catalog.version(&listing.name, Some(number)) {
                     Ok(version) => Arc::new(TwinSummary::of(version)),
                     Err(error) => {
-                        tracing::warn!(twin = listing.name, "not listed: {error}");
+                        damaged.push(DamagedSummary::of(listing.name, &error));
                         continue;
                     }
                 },
@@ -84,7 +104,11 @@ impl SummaryCache {
             fresh.insert(listing.name, summary);
         }
         *known = fresh;
-        Ok(known.values().cloned().collect())
+        damaged.sort_by(|a, b| a.name.cmp(&b.name));
+        for DamagedSummary { name, reason } in &damaged {
+            tracing::warn!(twin = name, "damaged: {reason}");
+        }
+        Ok(TwinSummaries { twins: known.values().cloned().collect(), damaged })
     }
 
     /// Checks that the directory of twins can be read.
@@ -93,6 +117,12 @@ impl SummaryCache {
     /// It cannot.
     pub(crate) fn check(&self) -> Result<(), StoreError> {
         self.catalog.twins().map(|_| ())
+    }
+}
+
+impl DamagedSummary {
+    fn of(name: String, error: &StoreError) -> Self {
+        Self { name, reason: error.to_string() }
     }
 }
 

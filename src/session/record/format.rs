@@ -11,15 +11,18 @@
 //! A scenario adds the lines of [`wildcity_episode`]: `scenario`, `actors`, `event` and `result`.
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{RenderProfile, Rig};
+use wildcity_scene::rig::is_name;
+use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
 use wildcity_sim::ego::{Action, TimedPose};
-use wildcity_sim::{Command, Dynamics};
+use wildcity_sim::{Command, Dynamics, Ego};
 
-use crate::episode::EpisodeSummary;
+use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
+use crate::observe::schedule::Schedule;
 
 /// This build, as it is named in records.
 pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
@@ -62,6 +65,42 @@ pub struct EpisodeHeader {
     pub start: Pose,
     /// Simulated time of a step, in microseconds.
     pub dt_us: i64,
+    /// The session's other settings; absent if all are the defaults.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub settings: Option<RecordedSettings>,
+    /// The state at the beginning of the file, if that is more than a start: after a warm-up, or of a branch.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub state: Option<Episode>,
+    /// The recorded episode that this one is a branch of.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub origin: Option<RecordedOrigin>,
+    /// BLAKE3 of the resolved scenario, in hex; absent without a scenario.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<String>,
+}
+
+/// Settings of a session that images do not depend on, but bundles, later versions and later episodes do.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedSettings {
+    /// Fields that override the profile of each version.
+    pub profile_overrides: ProfileOverrides,
+    /// When the cameras take frames, and when the agent decides.
+    pub(crate) schedule: Schedule,
+    /// Whether images had a trust.
+    pub trust: bool,
+    /// Length of the warm-up, in microseconds.
+    pub warm_up_us: i64,
+}
+
+/// Where a branch begins.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedOrigin {
+    /// Name of the episode's file, without its ending.
+    pub episode: String,
+    /// Steps done there.
+    pub step: u64,
 }
 
 /// What the observations held.
@@ -97,6 +136,16 @@ pub struct FrameRecord {
     /// The command that moved the ego, unless it was the pose itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub command: Option<RecordedCommand>,
+    /// Steps that the command moved the ego by, for which it was a plan.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub steps: u64,
+    /// When the frames at the poses were taken, in microseconds; only for a plan. Otherwise the last one is at
+    /// `time_us`, and those before it are in the warm-up.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub times_us: Vec<i64>,
+    /// What the agent noted, as it was sent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub notes: Option<Value>,
     /// Whether the agent ended the episode with this step.
     pub terminated: bool,
     /// BLAKE3 of the shown images' hashes, in hex.
@@ -139,6 +188,8 @@ pub enum FrameRequest {
     Reset,
     /// A step.
     Step,
+    /// A snapshot was restored.
+    Restore,
     /// Poses to render from without moving the ego.
     Observe,
 }
@@ -165,12 +216,47 @@ pub(crate) enum Line {
     End(EpisodeSummary),
 }
 
+impl RecordedSettings {
+    /// The settings of a session that requests none.
+    pub(crate) fn default_of(cameras: usize, dt_us: i64) -> Self {
+        Self {
+            profile_overrides: ProfileOverrides::default(),
+            schedule: Schedule::every_step(cameras, dt_us),
+            trust: false,
+            warm_up_us: 0,
+        }
+    }
+}
+
 impl EpisodeHeader {
     /// The version of the format that this build writes and reads.
     pub const FORMAT: u32 = 0;
+
+    /// The state at the beginning of the file.
+    pub(crate) fn first_state(&self) -> Episode {
+        match &self.state {
+            Some(state) => state.clone(),
+            None => Episode::new(self.seed, Ego::new(self.dynamics, self.start), self.dt_us),
+        }
+    }
+}
+
+fn one() -> u64 {
+    1
+}
+
+fn is_one(steps: &u64) -> bool {
+    *steps == 1
 }
 
 impl FrameRecord {
+    /// When the frames at a pose were taken, in microseconds; those of a warm-up are at any time below 0.
+    pub(crate) fn taken_us(&self, pose: usize) -> i64 {
+        let is_now = self.request == FrameRequest::Observe || pose + 1 == self.poses.len();
+        let otherwise = if is_now { self.time_us } else { -1 };
+        self.times_us.get(pose).copied().unwrap_or(otherwise)
+    }
+
     /// The rendered cameras of a pose, by their index, of a rig with `rig_cameras`.
     pub(crate) fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
         self.cameras.get(pose).cloned().unwrap_or_else(|| (0..rig_cameras).collect())
@@ -186,6 +272,14 @@ impl RecordedCommand {
             Command::Action(action) => Some(Self::Action(*action)),
         }
     }
+}
+
+/// Whether a text names an episode: the name of a session, a hyphen and a number. Such a name is safe as a file
+/// name and cannot be a path.
+pub fn is_episode_name(text: &str) -> bool {
+    let is_number =
+        |text: &str| (1..=20).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());
+    text.rsplit_once('-').is_some_and(|(session, number)| is_name(session) && is_number(number))
 }
 
 /// BLAKE3 of a profile's JSON.

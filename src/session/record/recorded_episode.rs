@@ -10,7 +10,7 @@ use wildcity_scene::appearance::Overlay;
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
 use super::replay_report::ReplayError;
 use crate::episode::EpisodeSummary;
-use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES};
+use crate::limits::{EPISODE_HEAD_BYTES, EPISODE_LINE_BYTES, PLAN_STEPS};
 
 // The first line has room for the largest overlays: 4 bytes a pixel, in base64 (4/3), and a thousandth that
 // PNG may add. The rest of a rig and a profile are below 1 MiB.
@@ -34,7 +34,7 @@ pub struct RecordedEpisode {
     pub frame_lines: Vec<usize>,
     /// Line of the file, from 1, at which the end is; 0 without one.
     pub end_line: usize,
-    /// How it went; absent if the server was killed or is still running.
+    /// How it went; absent if the server was killed or is still running. A last line without an end is left out.
     pub end: Option<EpisodeSummary>,
 }
 
@@ -68,6 +68,8 @@ impl RecordedEpisode {
                 Some(_) if text.len() == limit => {
                     return Err(wrong(format!("longer than {limit} bytes")));
                 }
+                // The recorder was interrupted: the line is of an answer that was never sent.
+                Some(_) if header.is_some() => break,
                 Some(_) => return Err(wrong("incomplete: it has no line break".to_owned())),
             }
 
@@ -84,6 +86,9 @@ impl RecordedEpisode {
                         return Err(wrong(format!("format {format}; this build reads {known}")));
                     }
                     first.rig.check()?;
+                    if let Some(state) = &first.state {
+                        state.check().map_err(|reason| wrong(reason.to_owned()))?;
+                    }
                     header = Some(*first);
                 }
                 Line::Frame(frame) if number > 1 => {
@@ -116,6 +121,12 @@ impl RecordedEpisode {
 /// Checks that the cameras and images of a frame match its poses. Returns what is wrong otherwise.
 fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     let poses = frame.poses.len();
+    if !(1..=PLAN_STEPS as u64).contains(&frame.steps) {
+        return Err(format!("a plan of {} steps; 1 to {PLAN_STEPS} are accepted", frame.steps));
+    }
+    if !frame.times_us.is_empty() && frame.times_us.len() != poses {
+        return Err(format!("times of {} poses, but {poses} poses", frame.times_us.len()));
+    }
     if !frame.cameras.is_empty() && frame.cameras.len() != poses {
         return Err(format!("cameras for {} poses, but {poses} poses", frame.cameras.len()));
     }

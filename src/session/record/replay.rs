@@ -9,7 +9,7 @@ use wildcity_sim::Ground;
 use wildcity_twin::residency::{ResidencyError, Resident};
 
 use super::ego_replay::EgoReplay;
-use super::format::{BUILD, FrameRecord, FrameRequest, RecordedVersion, profile_hash};
+use super::format::{BUILD, FrameRecord, RecordedVersion, profile_hash};
 use super::recorded_episode::RecordedEpisode;
 use super::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
@@ -202,10 +202,8 @@ impl<'a> Replay<'a> {
         selected: &[usize],
     ) -> Result<(), ReplayError> {
         let step = frame.step;
-        // The poses before the last one of a reset or a step are in the warm-up, where the rig stands
-        // during the exposure.
-        let in_motion = frame.request == FrameRequest::Observe || pose + 1 == frame.poses.len();
-        let views = self.ego.episode().views(self.cameras, selected, frame.poses[pose], in_motion);
+        let taken_us = frame.taken_us(pose);
+        let views = self.ego.episode().views(self.cameras, selected, frame.poses[pose], taken_us);
         let scene = self
             .resident
             .scene(&viewpoints(&views), self.profile)

@@ -29,7 +29,7 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
     };
     let shown = match frame.request {
         FrameRequest::Observe => hash_of(&frame.images),
-        FrameRequest::Reset | FrameRequest::Step => {
+        FrameRequest::Reset | FrameRequest::Step | FrameRequest::Restore => {
             // Those of the last pose; the others are earlier frames of a bundle.
             let poses = frame.poses.len();
             let last = poses.checked_sub(1).map_or(0, |k| frame.cameras_of(k, rig_cameras).len());

@@ -3,6 +3,7 @@
 //! Each request first renders, then records, and only then changes the session. If it fails or its future
 //! is dropped before that, nothing has happened, and the client can repeat it.
 
+use serde_json::Value;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
 
@@ -12,8 +13,9 @@ use wildcity_sim::{Command, Ground};
 use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
+use super::recording::scenario_hash;
 use crate::blocking::run_blocking;
-use crate::engine::render_queue::Scratch;
+use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
 use crate::error::SessionError;
 use crate::limits;
@@ -22,9 +24,12 @@ use crate::observe::builder::finish::RenderedObservation;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
-use crate::options::Start;
-use crate::record::format::{FrameRequest, Line, RecordedCommand};
+use crate::options::{ResetOptions, Start, StepOptions};
+use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
+use crate::record::recorder::NewFile;
+use crate::scenario::EpisodeTraffic;
 use crate::start::EpisodeStart;
+use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
 
 impl Session {
@@ -38,22 +43,74 @@ impl Session {
         command: impl Into<Command>,
         terminate: bool,
     ) -> Result<Observation, SessionError> {
-        let command = command.into();
-        let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
-        let mut next = self.episode.stepped(&command, &ground, terminate)?;
+        self.follow(command.into(), StepOptions { terminate, ..StepOptions::default() }).await
+    }
 
-        let captures = self.layout.captures(&next, &self.frame_history);
-        let rendered = self.render(&next, captures, Some(self.frame_history.clone())).await?;
+    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of then, and
+    /// those since its start that the observation shows.
+    ///
+    /// # Errors
+    /// As [`Session::step`], and if the notes or the number of steps are out of range.
+    pub async fn follow(
+        &mut self,
+        command: Command,
+        options: StepOptions,
+    ) -> Result<Observation, SessionError> {
+        let steps = self.plan_steps(&command, options.until_us)?;
+        check_notes(options.notes.as_ref())?;
+        let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
+        let now = &self.state.episode;
+        let mut next = now.followed(&command, steps, &ground, options.terminate)?;
+        let traffic = match &self.state.traffic {
+            None => None,
+            Some(traffic) => {
+                let dt_us = self.settings.dt_us;
+                let egos = now.ego().followed(&command, dt_us, steps, &ground)?;
+                Some(traffic.followed(now.ego(), &egos, dt_us))
+            }
+        };
+        if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
+            next.end(reason);
+        }
+
+        let frame_history = self.state.frame_history.clone();
+        let captures = self.settings.layout.captures(&next, &frame_history);
+        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = RecordedCommand::of(&command);
+        record.notes = options.notes;
+        if steps > 1 {
+            record.steps = steps as u64;
+            record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
+        }
         self.record(record).await?;
 
         next.add_trusts(rendered.trusts());
-        self.episode = next;
-        self.frame_history = rendered.frame_history;
+        let frame_history = rendered.frame_history;
+        self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
         Ok(rendered.observation)
+    }
+
+    /// Number of steps of a plan that is followed for `until_us`.
+    fn plan_steps(&self, command: &Command, until_us: Option<i64>) -> Result<usize, SessionError> {
+        let dt_us = self.settings.dt_us;
+        let Some(until_us) = until_us else { return Ok(1) };
+        let refused = |must: String| SessionError::OutOfRange { field: "until_us", must };
+        let most_us =
+            dt_us.saturating_mul(limits::PLAN_STEPS as i64).min(limits::PLAN_US.max(dt_us));
+        if !(dt_us..=most_us).contains(&until_us) || until_us % dt_us != 0 {
+            return Err(refused(format!(
+                "{until_us} µs; whole steps of {dt_us} µs up to {most_us} µs are accepted"
+            )));
+        }
+        if matches!(command, Command::Pose(_)) && until_us > dt_us {
+            let must =
+                "several steps, and a pose is reached with one: send a trajectory or an action";
+            return Err(refused(format!("{until_us} µs, {must}")));
+        }
+        Ok((until_us / dt_us) as usize)
     }
 
     /// Renders from 1 to [`limits::OBSERVE_POSES`] poses (`world_from_rig`) without moving the ego.
@@ -65,9 +122,9 @@ impl Session {
             let must = format!("{}; 1 to {} are accepted", poses.len(), limits::OBSERVE_POSES);
             return Err(SessionError::OutOfRange { field: "poses", must });
         }
-        let episode = self.episode.clone();
-        let captures = self.layout.captures_at(&episode, poses);
-        let rendered = self.render(&episode, captures, None).await?;
+        let episode = self.state.episode.clone();
+        let captures = self.settings.layout.captures_at(&episode, poses);
+        let rendered = self.render(&self.version, &episode, captures, None).await?;
         self.record(self.frame_record(FrameRequest::Observe, &episode, &rendered)).await?;
         Ok(rendered.observation)
     }
@@ -81,56 +138,97 @@ impl Session {
         seed: u64,
         start: Option<Start>,
     ) -> Result<Observation, SessionError> {
-        let start = match &start {
-            Some(_) => EpisodeStart::resolve(
-                &self.resident().version.manifest,
-                start.as_ref(),
-                self.warm_up_us,
-                self.dynamics,
-            )
-            .map_err(|error| error.of_reset(start.as_ref()))?,
-            None => self.start.clone(),
-        };
-        let mut next = start.episode(seed, self.dynamics, self.dt_us);
+        self.reset_with(ResetOptions { seed, start, ..ResetOptions::default() }).await
+    }
 
-        let captures = self.layout.captures(&next, &FrameHistory::default());
-        let rendered = self.render(&next, captures, Some(FrameHistory::default())).await?;
+    /// As [`Session::reset`], with dynamics for this episode alone.
+    ///
+    /// # Errors
+    /// As [`Session::reset`], and if the speed is out of range.
+    pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, SessionError> {
+        let settings = &self.settings;
+        let ResetOptions { seed, start, dynamics, speed_m_s } = options;
+        let mut dynamics = dynamics.unwrap_or(settings.dynamics);
+        if let Some(speed_m_s) = speed_m_s {
+            dynamics = dynamics.with_speed("speed", speed_m_s)?;
+        }
+        // With a scenario, the seed decides jitter, and perhaps the start.
+        let loaded = match &settings.scenario {
+            None => None,
+            Some(scenario) => {
+                let scenario = scenario.clone();
+                let version = self.resident().version.clone();
+                Some(run_blocking(move || scenario.of_episode(seed, &version)).await??)
+            }
+        };
+        let start = start
+            .or_else(|| settings.random_start.clone().map(Start::Random))
+            .or_else(|| settings.scenario.as_ref()?.start_of(loaded.as_ref()?));
+        let start = match &start {
+            // Dynamics decide whether a start is placed on the ground.
+            None if dynamics.model == settings.dynamics.model => settings.start.clone(),
+            None => settings.start.placed(&self.resident().version.manifest, dynamics),
+            Some(start) => EpisodeStart::resolve(
+                &self.resident().version.manifest,
+                Some(start),
+                settings.warm_up_us,
+                dynamics,
+                seed,
+            )
+            .map_err(|error| error.of_reset(Some(start)))?,
+        };
+        let mut next = start.episode(seed, dynamics, settings.dt_us);
+        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, next.ego()));
+
+        let frame_history = FrameHistory::default();
+        let captures = self.settings.layout.captures(&next, &frame_history);
+        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let file = self.create_file(&next, Line::Frame(record)).await?;
+        let scenario = scenario_hash(traffic.as_ref());
+        let line = Line::Frame(record);
+        let file = self.create_file(&self.version, None, scenario, &next, line).await?;
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());
+        self.begin(file, None);
+        let frame_history = rendered.frame_history;
+        self.state = EpisodeState { episode: next, frame_history, traffic };
+        self.look_ahead();
+        Ok(rendered.observation)
+    }
+
+    /// Goes over to another episode, which has its own file. The caller sets its state.
+    pub(super) fn begin(&mut self, file: NewFile, origin: Option<RecordedOrigin>) {
         self.recorder = Some(file.recorder);
         self.episode_number = file.number;
         self.version_switched = false;
-        self.episode = next;
-        self.frame_history = rendered.frame_history;
+        self.origin = origin;
         self.hint.clear();
-        self.look_ahead();
-        Ok(rendered.observation)
     }
 
     /// Ends the session and summarizes its last episode.
     pub async fn close(mut self, outcome: Outcome) -> EpisodeSummary {
         self.end_recording(outcome).await;
-        self.episode.summary(outcome)
+        self.state.episode.summary(outcome)
     }
 
-    /// Renders captures one after the other, each in its turn among the other sessions' frames.
+    /// Renders captures of a version one after the other, each in its turn among the other sessions' frames.
     ///
     /// With a history, the observation also shows its earlier frames; without one (`observe`), it does not.
-    async fn render(
+    pub(super) async fn render(
         &self,
+        version: &PinnedVersion,
         episode: &Episode,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
     ) -> Result<RenderedObservation, SessionError> {
-        let deadline = Instant::now() + self.deadline;
+        let layout = &self.settings.layout;
+        let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(
-            self.layout.clone(),
+            layout.clone(),
             self.engine.answer_budget(),
-            self.coverage.clone(),
+            version.coverage.clone(),
             episode,
             &captures,
         )?;
@@ -139,47 +237,58 @@ impl Session {
                 builder.add_capture(capture);
                 continue;
             }
-            let views = self.layout.views(episode, &capture);
+            let views = layout.views(episode, &capture);
             // Load before the job is queued, so that no render thread waits for a disk.
-            let pinned = self.pin(deadline, viewpoints(&views)).await?;
+            let pinned = pin(version, deadline, viewpoints(&views)).await?;
             builder.add_load(pinned.waited_for, pinned.waited);
-            let profile = self.profile;
+            let profile = version.profile;
+            let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
+            let cost = FrameCost { session: self.number, pixels };
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
                 let frame = Frame { scene: &pinned, profile: &profile, views: &views };
                 let rendered = builder.render(&capture, &frame, backend, scratch);
                 builder.add_capture(capture);
                 rendered.map(|()| builder)
             };
-            let (rendered, queued) = self.engine.run(deadline, work).await?;
+            let (rendered, queued) = self.engine.run(cost, deadline, work).await?;
             builder = rendered?;
             builder.add_queue_time(queued);
         }
-        let (held_bytes, limit_bytes) = self.resident().memory();
+        let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
     }
+}
 
-    /// Waits until all sections that a frame needs are in memory, and pins them.
-    async fn pin(
-        &self,
-        deadline: Instant,
-        viewpoints: Vec<Viewpoint>,
-    ) -> Result<PinnedScene, SessionError> {
-        let (reply, answer) = oneshot::channel();
-        let resident = self.resident().clone();
-        let profile = self.profile;
-        let request = run_blocking(move || {
-            let done = Box::new(move |pinned| {
-                // Sending fails if the deadline has passed and the receiver is gone.
-                let _ = reply.send(pinned);
-            });
-            resident.request(&viewpoints, &profile, done)
+fn check_notes(notes: Option<&Value>) -> Result<(), SessionError> {
+    let bytes = notes.map_or(0, |notes| notes.to_string().len());
+    if bytes > limits::NOTES_BYTES {
+        let must = format!("{bytes} bytes of JSON; at most {} are accepted", limits::NOTES_BYTES);
+        return Err(SessionError::OutOfRange { field: "notes", must });
+    }
+    Ok(())
+}
+
+/// Waits until all sections that a frame needs are in memory, and pins them.
+async fn pin(
+    version: &PinnedVersion,
+    deadline: Instant,
+    viewpoints: Vec<Viewpoint>,
+) -> Result<PinnedScene, SessionError> {
+    let (reply, answer) = oneshot::channel();
+    let resident = version.resident.clone();
+    let profile = version.profile;
+    let request = run_blocking(move || {
+        let done = Box::new(move |pinned| {
+            // Sending fails if the deadline has passed and the receiver is gone.
+            let _ = reply.send(pinned);
         });
-        // Dropping the request takes the frame out of the pager's queue.
-        let request = request.await??;
-        match timeout_at(deadline, answer).await {
-            Ok(Ok(pinned)) => Ok(pinned?),
-            Ok(Err(_)) => Err(SessionError::Crashed),
-            Err(_) => Err(request.timeout_error().into()),
-        }
+        resident.request(&viewpoints, &profile, done)
+    });
+    // Dropping the request takes the frame out of the pager's queue.
+    let request = request.await??;
+    match timeout_at(deadline, answer).await {
+        Ok(Ok(pinned)) => Ok(pinned?),
+        Ok(Err(_)) => Err(SessionError::Crashed),
+        Err(_) => Err(request.timeout_error().into()),
     }
 }

@@ -41,6 +41,8 @@ use wildcity_scene::geometry::Pose;
 
 use super::Ground;
 
+use path::ReferenceTrajectory;
+
 pub use path::{Path, TimedPose};
 pub use single_track::{Setpoint, SingleTrackState};
 pub use vehicle::Vehicle;
@@ -100,7 +102,8 @@ pub struct Action {
 }
 
 /// The state of an ego between two steps.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Ego {
     dynamics: Dynamics,
     world_from_rig: Pose,
@@ -210,6 +213,20 @@ impl Dynamics {
         Ok(dynamics)
     }
 
+    /// The same dynamics with another speed at the start, from the field `field` of a request.
+    ///
+    /// # Errors
+    /// As [`Dynamics::checked`].
+    pub fn with_speed(self, field: &'static str, speed_m_s: f64) -> Result<Self, EgoError> {
+        let refused = |error| match error {
+            EgoError::Range { value, least, most, .. } => {
+                EgoError::Range { field, value, least, most }
+            }
+            other => other,
+        };
+        Self::checked(self.model, speed_m_s, self.reverse).map_err(refused)
+    }
+
     /// The first pose of an episode that is requested to start at `world_from_rig`: the same pose, placed on
     /// the ground unless the model is a teleport.
     pub fn start_pose(&self, world_from_rig: Pose, ground: &Ground<'_>) -> Pose {
@@ -288,7 +305,8 @@ impl Ego {
                 Ok(self.driven(self.advanced(&self.car, *action, step_s), step_s, ground))
             }
             (_, Command::Path(path)) => {
-                Ok(self.driven(self.tracked(path, step_us), step_s, ground))
+                let car = self.tracked(&path.reference(), self.car, 0, step_us);
+                Ok(self.driven(car, step_s, ground))
             }
             (model, Command::Action(_)) => {
                 let (given, takes) = ("action", "pose or trajectory");
@@ -299,6 +317,54 @@ impl Ego {
                 Err(EgoError::Command { model: model.name(), given, takes })
             }
         }
+    }
+
+    /// The egos after each of `steps` steps along a plan, a trajectory or an action that holds for all of them. A
+    /// plan of one step is [`Ego::stepped`].
+    ///
+    /// # Errors
+    /// As [`Ego::stepped`]; the path must reach to the end of the last step.
+    pub fn followed(
+        &self,
+        command: &Command,
+        step_us: i64,
+        steps: usize,
+        ground: &Ground<'_>,
+    ) -> Result<Vec<Self>, EgoError> {
+        let mut egos = vec![self.stepped(command, step_us, ground)?];
+        let Command::Path(path) = command else {
+            for index in 1..steps {
+                egos.push(egos[index - 1].stepped(command, step_us, ground)?);
+            }
+            return Ok(egos);
+        };
+        let end_us = step_us * steps as i64;
+        if path.end_us() < end_us {
+            return Err(EgoError::PathShort { end_us: path.end_us(), step_us: end_us });
+        }
+        let step_s = step_us as f64 * 1e-6;
+        let reference = path.reference();
+        for index in 1..steps {
+            let before = &egos[index - 1];
+            let from_us = step_us * index as i64;
+            egos.push(match self.dynamics.model {
+                EgoModel::Teleport => {
+                    before.moved_to(self.world_from_rig * path.at(from_us + step_us), step_s)
+                }
+                EgoModel::Kinematic | EgoModel::Dynamic => {
+                    let start_from_rig = self.world_from_rig.inverse() * before.world_from_rig;
+                    let forward = start_from_rig.rotation * DVec3::X;
+                    let car = SingleTrackState {
+                        position_m: start_from_rig.position_m.truncate(),
+                        yaw_rad: forward.y.atan2(forward.x),
+                        ..before.car
+                    };
+                    let after = before.tracked(&reference, car, from_us, step_us);
+                    before.driven(after.relative_to(&car), step_s, ground)
+                }
+            });
+        }
+        Ok(egos)
     }
 
     /// The dynamics that it was created with.
@@ -392,17 +458,25 @@ impl Ego {
         car.after(&vehicle, setpoint, step_s, bounds_m_s)
     }
 
-    /// The car after a step along a path: the tracker computes a new action for each tick.
-    fn tracked(&self, path: &Path, step_us: i64) -> SingleTrackState {
-        let reference = path.reference();
+    /// The car after a step along a reference: the tracker computes a new action for each tick. The step begins at
+    /// the time `from_us` of the reference, and `car` is in its frame.
+    fn tracked(
+        &self,
+        reference: &ReferenceTrajectory,
+        car: SingleTrackState,
+        from_us: i64,
+        step_us: i64,
+    ) -> SingleTrackState {
+        let from_s = from_us as f64 * 1e-6;
         let lag_s = match self.dynamics.model {
             EgoModel::Dynamic => Vehicle::DEFAULT.lag_s,
             EgoModel::Teleport | EgoModel::Kinematic => 0.0,
         };
         let ticks = (step_us as u64).div_ceil(limits::TRACKER_TICK_US);
         let tick_s = step_us as f64 * 1e-6 / ticks as f64;
-        (0..ticks).fold(self.car, |car, tick| {
-            let action = tracker::track(&reference, tick as f64 * tick_s, lag_s, &car);
+        (0..ticks).fold(car, |car, tick| {
+            let time_s = from_s + tick as f64 * tick_s;
+            let action = tracker::track(reference, time_s, lag_s, &car);
             self.advanced(&car, action, tick_s)
         })
     }

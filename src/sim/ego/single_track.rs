@@ -1,6 +1,7 @@
 //! One step of the linear single-track model: speed, steering, lateral velocity, yaw rate, and the pose.
 
 use glam::DVec2;
+use serde::{Deserialize, Serialize};
 
 use super::collocation::{INTEGRALS, NODES, POINTS, solve};
 use super::constant_speed::{ConstantSpeed, Steering};
@@ -8,7 +9,8 @@ use super::speed::{Drive, Phase};
 use super::vehicle::{LateralDynamics, Vehicle};
 
 /// The state of a car in the plane.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SingleTrackState {
     /// Position of the middle of the rear axle, in metres.
     pub position_m: DVec2,
@@ -49,6 +51,17 @@ const MAX_INTERVAL_LAGS: f64 = 0.25;
 const MIN_INTERVAL_SPEED_M_S: f64 = 1e-3;
 
 impl SingleTrackState {
+    /// The same state in the frame of the place of another one.
+    #[must_use]
+    pub(super) fn relative_to(&self, other: &Self) -> Self {
+        Self {
+            position_m: DVec2::from_angle(-other.yaw_rad)
+                .rotate(self.position_m - other.position_m),
+            yaw_rad: self.yaw_rad - other.yaw_rad,
+            ..*self
+        }
+    }
+
     /// The state after a step of `step_s` seconds. The speed stays within `bounds_m_s` (smallest and largest,
     /// in m/s), which must contain 0.
     ///

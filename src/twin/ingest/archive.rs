@@ -13,9 +13,9 @@ use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 
-/// Reads the scene of an archive, found by the first file in it of a known name.
-pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
-    let mut archive = Archive::open(bytes)?;
+/// Reads the scene of an archive within a budget of nothing read, found by the first file in it of a known name.
+pub(super) fn read(bytes: Vec<u8>, budget: UnpackBudget) -> Result<Gaussians, IngestError> {
+    let mut archive = Archive::open(bytes, budget)?;
     if let Some(name) = archive.find(|name| name.ends_with(".nurec")) {
         let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
         return nurec::read(&payload, archive.budget());
@@ -36,8 +36,11 @@ pub(super) fn read(bytes: Vec<u8>) -> Result<Gaussians, IngestError> {
 }
 
 /// Reads the tracked objects of a NuRec archive; none of another one.
-pub(super) fn read_tracked(bytes: Vec<u8>) -> Result<Vec<TrackedObject>, IngestError> {
-    let mut archive = Archive::open(bytes)?;
+pub(super) fn read_tracked(
+    bytes: Vec<u8>,
+    budget: UnpackBudget,
+) -> Result<Vec<TrackedObject>, IngestError> {
+    let mut archive = Archive::open(bytes, budget)?;
     let Some(name) = archive.find(|name| name.ends_with(".nurec")) else { return Ok(Vec::new()) };
     let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
     nurec::read_tracked(&payload, archive.budget())
@@ -50,9 +53,9 @@ struct Archive {
 }
 
 impl Archive {
-    fn open(bytes: Vec<u8>) -> Result<Self, IngestError> {
-        let mut budget = UnpackBudget::default();
+    fn open(bytes: Vec<u8>, mut budget: UnpackBudget) -> Result<Self, IngestError> {
         budget.read(bytes.len() as u64);
+        check_end(&bytes)?;
         let zip =
             ZipArchive::new(Cursor::new(bytes)).map_err(|e| error("directory", damaged(&e)))?;
         Ok(Self { zip, budget })
@@ -89,6 +92,25 @@ impl SceneFiles for Archive {
 
     fn budget(&mut self) -> &mut UnpackBudget {
         &mut self.budget
+    }
+}
+
+/// Checks that nothing follows the archive: its last record, with a comment of the length that it says, ends the file.
+fn check_end(bytes: &[u8]) -> Result<(), IngestError> {
+    const RECORD_BYTES: usize = 22;
+    let is_record_at = |at: usize| {
+        let record = &bytes[at..];
+        let comment = usize::from(u16::from_le_bytes([record[20], record[21]]));
+        record.starts_with(b"PK\x05\x06") && record.len() == RECORD_BYTES + comment
+    };
+    let last = bytes.len().saturating_sub(RECORD_BYTES);
+    let first = last.saturating_sub(usize::from(u16::MAX));
+    match bytes.len() >= RECORD_BYTES && (first..=last).rev().any(is_record_at) {
+        true => Ok(()),
+        false => {
+            let reason = "is not at the end of the file: the file is truncated, or something follows the archive";
+            Err(error("the end of the directory", reason.into()))
+        }
     }
 }
 

@@ -85,6 +85,17 @@ pub enum IngestError {
         /// Bytes that they would unpack to.
         unpacked: u128,
     },
+    /// The content needs more memory than the reader may use.
+    #[error("unpacking it takes {needed} bytes of memory; {limit} may be used: split the scene")]
+    TooMuchMemory {
+        /// Bytes that it needs, as far as known.
+        needed: u128,
+        /// Bytes that may be used.
+        limit: u64,
+    },
+    /// Reading was to stop.
+    #[error("reading was stopped")]
+    Stopped,
     /// More Gaussians than a twin can hold.
     #[error(
         "{count} Gaussians; at most {} fit one import: split the scene",

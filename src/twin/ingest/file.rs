@@ -19,6 +19,14 @@ pub enum FileError {
     /// Another file names it, and it is not within that file's folder.
     #[error("is not a plain path below the folder of the file that names it; move it there")]
     OutsideFolder,
+    /// A scene of a push names it, and the push has none or several files of this name.
+    #[error(
+        "is not the name of exactly one file of this push; push it together with the file that names it"
+    )]
+    NotListed,
+    /// The scene names it again.
+    #[error("is named more than once; each file of a scene is read once")]
+    Repeated,
     /// The scene has more files than are read.
     #[error("the scene has more than {limit} files; split it")]
     TooMany {
@@ -54,13 +62,21 @@ pub(super) fn open(path: &Path) -> Result<(File, u64), FileError> {
 /// # Errors
 /// It cannot be read, is not a regular file, or is larger.
 pub fn read_whole(path: &Path, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
-    let (file, _) = open(path)?;
-    read_at_most(file, limit_bytes)
+    let (file, file_bytes) = open(path)?;
+    read_at_most(file, file_bytes, limit_bytes)
 }
 
-/// Reads to the end, which must come within `limit_bytes`.
-pub(super) fn read_at_most(input: impl Read, limit_bytes: u64) -> Result<Vec<u8>, FileError> {
-    let mut bytes = Vec::new();
+/// Reads to the end, which must come within `limit_bytes`. `expected_bytes` is the size of the file: a buffer that
+/// grows while it is filled could take twice as much.
+pub(super) fn read_at_most(
+    input: impl Read,
+    expected_bytes: u64,
+    limit_bytes: u64,
+) -> Result<Vec<u8>, FileError> {
+    if expected_bytes > limit_bytes {
+        return Err(FileError::TooLarge { limit_bytes });
+    }
+    let mut bytes = Vec::with_capacity(expected_bytes as usize);
     // One byte more, to distinguish a file of exactly the limit from a larger one.
     input.take(limit_bytes + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > limit_bytes {

@@ -48,7 +48,12 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
     if headers_bytes + body != file_bytes.into() {
         return Err(size(headers_bytes + body, format!("{} sections", sections.len())));
     }
-    check_count(sections.iter().map(|section| u64::from(section.count)).sum())?;
+    let count = sections.iter().map(|section| u64::from(section.count)).sum();
+    check_count(count)?;
+    if count != u64::from(header.count) {
+        let reason = format!("{} Gaussians; the sections have {count}", header.count);
+        return Err(bad("bytes 16 to 19", reason));
+    }
     let mut all = Gaussians::default();
     for section in &sections {
         let part = section.decode(&mut input, &header)?;
@@ -61,6 +66,8 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
 struct Header {
     /// Number of sections with a header; unused ones are empty.
     sections: u32,
+    /// Number of Gaussians of all sections.
+    count: u32,
     level: u16,
     /// Smallest and largest value of 8-bit coefficients.
     sh_range: [f32; 2],
@@ -77,7 +84,7 @@ impl Header {
         let [least, most] = [36, 40].map(|at| f32::from_bits(u32_at(&bytes, at)));
         let or = |value: f32, default: f32| if value == 0.0 { default } else { value };
         let sh_range = [or(least, -SH_RANGE), or(most, SH_RANGE)];
-        Ok(Self { sections: u32_at(&bytes, 4), level, sh_range })
+        Ok(Self { sections: u32_at(&bytes, 4), count: u32_at(&bytes, 16), level, sh_range })
     }
 }
 

@@ -23,6 +23,7 @@ mod nurec;
 mod objects;
 mod ply;
 mod progress;
+mod read_limits;
 mod safetensors;
 mod scene_files;
 pub mod sky;
@@ -32,11 +33,12 @@ mod spz;
 mod tracked;
 mod unpack_budget;
 
+use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Read};
+use std::io::{self, BufRead, BufReader};
 use std::path::Path;
 
-use crate::limits;
+use crate::limits::{SCENE_JSON_BYTES, SCENE_PART_BYTES};
 use wildcity_scene::Gaussians;
 
 pub use axes::Axes;
@@ -44,13 +46,16 @@ pub use error::IngestError;
 pub use file::{FileError, read_whole};
 pub use objects::TrackedObject;
 pub use progress::Progress;
+pub use read_limits::{ReadLimits, StopFlag};
+pub use scene_files::ListedFiles;
 pub use tracked::read_tracked;
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use error::check_count;
 use hash_reader::HashReader;
 use progress::ProgressReader;
-use scene_files::Folder;
+use scene_files::PartFiles;
+use unpack_budget::UnpackBudget;
 
 /// Reads a scene of any of the formats.
 ///
@@ -66,7 +71,7 @@ pub fn read(path: &Path, progress: Progress<'_>) -> Result<Gaussians, IngestErro
 /// the source of a twin, even if the file is changed later.
 ///
 /// For a scene in several files it is the BLAKE3 of their hashes in hex, one per line: first the
-/// given file, then the files that it names, in the order in which they are named. `b3sum
+/// given file, then the files that it names, in the order in which they are first named. `b3sum
 /// --no-names FILE.. | b3sum` prints the same.
 ///
 /// # Errors
@@ -75,35 +80,51 @@ pub fn read_hashed(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Gaussians, String), IngestError> {
-    read_with(path, limits::MESH_GAUSSIANS, progress)
+    let limits = ReadLimits::of_own_file();
+    read_limited(path, &limits, progress).map(|read| (read.gaussians, read.hash))
 }
 
-/// As [`read_hashed`], with about `mesh_gaussians` Gaussians for the triangles of a mesh; triangles smaller than one
-/// Gaussian's share add more. Scenes of Gaussians keep theirs.
+/// A scene that was read.
+#[derive(Debug)]
+pub struct ReadScene {
+    /// The Gaussians, in the axes and unit of the file.
+    pub gaussians: Gaussians,
+    /// BLAKE3 of what was read; see [`read_hashed`].
+    pub hash: String,
+    /// The names of the files that the given one names.
+    pub parts: BTreeSet<String>,
+}
+
+/// As [`read_hashed`], within limits.
 ///
 /// # Errors
-/// As [`read`].
-pub fn read_with(
+/// As [`read`], and what exceeds a limit.
+pub fn read_limited(
     path: &Path,
-    mesh_gaussians: u32,
+    limits: &ReadLimits<'_>,
     progress: Progress<'_>,
-) -> Result<(Gaussians, String), IngestError> {
+) -> Result<ReadScene, IngestError> {
     let (file, file_bytes) = file::open(path)?;
-    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file));
+    let mut input =
+        BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
     let gaussians = match Format::of(input.fill_buf()?)? {
         Format::Json => {
-            return read_parts(path, input, progress, MultiFileFormat::Json, mesh_gaussians);
+            let parts = PartFiles::new(path, limits, progress);
+            return read_parts(input, file_bytes, parts, MultiFileFormat::Json);
         }
         Format::Glb => {
-            return read_parts(path, input, progress, MultiFileFormat::Glb, mesh_gaussians);
+            let parts = PartFiles::new(path, limits, progress);
+            return read_parts(input, file_bytes, parts, MultiFileFormat::Glb);
         }
         Format::Ply => ply::read(&mut input, file_bytes, progress)?,
         Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
         Format::Spz => {
-            spz::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            spz::read(input, file_bytes, UnpackBudget::new(limits))?
         }
         Format::Gzip => {
-            spz::read_gzip(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            spz::read_gzip(input, file_bytes, UnpackBudget::new(limits))?
         }
         Format::Splat => {
             splat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
@@ -112,12 +133,24 @@ pub fn read_with(
             ksplat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
         }
         Format::Zip => {
-            let archive = read_whole_part(ProgressReader::new(&mut input, file_bytes, progress))?;
-            archive::read(archive)?
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            let bytes = file::read_at_most(input, file_bytes, SCENE_PART_BYTES)?;
+            archive::read(bytes, UnpackBudget::new(limits))?
         }
     };
     io::copy(&mut input, &mut io::sink())?;
-    Ok((gaussians, input.into_inner().finish()))
+    let hash = input.into_inner().finish();
+    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new() })
+}
+
+/// Whether a file is of a format in which it may name others.
+///
+/// # Errors
+/// It cannot be read, or is not a regular file.
+pub fn may_name_others(path: &Path) -> Result<bool, FileError> {
+    let (file, _) = file::open(path)?;
+    let mut input = BufReader::new(file);
+    Ok(matches!(Format::of(input.fill_buf()?), Ok(Format::Json | Format::Glb)))
 }
 
 /// A format in which the first file may name others.
@@ -128,30 +161,23 @@ enum MultiFileFormat {
 
 /// Reads a scene in such a format.
 fn read_parts(
-    path: &Path,
     mut input: BufReader<HashReader<File>>,
-    progress: Progress<'_>,
+    file_bytes: u64,
+    mut parts: PartFiles<'_>,
     format: MultiFileFormat,
-    mesh_gaussians: u32,
-) -> Result<(Gaussians, String), IngestError> {
+) -> Result<ReadScene, IngestError> {
     let limit_bytes = match format {
-        MultiFileFormat::Json => limits::SCENE_JSON_BYTES,
-        MultiFileFormat::Glb => limits::SCENE_PART_BYTES,
+        MultiFileFormat::Json => SCENE_JSON_BYTES,
+        MultiFileFormat::Glb => SCENE_PART_BYTES,
     };
-    let first = file::read_at_most(&mut input, limit_bytes)?;
-    let mut folder = Folder::new(path, first.len() as u64, input.into_inner().finish(), progress);
-    folder = folder.with_mesh_gaussians(mesh_gaussians);
+    let first = file::read_at_most(&mut input, file_bytes, limit_bytes)?;
+    parts.add(first.len() as u64, input.into_inner().finish());
     let gaussians = match format {
-        MultiFileFormat::Glb => gltf::read_glb(&first, &mut folder)?,
-        MultiFileFormat::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut folder)?,
-        MultiFileFormat::Json => sog::read(&first, "", &mut folder)?,
+        MultiFileFormat::Glb => gltf::read_glb(&first, &mut parts)?,
+        MultiFileFormat::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut parts)?,
+        MultiFileFormat::Json => sog::read(&first, "", &mut parts)?,
     };
-    Ok((gaussians, folder.finish()))
-}
-
-/// Reads the rest of the input into memory.
-fn read_whole_part(input: impl Read) -> Result<Vec<u8>, IngestError> {
-    Ok(file::read_at_most(input, limits::SCENE_PART_BYTES)?)
+    Ok(ReadScene { gaussians, hash: parts.hash(), parts: parts.into_names() })
 }
 
 /// The format of a file.

@@ -40,6 +40,14 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
     let mut record = [0; RECORD_BYTES];
     for _ in 0..count {
         input.read_exact(&mut record)?;
+        // No rotation is all zeros: a disk that lost the end of a file gives zeros.
+        if record == [0; RECORD_BYTES] {
+            let index = gaussians.len();
+            let place = format!("record {index}");
+            let reason =
+                "is all zeros: the file is damaged from there on; copy it again".to_owned();
+            return Err(IngestError::Body { format: ".splat", place, reason });
+        }
         let [means_m, scales] = numbers(&record);
         gaussians.means_m.push(means_m.map(f64::from));
         gaussians.ln_scales.push(scales.map(|s| activation::ln_scale(s.into())));

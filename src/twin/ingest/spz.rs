@@ -13,8 +13,9 @@ use flate2::bufread::GzDecoder;
 
 use wildcity_scene::{Gaussians, sh};
 
+use super::unpack_budget::{self, UnpackBudget};
 use super::validate::{self, Field};
-use super::{IngestError, activation, check_count, unpack_budget};
+use super::{IngestError, activation, check_count};
 
 const FORMAT: &str = "SPZ";
 /// "NGSP": Niantic's Gaussian splats.
@@ -32,7 +33,11 @@ const FLAG_EXTENSIONS: u8 = 2;
 const COLOUR_SCALE: f64 = 0.15;
 
 /// Reads a file that starts with the header, of a known size.
-pub(super) fn read(mut input: impl BufRead, file_bytes: u64) -> Result<Gaussians, IngestError> {
+pub(super) fn read(
+    mut input: impl BufRead,
+    file_bytes: u64,
+    budget: UnpackBudget,
+) -> Result<Gaussians, IngestError> {
     let header = Header::read(&mut input)?;
     let count = header.count;
     let attributes = header.attributes();
@@ -45,7 +50,7 @@ pub(super) fn read(mut input: impl BufRead, file_bytes: u64) -> Result<Gaussians
         }
         return decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take));
     }
-    let streams = read_table(&mut input, &header, file_bytes)?;
+    let streams = read_table(&mut input, &header, file_bytes, budget)?;
     decode(&header, |attribute, take| {
         let attribute = &attributes[attribute];
         let broken = |error: io::Error| attribute.broken(&error);
@@ -61,7 +66,12 @@ pub(super) fn read(mut input: impl BufRead, file_bytes: u64) -> Result<Gaussians
 }
 
 /// Reads a gzip stream that holds versions 2 or 3, of a known compressed size.
-pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussians, IngestError> {
+pub(super) fn read_gzip(
+    input: impl BufRead,
+    file_bytes: u64,
+    mut budget: UnpackBudget,
+) -> Result<Gaussians, IngestError> {
+    budget.read(file_bytes);
     let mut input = GzDecoder::new(input);
     let header = Header::read(&mut input)?;
     if header.version > 3 {
@@ -69,7 +79,7 @@ pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussian
         return Err(bad("bytes 4 to 7", reason));
     }
     let unpacked_bytes = u128::from(HEADER_BYTES) + header.body_bytes();
-    unpack_budget::check(FORMAT, "the gzip stream", file_bytes, unpacked_bytes)?;
+    budget.unpack(FORMAT, "the gzip stream", unpacked_bytes)?;
     let attributes = header.attributes();
     let gaussians =
         decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take))?;
@@ -80,6 +90,9 @@ pub(super) fn read_gzip(input: impl BufRead, file_bytes: u64) -> Result<Gaussian
     if more > 0 && header.flags & FLAG_EXTENSIONS == 0 {
         let reason = format!("more than the {unpacked_bytes} bytes that the header promises");
         return Err(body("the end", reason));
+    }
+    if more < limit && !input.into_inner().fill_buf()?.is_empty() {
+        return Err(body("the end", "more than the gzip stream: copy the file again".into()));
     }
     Ok(gaussians)
 }
@@ -191,7 +204,9 @@ fn read_table(
     input: &mut impl Read,
     header: &Header,
     file_bytes: u64,
+    mut budget: UnpackBudget,
 ) -> Result<Vec<u64>, IngestError> {
+    budget.read(file_bytes);
     let attributes = header.attributes();
     if usize::from(header.streams) != attributes.len() {
         let found = header.streams;
@@ -230,7 +245,7 @@ fn read_table(
         let content = format!("{} streams", packed.len());
         return Err(IngestError::Size { format: FORMAT, promised, held, content });
     }
-    unpack_budget::check(FORMAT, "the zstd streams", file_bytes, header.body_bytes())?;
+    budget.unpack(FORMAT, "the zstd streams", header.body_bytes())?;
     Ok(packed)
 }
 

@@ -10,9 +10,9 @@ use std::path::Path;
 
 use super::hash_reader::HashReader;
 use super::objects::{self, TrackedObject};
-use super::{
-    BUFFER_BYTES, Format, IngestError, Progress, archive, file, read_whole_part, safetensors,
-};
+use super::unpack_budget::UnpackBudget;
+use super::{BUFFER_BYTES, Format, IngestError, Progress, ReadLimits, archive, file, safetensors};
+use crate::limits::SCENE_PART_BYTES;
 
 /// Reads the tracked objects of a file, in order of their tracks, and the file's BLAKE3 in hex.
 ///
@@ -22,17 +22,19 @@ pub fn read_tracked(
     path: &Path,
     progress: Progress<'_>,
 ) -> Result<(Vec<TrackedObject>, String), IngestError> {
+    let limits = ReadLimits::of_own_file();
     let (opened, file_bytes) = file::open(path)?;
-    let mut input = BufReader::with_capacity(BUFFER_BYTES, HashReader::new(opened));
+    let mut input =
+        BufReader::with_capacity(BUFFER_BYTES, HashReader::new(opened, limits.stop.clone()));
     let found = match Format::of(std::io::BufRead::fill_buf(&mut input)?)? {
         Format::Safetensors => {
             let (gaussians, ids) = safetensors::read_tracked(&mut input, file_bytes, progress)?;
             objects::split(&gaussians, &ids, |id| Some(id.to_string()))
         }
         Format::Zip => {
-            let bytes = read_whole_part(&mut input)?;
+            let bytes = file::read_at_most(&mut input, file_bytes, SCENE_PART_BYTES)?;
             progress(file_bytes, file_bytes);
-            archive::read_tracked(bytes)?
+            archive::read_tracked(bytes, UnpackBudget::new(&limits))?
         }
         _ => Vec::new(),
     };

@@ -5,7 +5,7 @@ use std::sync::{Arc, Weak};
 
 use parking_lot::Mutex;
 
-use crate::store::{Catalog, StoreError, TwinListing, Version};
+use crate::store::{Catalog, Version};
 use wildcity_scene::manifest::SkyRef;
 use wildcity_scene::{Manifest, Sky};
 
@@ -64,14 +64,6 @@ impl Cache {
             skies: Mutex::default(),
             last: Mutex::default(),
         }
-    }
-
-    /// The twins that can be opened.
-    ///
-    /// # Errors
-    /// As [`Catalog::twins`].
-    pub fn twins(&self) -> Result<Vec<TwinListing>, StoreError> {
-        self.catalog.twins()
     }
 
     /// The catalog that versions are read from.

@@ -82,7 +82,7 @@ impl Catalog {
         record: RecordFormat,
     ) -> Result<StoredActor, StoreError> {
         let (header, bytes) = self.encode_actor(asset, record)?;
-        self.remove_abandoned_commits()?;
+        self.remove_abandoned_commits(Some(ACTORS))?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let mut staging = self.objects.begin_staging(ACTORS, &id)?;
         let stored = staging.put(Box::new(|out| out.write_all(&bytes)))?;

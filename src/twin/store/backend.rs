@@ -7,6 +7,7 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use super::StoreError;
+use super::disk::Lock;
 use super::layout::{object_key, record_key};
 
 /// A directory or an object store with twins. Callers must check names of twins and hashes before they
@@ -70,6 +71,12 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError>;
 
+    /// Renames a log record, so that it is part of the log no more. Returns the path that it has then.
+    ///
+    /// # Errors
+    /// The record does not exist, or the backend cannot rename.
+    fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError>;
+
     /// All objects of a twin, in order of their hashes.
     fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
 
@@ -97,6 +104,17 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
 
     /// Removes a side file, if it exists.
     fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError>;
+
+    /// Removes what stopped processes left in a folder of side files, if it was written before a time: files that
+    /// were being written, and locks without their side file.
+    fn remove_leftovers(&self, name: &str, folder: &str, before_us: i64) -> Result<(), StoreError>;
+
+    /// Keeps a side file locked until the lock is dropped, or the process ends. `None` where the backend has no
+    /// locks.
+    fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError>;
+
+    /// Whether a process keeps a side file locked.
+    fn is_held(&self, name: &str, file: &str) -> Result<bool, StoreError>;
 
     /// Path or URL of one log record.
     fn record_path(&self, name: &str, number: u64) -> PathBuf {

@@ -11,8 +11,10 @@ use wildcity_scene::rig::is_name;
 use wildcity_scene::{Chunk, Manifest, sh};
 
 use super::backend::ObjectBackend;
+use super::clock::{Clock, SystemClock};
+use super::disk::Disk;
 use super::layout::is_hash;
-use super::local::{DiskCache, Local};
+use super::local::{DiskCache, Local, RealDisk};
 use super::log::{LogEntry, LogRecord};
 use super::remote::{Remote, RetryPolicy, Traffic};
 use super::{StoreError, chunk_file};
@@ -21,6 +23,7 @@ use super::{StoreError, chunk_file};
 #[derive(Clone, Debug)]
 pub struct Catalog {
     pub(super) objects: Arc<dyn ObjectBackend>,
+    pub(super) clock: Arc<dyn Clock>,
     remote: Option<Remote>,
 }
 
@@ -44,6 +47,24 @@ pub struct TwinListing {
     pub hash: String,
 }
 
+/// The twins of a catalog.
+#[derive(Debug, Default)]
+pub struct TwinList {
+    /// Those whose newest log record can be read, sorted by name.
+    pub twins: Vec<TwinListing>,
+    /// The others, sorted by name. Their damage does not concern the twins beside them.
+    pub damaged: Vec<DamagedTwin>,
+}
+
+/// A twin whose newest log record cannot be read.
+#[derive(Debug)]
+pub struct DamagedTwin {
+    /// The twin's name.
+    pub name: String,
+    /// What is wrong.
+    pub error: StoreError,
+}
+
 /// One immutable version of a twin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Version {
@@ -63,8 +84,8 @@ impl Catalog {
     /// credentials from the environment.
     ///
     /// # Errors
-    /// The directory cannot be listed, or the remains of a killed commit cannot be removed;
-    /// [`StoreError::Url`].
+    /// The directory cannot be listed; [`StoreError::Url`]. Remains that cannot be removed are no error here, so
+    /// that one twin does not keep the others from being opened: the next commit of that twin reports it.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
         Self::open_cached(dir, None)
     }
@@ -81,11 +102,11 @@ impl Catalog {
         let url = place.to_str().filter(|place| place.contains("://"));
         let dir = url.and_then(|url| url.strip_prefix("file://"));
         let catalog = match (url, dir) {
-            (_, Some(dir)) => Self { objects: Arc::new(Local::new(Path::new(dir))), remote: None },
+            (_, Some(dir)) => Self::local(Path::new(dir)),
             (Some(url), None) => Self::remote(Remote::at(url, open_cache(cache)?)?),
-            (None, None) => Self { objects: Arc::new(Local::new(place)), remote: None },
+            (None, None) => Self::local(place),
         };
-        catalog.remove_abandoned_commits()?;
+        catalog.remove_abandoned_commits(None)?;
         Ok(catalog)
     }
 
@@ -104,8 +125,26 @@ impl Catalog {
         Remote::over(store, url, prefix, open_cache(cache)?, retry).map(Self::remote)
     }
 
+    /// Opens a directory of twins on a disk, with a clock: the parts of a machine, or of a simulated one. As
+    /// [`Catalog::open`], removes the remains of killed commits.
+    ///
+    /// # Errors
+    /// As [`Catalog::open`].
+    pub fn on(dir: &Path, disk: Arc<dyn Disk>, clock: Arc<dyn Clock>) -> Result<Self, StoreError> {
+        let objects = Arc::new(Local::new(dir, disk));
+        let catalog = Self { objects, clock, remote: None };
+        catalog.remove_abandoned_commits(None)?;
+        Ok(catalog)
+    }
+
+    fn local(dir: &Path) -> Self {
+        let objects = Arc::new(Local::new(dir, Arc::new(RealDisk)));
+        Self { objects, clock: Arc::new(SystemClock), remote: None }
+    }
+
     fn remote(remote: Remote) -> Self {
-        Self { objects: Arc::new(remote.clone()), remote: Some(remote) }
+        let objects = Arc::new(remote.clone());
+        Self { objects, clock: Arc::new(SystemClock), remote: Some(remote) }
     }
 
     /// The same twins, read without the disk cache.
@@ -123,19 +162,28 @@ impl Catalog {
         self.objects.root()
     }
 
-    /// All twins with their latest versions, sorted by name.
+    /// All twins with their latest versions, and the damaged ones.
     ///
     /// # Errors
-    /// A log cannot be read.
-    pub fn twins(&self) -> Result<Vec<TwinListing>, StoreError> {
-        let mut twins = Vec::new();
+    /// The directory or the object store cannot be listed.
+    pub fn twins(&self) -> Result<TwinList, StoreError> {
+        let mut list = TwinList::default();
         for name in self.objects.twin_names()? {
-            if let Some(&number) = self.objects.version_numbers(&name)?.last() {
-                let hash = self.record(&name, number)?.manifest;
-                twins.push(TwinListing { name, number, hash });
+            match self.listing(&name) {
+                Ok(Some(listing)) => list.twins.push(listing),
+                // Its only version was removed meanwhile.
+                Ok(None) => {}
+                Err(error) => list.damaged.push(DamagedTwin { name, error }),
             }
         }
-        Ok(twins)
+        Ok(list)
+    }
+
+    fn listing(&self, name: &str) -> Result<Option<TwinListing>, StoreError> {
+        let numbers = self.objects.version_numbers(name)?;
+        let Some(&number) = numbers.last() else { return Ok(None) };
+        let hash = self.record(name, number)?.manifest;
+        Ok(Some(TwinListing { name: name.to_owned(), number, hash }))
     }
 
     /// Number of a twin's latest version, from the names of the log's records alone. The records

@@ -62,7 +62,7 @@ impl Catalog {
         storage: StorageOptions,
     ) -> Result<Commit, StoreError> {
         check_name(name)?;
-        self.remove_abandoned_commits()?;
+        self.remove_abandoned_commits(Some(name))?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         Ok(Commit {
             staging: self.objects.begin_staging(name, &id)?,
@@ -315,8 +315,14 @@ impl Commit {
 
             // Otherwise publish a new version.
             let number = latest.unwrap_or(0) + 1;
-            let record = LogRecord::new(hash.clone(), &self.id, parent, self.kind);
-            let created_us = record.created_us;
+            let created_us = self.catalog.clock.now_us();
+            let record = LogRecord {
+                manifest: hash.clone(),
+                created_us,
+                commit: Some(self.id.clone()),
+                parent,
+                kind: self.kind,
+            };
             match self.staging.publish(&objects, number, &self.catalog.encode(&record)?) {
                 Ok(()) => return Ok(Version { number, hash, created_us, manifest }),
                 // The winner may be this very commit, if the answer to its first attempt was lost.

@@ -226,8 +226,8 @@ pub enum StoreError {
     Gaussians(#[from] IngestError),
     /// The record format cannot hold the values of the scene.
     #[error(
-        "{count} of {gaussians} Gaussians have a value of {field} that record {record} cannot hold; \
-         at most {} % may: store it with --record h52 or f32",
+        "record {record} cannot hold {count} values of {field} in {gaussians} Gaussians; at most {} % \
+         of as many as there are Gaussians may be clamped: store it with --record h52 or f32",
         100.0 * limits::CLAMPED_SHARE
     )]
     Clamped {

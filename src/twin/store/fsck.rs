@@ -1,6 +1,7 @@
 //! Checks a twin: re-reads every object, and finds what is missing, damaged, or left over.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use wildcity_scene::manifest::SkyRef;
 
@@ -43,6 +44,17 @@ pub struct DamagedObject {
     pub object: String,
     /// What is wrong with it: it is missing, unreadable, or has another hash.
     pub error: StoreError,
+}
+
+/// A damaged log record that was set aside.
+#[derive(Debug)]
+pub struct RecordSetAside {
+    /// Number of the version that it was the record of.
+    pub number: u64,
+    /// What was wrong with it.
+    pub error: StoreError,
+    /// Where it is now.
+    pub path: PathBuf,
 }
 
 impl FsckReport {
@@ -94,6 +106,28 @@ impl Catalog {
             unreferenced,
             staging: self.objects.unfinished_commits()?.iter().any(|unfinished| unfinished == name),
         })
+    }
+
+    /// Sets the newest records of a twin's log aside, as long as the newest cannot be read. The version before
+    /// them is the latest again, and the next commit takes their number. Objects stay: a commit of the same content
+    /// uses them.
+    ///
+    /// # Errors
+    /// [`StoreError::Name`], [`StoreError::NoTwin`]; the log cannot be listed or changed.
+    pub fn repair_log(&self, name: &str) -> Result<Vec<RecordSetAside>, StoreError> {
+        let mut aside = Vec::new();
+        for number in self.numbers(name)?.into_iter().rev() {
+            let Err(error) = self.record(name, number) else { break };
+            // A file that the system refuses to read may be sound: its permissions or the disk may be at fault.
+            let is_refused =
+                matches!(&error, StoreError::Io { cause, .. } if cause.raw_os_error().is_some());
+            if is_refused {
+                return Err(error);
+            }
+            let path = self.objects.set_record_aside(name, number)?;
+            aside.push(RecordSetAside { number, error, path });
+        }
+        Ok(aside)
     }
 
     /// Compares every object of every version of a twin with its hash. `progress` gets the bytes

@@ -16,8 +16,7 @@ use serde::Deserialize;
 use crate::limits;
 
 use super::catalog::check_name;
-use super::lease::LeaseRecord;
-use super::log::now_us;
+use super::lease::{self, LeaseRecord};
 use super::{Catalog, StoreError};
 
 /// Which versions are kept, and how long garbage is kept.
@@ -53,6 +52,10 @@ pub struct ObjectTotals {
 /// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
+/// The folder of the state of garbage collection.
+const FOLDER: &str = "gc";
+/// Age of what a stopped process left of a side file, in microseconds: a day, in which every write ends.
+const LEFTOVER_AGE_US: i64 = 86_400_000_000;
 /// The side file with the candidates.
 const CANDIDATES: &str = "gc/candidates";
 /// The side file with the versions that were removed.
@@ -82,7 +85,7 @@ impl Catalog {
         dry_run: bool,
     ) -> Result<CollectionReport, StoreError> {
         check_name(name)?;
-        let now_us = now_us();
+        let now_us = self.clock.now_us();
         let before: Candidates = self.read_side_json(name, CANDIDATES)?;
         let mut plan = self.plan(name, keep, &before, now_us)?;
         if dry_run {
@@ -98,8 +101,14 @@ impl Catalog {
             })?;
         }
         self.objects.write_side_file(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
-        for lease in self.leases(name)?.iter().filter(|lease| !lease.is_live(now_us)) {
-            lease.remove(self, name)?;
+        for lease in self.leases(name)? {
+            if !self.is_live(name, &lease, now_us)? {
+                lease.remove(self, name)?;
+            }
+        }
+        for folder in [lease::FOLDER, FOLDER] {
+            let before_us = now_us.saturating_sub(LEFTOVER_AGE_US);
+            self.objects.remove_leftovers(name, folder, before_us)?;
         }
         Ok(plan.report)
     }
@@ -120,8 +129,8 @@ impl Catalog {
         let before = self.collected(name)?;
         let after: BTreeSet<u64> = before.union(gone).copied().collect();
         self.objects.write_side_file(name, COLLECTED, &self.encode(&after)?)?;
-        let leases = self.leases(name)?;
-        let leased = |lease: &&LeaseRecord| lease.is_live(now_us) && gone.contains(&lease.version);
+        let leases = self.live_leases(name, now_us)?;
+        let leased = |lease: &&LeaseRecord| gone.contains(&lease.version);
         let Some(lease) = leases.iter().find(leased) else { return Ok(()) };
         self.objects.write_side_file(name, COLLECTED, &self.encode(&before)?)?;
         Err(StoreError::Leased { name: name.to_owned(), number: lease.version })
@@ -144,7 +153,7 @@ impl Catalog {
         let numbers = self.numbers(name)?;
         let latest = numbers.len().saturating_sub(keep.versions.max(1));
         let mut kept: BTreeSet<u64> = numbers[latest..].iter().copied().collect();
-        let live = self.leases(name)?.into_iter().filter(|lease| lease.is_live(now_us));
+        let live = self.live_leases(name, now_us)?.into_iter();
         kept.extend(live.map(|lease| lease.version).filter(|number| numbers.contains(number)));
         let gone = self.collected(name)?;
         kept.retain(|number| !gone.contains(number));

@@ -16,6 +16,9 @@ pub(super) fn record_key(name: &str, number: u64) -> String {
     format!("{name}/log/{number:010}")
 }
 
+/// Ending of a side file that a process keeps locked while it uses the side file of the same name.
+pub(super) const LOCK_ENDING: &str = ".lock";
+
 /// Path of an object below the root.
 pub(super) fn object_key(name: &str, hash: &str) -> String {
     format!("{name}/objects/{}/{hash}", &hash[..2])

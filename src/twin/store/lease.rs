@@ -1,21 +1,27 @@
 //! Leases: a process that uses a version records it with an expiry time, and garbage collection
 //! keeps the version until then.
+//!
+//! In a directory, the process also keeps a file locked. Then the version is kept as long as the process lives, even if
+//! the clock jumps beyond the expiry time. An object store has no such lock.
 
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::log::now_us;
+use super::disk::Lock;
+use super::layout::LOCK_ENDING;
 use super::{Catalog, StoreError};
 
-/// A version in use. The lease ends when it is dropped, or when it was not renewed for its
-/// duration.
+/// A version in use. The lease ends when it is dropped; or when it was not renewed for its duration, except in a
+/// directory, as long as its process lives.
 #[derive(Debug)]
 pub struct Lease {
     catalog: Catalog,
     name: String,
     duration: Duration,
     record: LeaseRecord,
+    /// Where the backend has locks.
+    _lock: Option<Lock>,
 }
 
 /// A lease as stored, in JSON.
@@ -28,7 +34,8 @@ pub(super) struct LeaseRecord {
     until_us: i64,
 }
 
-const FOLDER: &str = "leases";
+/// The folder of leases among a twin's side files.
+pub(super) const FOLDER: &str = "leases";
 
 impl Catalog {
     /// Records that a version of a twin is in use by `holder` (a text for people), until the
@@ -51,7 +58,9 @@ impl Catalog {
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let record = LeaseRecord { version, holder: holder.to_owned(), id, until_us: 0 };
         self.check_not_collected(name, version)?;
-        let mut lease = Lease { catalog: self.clone(), name: name.to_owned(), duration, record };
+        let lock = self.objects.hold(name, &record.lock_file())?;
+        let catalog = self.clone();
+        let mut lease = Lease { catalog, name: name.to_owned(), duration, record, _lock: lock };
         lease.renew()?;
         Ok(lease)
     }
@@ -67,7 +76,8 @@ impl Catalog {
     /// All leases of a twin, including expired ones.
     pub(super) fn leases(&self, name: &str) -> Result<Vec<LeaseRecord>, StoreError> {
         let mut leases = Vec::new();
-        for id in self.objects.list_side_files(name, FOLDER)? {
+        let files = self.objects.list_side_files(name, FOLDER)?;
+        for id in files.into_iter().filter(|file| !file.ends_with(LOCK_ENDING)) {
             let read = self.objects.read_side_file(name, &format!("{FOLDER}/{id}"))?;
             // A missing file is a lease that ended meanwhile. A damaged one cannot say which
             // version it holds.
@@ -76,6 +86,31 @@ impl Catalog {
             leases.extend(record.filter(|record| record.id == id));
         }
         Ok(leases)
+    }
+
+    /// The leases of versions that are in use.
+    pub(super) fn live_leases(
+        &self,
+        name: &str,
+        now_us: i64,
+    ) -> Result<Vec<LeaseRecord>, StoreError> {
+        let mut live = Vec::new();
+        for lease in self.leases(name)? {
+            if self.is_live(name, &lease, now_us)? {
+                live.push(lease);
+            }
+        }
+        Ok(live)
+    }
+
+    /// Whether a lease has not expired, or its process lives.
+    pub(super) fn is_live(
+        &self,
+        name: &str,
+        lease: &LeaseRecord,
+        now_us: i64,
+    ) -> Result<bool, StoreError> {
+        Ok(lease.until_us > now_us || self.objects.is_held(name, &lease.lock_file())?)
     }
 }
 
@@ -87,7 +122,7 @@ impl Lease {
     /// [`StoreError::GarbageCollected`] if it had ended, and the version's objects were removed.
     pub fn renew(&mut self) -> Result<(), StoreError> {
         let for_us = i64::try_from(self.duration.as_micros()).unwrap_or(i64::MAX);
-        self.record.until_us = now_us().saturating_add(for_us);
+        self.record.until_us = self.catalog.clock.now_us().saturating_add(for_us);
         let record = self.catalog.encode(&self.record)?;
         self.catalog.objects.write_side_file(&self.name, &self.record.file(), &record)?;
         // Garbage collection first records what it removes, and then reads the leases. Here it is
@@ -104,12 +139,13 @@ impl Drop for Lease {
 }
 
 impl LeaseRecord {
-    pub(super) fn is_live(&self, now_us: i64) -> bool {
-        self.until_us > now_us
+    pub(super) fn remove(&self, catalog: &Catalog, name: &str) -> Result<(), StoreError> {
+        catalog.objects.remove_side_file(name, &self.file())?;
+        catalog.objects.remove_side_file(name, &self.lock_file())
     }
 
-    pub(super) fn remove(&self, catalog: &Catalog, name: &str) -> Result<(), StoreError> {
-        catalog.objects.remove_side_file(name, &self.file())
+    fn lock_file(&self) -> String {
+        format!("{FOLDER}/{}{LOCK_ENDING}", self.id)
     }
 
     fn file(&self) -> String {

@@ -1,7 +1,5 @@
 //! A twin's log: for each version the hash of its manifest, the time of its commit, and how it was made.
 
-use std::time::{SystemTime, UNIX_EPOCH};
-
 use serde::{Deserialize, Serialize};
 
 /// One entry of a twin's log.
@@ -58,22 +56,4 @@ pub(super) struct LogRecord {
     pub(super) parent: Option<u64>,
     #[serde(default)]
     pub(super) kind: CommitKind,
-}
-
-impl LogRecord {
-    /// A record with the current time.
-    pub(super) fn new(
-        manifest: String,
-        commit: &str,
-        parent: Option<u64>,
-        kind: CommitKind,
-    ) -> Self {
-        Self { manifest, created_us: now_us(), commit: Some(commit.to_owned()), parent, kind }
-    }
-}
-
-/// Microseconds since 1970.
-pub(super) fn now_us() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_micros()).unwrap_or(i64::MAX)
 }

@@ -7,11 +7,15 @@ use super::layout::ACTORS;
 use super::{Catalog, StoreError};
 
 impl Catalog {
-    /// Removes the remains of killed commits: their staging, and objects that they placed without a
-    /// record.
+    /// Removes the remains of killed commits of all twins: their staging, and objects that they placed without
+    /// a record.
     ///
     /// A process with read-only access leaves this to processes that may write.
-    pub(super) fn remove_abandoned_commits(&self) -> Result<(), StoreError> {
+    ///
+    /// # Errors
+    /// The unfinished commits cannot be listed, or the remains of twin `needed` cannot be removed. A failure of
+    /// another twin is left to the next commit of that twin.
+    pub(super) fn remove_abandoned_commits(&self, needed: Option<&str>) -> Result<(), StoreError> {
         for name in self.objects.unfinished_commits()? {
             // If a version is damaged, it is unknown which objects it named, so every object is
             // kept. No version names assets, and all of them are kept.
@@ -21,7 +25,8 @@ impl Catalog {
             };
             match self.objects.remove_abandoned(&name, &named) {
                 Err(StoreError::Io { cause, .. }) if is_read_only(&cause) => {}
-                removed => removed?,
+                Err(error) if needed == Some(&*name) => return Err(error),
+                _ => {}
             }
         }
         Ok(())

@@ -22,15 +22,19 @@ from .protocol import (
     PROTOCOL,
     Action,
     Closed,
+    DriveSection,
     Dynamics,
     Model,
     Ok,
     Opened,
     Outputs,
     Pose,
+    RandomStart,
+    RecordedPoint,
     Refusal,
     Resumed,
     Rig,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -72,7 +76,7 @@ class SessionProtocol:
         version: int | None = None,
         session: str | None = None,
         seed: int = 0,
-        start: Pose | Station | None = None,
+        start: Pose | Station | RandomStart | None = None,
         rig: str | Rig | None = None,
         profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
@@ -81,6 +85,8 @@ class SessionProtocol:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        scenario: str | Mapping[str, Any] | None = None,
+        trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
         optional = {
@@ -94,6 +100,8 @@ class SessionProtocol:
             "deadline_ms": deadline_ms,
             "decision_us": decision_us,
             "warm_up_us": warm_up_us,
+            "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
+            "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}
         fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}
@@ -101,9 +109,17 @@ class SessionProtocol:
         self.session = opened.session
         return opened
 
-    def step(self, movement: Pose | Trajectory | Action, terminate: bool) -> Exchange[Observation]:
-        """Moves the ego and advances the time by one step."""
+    def step(
+        self,
+        movement: Pose | Trajectory | Action,
+        terminate: bool,
+        until_us: int | None = None,
+        notes: Any = None,
+    ) -> Exchange[Observation]:
+        """Moves the ego and advances the time by one step, or by several along a plan."""
+        optional = {"until_us": until_us, "notes": notes}
         fields = {**_movement(movement), "terminate": terminate}
+        fields |= {name: value for name, value in optional.items() if value is not None}
         return (yield from self._next("step", Observation, fields))
 
     def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
@@ -114,12 +130,35 @@ class SessionProtocol:
         """Announces where the ego may go next."""
         yield from self._next("prefetch", Ok, {"poses": encode(poses)})
 
-    def reset(self, seed: int, start: Pose | Station | None) -> Exchange[Observation]:
+    def reset(
+        self,
+        seed: int,
+        start: Pose | Station | RandomStart | None,
+        dynamics: Model | Dynamics | None = None,
+        speed: float | None = None,
+    ) -> Exchange[Observation]:
         """Starts a new episode."""
+        optional = {"start": _start(start), "dynamics": encode(dynamics), "speed": speed}
         fields: dict[str, Any] = {"seed": seed}
-        if start is not None:
-            fields["start"] = _start(start)
+        fields |= {name: value for name, value in optional.items() if value is not None}
         return (yield from self._next("reset", Observation, fields))
+
+    def branch(self, point: SnapshotPoint | RecordedPoint, session: str | None) -> Exchange[Opened]:
+        """Opens a session in a state of another episode."""
+        fields = {"from": encode(point)}
+        if session is not None:
+            fields["session"] = session
+        opened = yield from self._next("branch", Opened, fields)
+        self.session = opened.session
+        return opened
+
+    def snapshot(self, name: str) -> Exchange[None]:
+        """Stores the state of the episode under a name."""
+        yield from self._next("snapshot", Ok, {"name": name})
+
+    def restore(self, name: str) -> Exchange[Observation]:
+        """Returns to a snapshot."""
+        return (yield from self._next("restore", Observation, {"name": name}))
 
     def switch_version(self, version: int | None) -> Exchange[Switched]:
         """Shows another version of the twin."""
@@ -218,5 +257,7 @@ def _movement(movement: Pose | Trajectory | Action) -> dict[str, Any]:
     return {"action" if isinstance(movement, Action) else "pose": encode(movement)}
 
 
-def _start(start: Pose | Station | None) -> Any:
+def _start(start: Pose | Station | RandomStart | None) -> Any:
+    if isinstance(start, RandomStart):
+        return {"random": encode(start)}
     return {"pose": encode(start)} if isinstance(start, Pose) else encode(start)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection
@@ -27,13 +27,17 @@ from .observation import Observation
 from .protocol import (
     PROTOCOL,
     Action,
+    DriveSection,
     Dynamics,
     Model,
     Opened,
     Outputs,
     Pose,
+    RandomStart,
+    RecordedPoint,
     Resumed,
     Rig,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -80,7 +84,7 @@ class Client:
         version: int | None = None,
         session: str | None = None,
         seed: int = 0,
-        start: Pose | Station | None = None,
+        start: Pose | Station | RandomStart | None = None,
         rig: str | Rig | None = None,
         profile: Mapping[str, float | bool | None] | None = None,
         outputs: Outputs | None = None,
@@ -89,8 +93,12 @@ class Client:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        scenario: str | Mapping[str, Any] | None = None,
+        trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
+
+        `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
 
         Raises `Refused` if the server refuses.
         """
@@ -109,9 +117,19 @@ class Client:
                 deadline_ms=deadline_ms,
                 decision_us=decision_us,
                 warm_up_us=warm_up_us,
+                scenario=scenario,
+                trajectory=trajectory,
             )
         )
         return Session(self, opened)
+
+    def branch(self, point: SnapshotPoint | RecordedPoint, *, session: str | None = None) -> Session:
+        """Opens a session in a state of another episode, with that episode's settings.
+
+        The new session has that state as its snapshot `start`: `restore("start")` shows it. Raises `Refused` if
+        there is no such state.
+        """
+        return Session(self, self._run(self._protocol.branch(point, session)))
 
     def resume(self, session: str, last_seq: int) -> Session:
         """Continues a session that another client opened, for example one in a process that ended.
@@ -119,8 +137,8 @@ class Client:
         `last_seq` is the number of the last answer that the other client received (`metadata.seq`). Call it
         directly after connecting.
         """
-        self._run(self._protocol.resume(session, last_seq))
-        return Session(self, None)
+        resumed = self._run(self._protocol.resume(session, last_seq))
+        return Session(self, resumed.opened)
 
     def close(self) -> None:
         """Closes the connection. An open session can be resumed within `welcome.limits.resume_ms`."""
@@ -206,20 +224,27 @@ class Session:
 
     @property
     def opened(self) -> Opened:
-        """All settings of the session: cameras, start, hashes. Not available after `Client.resume`."""
+        """All settings of the session: cameras, start, hashes."""
         if self._opened is None:
-            raise WildCityError("another client opened this session, so its settings are not known here")
+            raise WildCityError("the server did not tell the settings of the resumed session")
         return self._opened
 
     def step(
-        self, movement: Pose | Trajectory | Action, *, terminate: bool = False
+        self,
+        movement: Pose | Trajectory | Action,
+        *,
+        until_us: int | None = None,
+        notes: Any = None,
+        terminate: bool = False,
     ) -> Observation:
         """Moves the ego, advances the simulated time by one step, and returns the observation there.
 
         A `Pose` is the next `world_from_rig` of an ego that teleports, an `Action` moves a car, and a `Trajectory`
-        moves both. `terminate` ends the episode with this step.
+        moves both. `until_us` is for how long a trajectory or an action is followed, in whole steps; the observation
+        is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into the
+        record. `terminate` ends the episode with this step.
         """
-        return self._client._run(self._protocol.step(movement, terminate))
+        return self._client._run(self._protocol.step(movement, terminate, until_us, notes))
 
     def observe(self, poses: Sequence[Pose]) -> Observation:
         """Renders images from poses without moving the ego: `views[k]` of the observation shows `poses[k]`."""
@@ -229,9 +254,27 @@ class Session:
         """Asks the server to load what is visible from poses, in driving order. Does not wait for it."""
         return self._client._run(self._protocol.prefetch(poses))
 
-    def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
-        """Starts a new episode at `start`, or at the session's start if it is None."""
-        return self._client._run(self._protocol.reset(seed, start))
+    def reset(
+        self,
+        seed: int = 0,
+        start: Pose | Station | RandomStart | None = None,
+        *,
+        dynamics: Model | Dynamics | None = None,
+        speed: float | None = None,
+    ) -> Observation:
+        """Starts a new episode at `start`, or at the session's start if it is None.
+
+        `dynamics`, and `speed` (m/s) in place of theirs, hold for this episode alone.
+        """
+        return self._client._run(self._protocol.reset(seed, start, dynamics, speed))
+
+    def snapshot(self, name: str) -> None:
+        """Stores the state of the episode under a name, in place of an earlier snapshot of that name."""
+        return self._client._run(self._protocol.snapshot(name))
+
+    def restore(self, name: str) -> Observation:
+        """Returns to a snapshot of this session, and returns the observation of that state."""
+        return self._client._run(self._protocol.restore(name))
 
     def switch_version(self, version: int | None = None) -> Switched:
         """Shows another version of the twin from the next step on, or the latest. The episode continues."""

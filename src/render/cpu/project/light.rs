@@ -47,7 +47,7 @@ impl Light<'_> {
                 let mean = Vec3x16::load(simd, columns, column::MEAN);
                 let mut factor = f32x16::splat(simd, 1.0);
                 for shadow in shadows {
-                    factor = factor * shadow_factor(simd, mean, shadow);
+                    factor *= shadow_factor(simd, mean, shadow);
                 }
                 splats.set_colors(splats.colors(simd).scale(factor));
             }

@@ -16,6 +16,7 @@ use image::ImageReader;
 
 use super::instances::MeshInstance;
 use super::triangle::{LONGEST, Material, Texture, Triangle};
+use super::uris::Uris;
 use super::{FORMAT, bad};
 use crate::ingest::IngestError;
 use crate::ingest::scene_files::SceneFiles;
@@ -27,7 +28,7 @@ pub(super) fn read(
     json: &[u8],
     placed: &[MeshInstance<'_>],
     buffers: &[&[u8]],
-    parts: &mut dyn SceneFiles,
+    uris: &mut Uris<'_>,
 ) -> Result<Gaussians, IngestError> {
     let root = gltf::json::deserialize::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
     let document = gltf::Document::from_json(root).map_err(|e| bad("JSON", e.to_string()))?;
@@ -41,9 +42,9 @@ pub(super) fn read(
             if let Some(image) = image_of(&primitive)
                 && !textures.contains_key(&image.index())
             {
-                textures.insert(image.index(), decode(&image, buffers, parts)?);
+                textures.insert(image.index(), decode(&image, buffers, uris)?);
             }
-            let found = read_primitive(&primitive, buffers, &textures, &place, parts)?;
+            let found = read_primitive(&primitive, buffers, &textures, &place, uris.parts())?;
             triangles.extend(found.into_iter().map(|triangle| Triangle {
                 corners_m: triangle.corners_m.map(|m| placed.scene_from_mesh.transform_point3(m)),
                 ..triangle
@@ -57,7 +58,7 @@ pub(super) fn read(
             "the scene has neither splats nor triangles with an area".into(),
         ));
     }
-    let share_m2 = area_m2 / f64::from(parts.mesh_gaussians());
+    let share_m2 = area_m2 / f64::from(uris.parts().mesh_gaussians());
     let longest_m = LONGEST * share_m2.sqrt();
     // A triangle without area is invisible, however long it is.
     let seen = triangles.into_iter().filter(|triangle| triangle.area_m2() > 0.0);
@@ -77,7 +78,7 @@ pub(super) fn read(
     });
     let triangles: Vec<Triangle> = halved.collect();
     let count: u128 = triangles.iter().map(|t| u128::from(t.cuts(share_m2)).pow(2)).sum();
-    parts.budget().unpack(FORMAT, "meshes", 56 * count)?;
+    uris.parts().budget().unpack(FORMAT, "meshes", 56 * count)?;
     let mut all = Gaussians::with_capacity(0, count as usize);
     for triangle in &triangles {
         triangle.cover(triangle.cuts(share_m2), &mut all);
@@ -179,7 +180,7 @@ fn image_of<'a>(primitive: &gltf::Primitive<'a>) -> Option<gltf::Image<'a>> {
 fn decode(
     image: &gltf::Image<'_>,
     buffers: &[&[u8]],
-    parts: &mut dyn SceneFiles,
+    uris: &mut Uris<'_>,
 ) -> Result<Texture, IngestError> {
     let place = &format!("image {}", image.index());
     let (file, fetched);
@@ -191,7 +192,7 @@ fn decode(
             file = bytes.ok_or_else(|| bad(place, "its bufferView does not exist".into()))?;
         }
         Source::Uri { uri, .. } => {
-            fetched = super::fetch(uri, place, parts)?;
+            fetched = uris.fetch(uri, place)?;
             file = &fetched;
         }
     }
@@ -200,7 +201,7 @@ fn decode(
     let size_px = open().map_err(|e| damaged(&e))?.into_dimensions().map_err(|e| damaged(&e))?;
     let pixels = u128::from(size_px.0) * u128::from(size_px.1);
     // 4 bytes per pixel as decoded, and 4 as RGBA.
-    parts.budget().unpack(FORMAT, place, 8 * pixels)?;
+    uris.parts().budget().unpack(FORMAT, place, 8 * pixels)?;
     let decoded = open().map_err(|e| damaged(&e))?.decode().map_err(|e| damaged(&e))?;
     Ok(decoded.into_rgba8().into())
 }

@@ -14,12 +14,10 @@ mod document;
 mod instances;
 mod mesh;
 mod triangle;
+mod uris;
 
 use std::collections::BTreeMap;
 
-use data_encoding::BASE64;
-
-use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
 use super::scene_files::SceneFiles;
@@ -27,6 +25,7 @@ use super::validate::{self, Field};
 use super::{IngestError, activation, check_count};
 use accessor::Column;
 use document::{Document, Primitive};
+use uris::Uris;
 
 const FORMAT: &str = "glTF";
 const EXTENSION: &str = "KHR_gaussian_splatting";
@@ -88,6 +87,10 @@ pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussi
         }
         rest = after;
     }
+    if !rest.is_empty() {
+        let reason = format!("{} bytes after the last one, too few for another", rest.len());
+        return Err(bad("chunks", reason));
+    }
     let json = json.ok_or_else(|| bad("chunks", "there is no chunk JSON".into()))?;
     read(json, buffer, parts)
 }
@@ -101,16 +104,18 @@ pub(super) fn read(
     let document: Document =
         serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
     // Buffers: from URIs, or within the GLB file.
+    let mut uris = Uris::new(parts);
     let mut fetched = Vec::new();
     for (index, buffer) in document.buffers.iter().enumerate() {
         fetched.push(match &buffer.uri {
-            Some(uri) => Some(fetch(uri, &format!("buffer {index}"), parts)?),
+            Some(uri) => Some(uris.fetch(uri, &format!("buffer {index}"))?),
             None => None,
         });
     }
     let mut buffers: Vec<&[u8]> = Vec::new();
     for (index, (bytes, buffer)) in fetched.iter().zip(&document.buffers).enumerate() {
-        let bytes = bytes.as_deref().or(own_buffer.filter(|_| index == 0)).unwrap_or_default();
+        let bytes = bytes.as_ref().map(|bytes| &bytes[..]);
+        let bytes = bytes.or(own_buffer.filter(|_| index == 0)).unwrap_or_default();
         let Some(bytes) = bytes.get(..buffer.byte_length as usize) else {
             return Err(IngestError::Size {
                 format: FORMAT,
@@ -133,28 +138,17 @@ pub(super) fn read(
             }
             found = true;
             let place = format!("node {}, primitive {index}", placed.node);
-            let mut part = read_primitive(&document, &buffers, primitive, &place, parts)?;
+            let mut part = read_primitive(&document, &buffers, primitive, &place, uris.parts())?;
             placed.apply(&mut part)?;
             all.append(&part);
             check_count(all.len() as u64)?;
         }
     }
     if !found {
-        all = mesh::read(json, &placed, &buffers, parts)?;
+        all = mesh::read(json, &placed, &buffers, &mut uris)?;
     }
     validate::check(&all, &Field::plain_name)?;
     Ok(all)
-}
-
-/// The bytes of a URI: a file, or base64 within the URI.
-fn fetch(uri: &str, place: &str, parts: &mut dyn SceneFiles) -> Result<Vec<u8>, IngestError> {
-    if !uri.starts_with("data:") {
-        return parts.read(uri, limits::SCENE_PART_BYTES);
-    }
-    let (_, text) = uri
-        .split_once(";base64,")
-        .ok_or_else(|| bad(place, "its data URI has no \";base64,\"".into()))?;
-    BASE64.decode(text.as_bytes()).map_err(|e| bad(place, format!("its base64: {e}")))
 }
 
 /// Reads one primitive, in the axes of its mesh.

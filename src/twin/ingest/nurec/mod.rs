@@ -11,15 +11,17 @@
 
 mod msgpack;
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
 
-use flate2::read::GzDecoder;
+use flate2::bufread::GzDecoder;
 use half::f16;
 
+use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
 use super::objects::{self, TrackedObject};
-use super::unpack_budget::{self, UnpackBudget};
+use super::unpack_budget::UnpackBudget;
 use super::validate::{self, Field};
 use super::{IngestError, check_count};
 use msgpack::Value;
@@ -27,21 +29,20 @@ use msgpack::Value;
 const FORMAT: &str = "NuRec";
 const LAYERS: &str = ".gaussians_nodes.";
 
-/// Reads a payload.
+/// Reads the static Gaussians of a payload.
 pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
-    let Payload { data, state } = Payload::of(&root)?;
-    let mut all = Gaussians::default();
-    let is_static = |layer: &&str| tracks_of(state, layer).is_empty();
-    let mut layers = layers_of(state).filter(is_static).peekable();
-    if layers.peek().is_none() {
+    let payload = Payload::of(&root)?;
+    let is_static = |name: &&str| payload.tracks_of(name).is_empty();
+    let layers: Vec<&str> = payload.names.iter().copied().filter(is_static).collect();
+    if layers.is_empty() {
         return Err(bad("a layer of static Gaussians", "is missing".into()));
     }
+    let mut all = Gaussians::default();
     for name in layers {
-        check_activations(data, name)?;
-        let part = Layer { state, name }.read()?;
-        all.append(&part);
+        budget.check_stop()?;
+        all.append(&payload.layer(name)?.read()?);
         check_count(all.len() as u64)?;
     }
     validate::check(&all, &Field::plain_name)?;
@@ -55,15 +56,15 @@ pub(super) fn read_tracked(
 ) -> Result<Vec<TrackedObject>, IngestError> {
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
-    let Payload { data, state } = Payload::of(&root)?;
+    let payload = Payload::of(&root)?;
     let mut found = Vec::new();
-    for name in layers_of(state) {
-        let tracks = tracks_of(state, name);
+    for &name in &payload.names {
+        let tracks = payload.tracks_of(name);
         if tracks.is_empty() {
             continue;
         }
-        check_activations(data, name)?;
-        let layer = Layer { state, name };
+        budget.check_stop()?;
+        let layer = payload.layer(name)?;
         let gaussians = layer.read()?;
         check_count(gaussians.len() as u64)?;
         validate::check(&gaussians, &Field::plain_name)?;
@@ -80,18 +81,26 @@ pub(super) fn read_tracked(
 
 /// The bytes of a gzip stream.
 fn unpack(payload: &[u8], budget: &mut UnpackBudget) -> Result<Vec<u8>, IngestError> {
-    let limit = unpack_budget::limit_bytes(payload.len() as u64);
+    let limit = budget.left_bytes();
     let mut bytes = Vec::new();
-    let read = GzDecoder::new(payload).take(limit + 1).read_to_end(&mut bytes);
+    let mut decoder = GzDecoder::new(payload);
+    let read = decoder.by_ref().take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
     budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    let rest = decoder.into_inner();
+    if !rest.is_empty() {
+        return Err(bad("the gzip stream", format!("is followed by {} bytes", rest.len())));
+    }
     Ok(bytes)
 }
 
-/// The two maps of a payload that are read.
+/// The maps of a payload that are read. They are searched once per layer and field, so they are indexed.
 struct Payload<'a> {
-    data: &'a Value<'a>,
-    state: &'a Value<'a>,
+    /// The layers' names, in the order of the file.
+    names: Vec<&'a str>,
+    fields: BTreeMap<&'a str, &'a Value<'a>>,
+    tracks: BTreeMap<&'a str, &'a Value<'a>>,
+    settings: BTreeMap<&'a str, &'a Value<'a>>,
 }
 
 impl<'a> Payload<'a> {
@@ -99,28 +108,45 @@ impl<'a> Payload<'a> {
         let missing = |name: &str| bad(name, "is missing".into());
         let data = root.get("nre_data").ok_or_else(|| missing("nre_data"))?;
         let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
-        Ok(Self { data, state })
+        let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
+        let settings = data.get("config").and_then(|config| config.get("layers"));
+        let names = state.keys();
+        let names = names.filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
+        // A key may be repeated: the first one counts.
+        let mut seen = BTreeSet::new();
+        let names: Vec<&str> = names.filter(|&name| seen.insert(name)).collect();
+        if names.len() > limits::NUREC_LAYERS {
+            let reason =
+                format!("{} layers; at most {} are read", names.len(), limits::NUREC_LAYERS);
+            return Err(bad("nre_data.state_dict", reason));
+        }
+        Ok(Self {
+            names,
+            fields: state.index(),
+            tracks: tracks.map(Value::index).unwrap_or_default(),
+            settings: settings.map(Value::index).unwrap_or_default(),
+        })
     }
-}
 
-/// The names of all layers of Gaussians.
-fn layers_of<'a>(state: &'a Value<'a>) -> impl Iterator<Item = &'a str> {
-    state.keys().filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"))
-}
+    /// The tracks of a layer; none for a static one.
+    fn tracks_of(&self, layer: &str) -> &'a [Value<'a>] {
+        match self.tracks.get(layer) {
+            Some(Value::Array(ids)) => ids,
+            _ => &[],
+        }
+    }
 
-/// The tracks of a layer; none for a static one.
-fn tracks_of<'a>(state: &'a Value<'a>, layer: &str) -> &'a [Value<'a>] {
-    let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
-    match tracks.and_then(|tracks| tracks.get(layer)) {
-        Some(Value::Array(ids)) => ids,
-        _ => &[],
+    /// A layer of Gaussians.
+    fn layer(&self, name: &'a str) -> Result<Layer<'_>, IngestError> {
+        if let Some(settings) = self.settings.get(name) {
+            check_activations(settings, name)?;
+        }
+        Ok(Layer { fields: &self.fields, name })
     }
 }
 
 /// Checks that parameters have the activations that this reader assumes.
-fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
-    let layers = data.get("config").and_then(|config| config.get("layers"));
-    let Some(settings) = layers.and_then(|layers| layers.get(layer)) else { return Ok(()) };
+fn check_activations(settings: &Value<'_>, layer: &str) -> Result<(), IngestError> {
     let wanted = [
         ("density_activation", "sigmoid"),
         ("scale_activation", "exp"),
@@ -140,7 +166,7 @@ fn check_activations(data: &Value<'_>, layer: &str) -> Result<(), IngestError> {
 
 /// The arrays of one layer.
 struct Layer<'a> {
-    state: &'a Value<'a>,
+    fields: &'a BTreeMap<&'a str, &'a Value<'a>>,
     name: &'a str,
 }
 
@@ -176,7 +202,7 @@ impl Layer<'_> {
     /// The index of each Gaussian's track, stored as i32 or i64.
     fn cuboid_ids(&self, rows: usize, tracks: usize) -> Result<Vec<i64>, IngestError> {
         let key = self.key("gaussian_cuboid_ids");
-        let Some(Value::Bytes(bytes)) = self.state.get(&key) else {
+        let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
             return Err(bad(&key, "is not an array of bytes".into()));
         };
         let ids: Vec<i64> = if bytes.len() == 4 * rows {
@@ -201,7 +227,7 @@ impl Layer<'_> {
 
     /// The SH degree that training had reached, stored as i64.
     fn active_degree(&self) -> Option<u8> {
-        match self.state.get(&self.key("n_active_features")) {
+        match self.fields.get(&*self.key("n_active_features")) {
             Some(Value::Bytes(bytes)) => {
                 let degree = i64::from_le_bytes(**bytes.first_chunk().as_ref()?);
                 u8::try_from(degree).ok()
@@ -217,7 +243,7 @@ impl Layer<'_> {
         rows: Option<usize>,
     ) -> Result<Array<'_>, IngestError> {
         let key = self.key(field);
-        let shape = match self.state.get(&format!("{key}.shape")) {
+        let shape = match self.fields.get(&*format!("{key}.shape")) {
             Some(Value::Array(shape)) => shape.iter().map(Value::as_usize).collect(),
             _ => None,
         };
@@ -231,7 +257,7 @@ impl Layer<'_> {
                 format!("[{found_rows}, {found_columns}], not [{}, {}]", any(rows), any(columns));
             return Err(bad(&format!("{key}.shape"), reason));
         }
-        let Some(Value::Bytes(bytes)) = self.state.get(&key) else {
+        let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
             return Err(bad(&key, "is not an array of bytes".into()));
         };
         let values = found_rows as u128 * found_columns as u128;

@@ -2,6 +2,8 @@
 //!
 //! Source: the format's specification, msgpack.org. Values point into the bytes they come from.
 
+use std::collections::BTreeMap;
+
 use crate::limits;
 
 /// A value; types that NuRec's reader does not need are `Other`.
@@ -39,6 +41,18 @@ impl<'a> Value<'a> {
             .iter()
             .find(|(key, _)| matches!(key, Value::Text(key) if *key == name))
             .map(|e| &e.1)
+    }
+
+    /// The values of a map by their text keys, as [`Value::get`] finds them, but in logarithmic time.
+    pub(super) fn index(&self) -> BTreeMap<&'a str, &Value<'a>> {
+        let mut index = BTreeMap::new();
+        let entries = if let Value::Map(entries) = self { &entries[..] } else { &[] };
+        for (key, value) in entries {
+            if let Value::Text(key) = key {
+                index.entry(*key).or_insert(value);
+            }
+        }
+        index
     }
 
     /// The text keys of a map.

@@ -1,11 +1,12 @@
 //! The directory of twins: the paths of its parts, and the locks on them.
 
 use std::collections::BTreeSet;
-use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::store::StoreError;
+use crate::store::disk::{Disk, Lock, ReadFile, Wait};
 use crate::store::layout::{object_key, record_key};
 
 use super::files::{create_dirs, entries};
@@ -22,24 +23,19 @@ pub(super) const LOCK: &str = "lock";
 #[derive(Clone, Debug)]
 pub(in crate::store) struct Local {
     pub(super) root: PathBuf,
+    pub(super) disk: Arc<dyn Disk>,
 }
 
 /// An object's file.
 pub(super) struct OpenObject {
     pub(super) path: PathBuf,
-    pub(super) file: File,
+    pub(super) file: Box<dyn ReadFile>,
     pub(super) bytes: u64,
 }
 
-/// The file that is locked while a version is published.
-pub(super) struct PublishLock {
-    pub(super) path: PathBuf,
-    pub(super) file: File,
-}
-
 impl Local {
-    pub(in crate::store) fn new(root: &Path) -> Self {
-        Self { root: root.to_owned() }
+    pub(in crate::store) fn new(root: &Path, disk: Arc<dyn Disk>) -> Self {
+        Self { root: root.to_owned(), disk }
     }
 
     pub(super) fn record_file(&self, name: &str, number: u64) -> PathBuf {
@@ -52,8 +48,8 @@ impl Local {
 
     pub(super) fn open(&self, name: &str, hash: &str) -> Result<OpenObject, StoreError> {
         let path = self.object_file(name, hash);
-        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
-        let bytes = file.metadata().map_err(StoreError::io("read", &path))?.len();
+        let file = self.disk.open(&path).map_err(StoreError::io("open", &path))?;
+        let bytes = file.size_bytes().map_err(StoreError::io("read", &path))?;
         Ok(OpenObject { path, file, bytes })
     }
 
@@ -64,11 +60,11 @@ impl Local {
         named: &BTreeSet<String>,
     ) -> Result<(), StoreError> {
         let objects = self.root.join(name).join("objects");
-        for prefix in entries(&objects)? {
-            for hash in entries(&objects.join(&prefix))? {
+        for prefix in entries(&*self.disk, &objects)? {
+            for hash in entries(&*self.disk, &objects.join(&prefix))? {
                 if !named.contains(&hash) {
                     let path = objects.join(&prefix).join(&hash);
-                    fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
+                    self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
                 }
             }
         }
@@ -80,43 +76,40 @@ impl Local {
     /// directories are kept. The caller holds the publish lock.
     pub(super) fn remove_empty(&self, name: &str) {
         let twin = self.root.join(name);
-        for prefix in entries(&twin.join("objects")).unwrap_or_default() {
-            let _ = fs::remove_dir(twin.join("objects").join(prefix));
+        for prefix in entries(&*self.disk, &twin.join("objects")).unwrap_or_default() {
+            let _ = self.disk.remove_dir(&twin.join("objects").join(prefix));
         }
         for dir in [twin.join("objects"), twin.join("log"), twin] {
-            let _ = fs::remove_dir(dir);
+            let _ = self.disk.remove_dir(&dir);
         }
     }
 
     /// Waits until no other process publishes a version of a twin, and takes the publish lock.
-    pub(super) fn lock_publishing(&self, name: &str) -> Result<File, StoreError> {
-        create_dirs(&self.root.join(STAGING))?;
-        let PublishLock { path, file } = self.publish_lock(name)?;
-        file.lock().map_err(StoreError::io("lock", &path))?;
-        Ok(file)
+    pub(super) fn lock_publishing(&self, name: &str) -> Result<Option<Lock>, StoreError> {
+        create_dirs(&*self.disk, &self.root.join(STAGING))?;
+        self.publish_lock(name, Wait::Yes)
     }
 
-    /// Opens the publish lock. Its file is never removed: otherwise two commits could lock two
-    /// files of one name.
-    pub(super) fn publish_lock(&self, name: &str) -> Result<PublishLock, StoreError> {
+    /// Takes the publish lock; `None` if another process has it and this one does not wait. Its file is never
+    /// removed: otherwise two commits could lock two files of one name.
+    pub(super) fn publish_lock(&self, name: &str, wait: Wait) -> Result<Option<Lock>, StoreError> {
         let path = self.root.join(STAGING).join(format!("{name}.lock"));
-        let file = File::options().create(true).append(true).open(&path);
-        let file = file.map_err(StoreError::io("create", &path))?;
-        Ok(PublishLock { path, file })
+        self.disk.lock(&path, wait).map_err(StoreError::io("lock", &path))
     }
-}
 
-/// Whether no process holds the lock of a staging directory. The caller holds the publish lock.
-pub(super) fn is_abandoned(dir: &Path) -> Result<bool, StoreError> {
-    let path = dir.join(LOCK);
-    match File::options().append(true).open(&path) {
-        Ok(lock) => match lock.try_lock() {
-            Ok(()) => Ok(true),
-            Err(TryLockError::WouldBlock) => Ok(false),
-            Err(TryLockError::Error(cause)) => Err(StoreError::io("lock", &path)(cause)),
-        },
-        // Its process was killed before it created the lock, or is removing the directory now.
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(dir.exists()),
-        Err(error) => Err(StoreError::io("open", &path)(error)),
+    /// Whether something is at a path.
+    pub(super) fn exists(&self, path: &Path) -> bool {
+        self.disk.info(path).is_ok()
+    }
+
+    /// Whether no process holds the lock of a staging directory. The caller holds the publish lock.
+    pub(super) fn is_abandoned(&self, dir: &Path) -> Result<bool, StoreError> {
+        let path = dir.join(LOCK);
+        match self.disk.lock(&path, Wait::NoAndExisting) {
+            Ok(lock) => Ok(lock.is_some()),
+            // Its process was killed before it created the lock, or is removing the directory now.
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(self.exists(dir)),
+            Err(error) => Err(StoreError::io("lock", &path)(error)),
+        }
     }
 }

@@ -20,6 +20,7 @@ use std::time::{Duration, SystemTime};
 use crate::store::StoreError;
 use crate::store::layout::{check_hash, is_hash};
 
+use super::RealDisk;
 use super::files::{WRITING, create_dirs, entries};
 
 /// A part gets a new modification time when it is used and the old one is older than this.
@@ -54,7 +55,7 @@ impl DiskCache {
     /// # Errors
     /// It cannot be created or listed.
     pub(in crate::store) fn open(dir: &Path, limit_bytes: u64) -> Result<Self, StoreError> {
-        create_dirs(dir)?;
+        create_dirs(&RealDisk, dir)?;
         let cache = Self { dir: dir.to_owned(), limit_bytes, counts: Arc::default() };
         cache.make_room()?;
         Ok(cache)
@@ -122,7 +123,7 @@ impl DiskCache {
             return Ok(());
         }
         let mut parts = Vec::new();
-        for folder in entries(&self.dir)? {
+        for folder in entries(&RealDisk, &self.dir)? {
             let path = self.dir.join(&folder);
             if folder.starts_with(WRITING) {
                 if age(&path).is_some_and(|age| age > LEFT_AFTER) {
@@ -130,7 +131,7 @@ impl DiskCache {
                 }
                 continue;
             }
-            for part in entries(&path)?.into_iter().filter(|part| is_hash(part)) {
+            for part in entries(&RealDisk, &path)?.into_iter().filter(|part| is_hash(part)) {
                 let path = path.join(part);
                 // Another process may have removed it because it was damaged.
                 if let Ok(found) = fs::metadata(&path)

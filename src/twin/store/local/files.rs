@@ -1,10 +1,10 @@
 //! Files and directories, synced so that they survive a power cut.
 
-use std::fs::{self, File};
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::Path;
 
 use crate::store::StoreError;
+use crate::store::disk::Disk;
 
 /// Bytes read or written at once.
 pub(super) const BUFFER_BYTES: usize = 256 << 10;
@@ -13,18 +13,18 @@ pub(super) const WRITING: char = '~';
 
 /// A file, and the hash of what was read from it or written to it.
 #[derive(Debug)]
-pub(super) struct HashingFile {
-    pub(super) inner: File,
+pub(super) struct HashingFile<F> {
+    pub(super) inner: F,
     pub(super) hasher: blake3::Hasher,
 }
 
-impl HashingFile {
-    pub(super) fn new(inner: File) -> Self {
+impl<F> HashingFile<F> {
+    pub(super) fn new(inner: F) -> Self {
         Self { inner, hasher: blake3::Hasher::new() }
     }
 }
 
-impl Read for HashingFile {
+impl<F: Read> Read for HashingFile<F> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let read = self.inner.read(buffer)?;
         self.hasher.update(&buffer[..read]);
@@ -32,7 +32,7 @@ impl Read for HashingFile {
     }
 }
 
-impl Write for HashingFile {
+impl<F: Write> Write for HashingFile<F> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let written = self.inner.write(bytes)?;
         self.hasher.update(&bytes[..written]);
@@ -45,68 +45,65 @@ impl Write for HashingFile {
 }
 
 /// Names in a directory, sorted; none if it does not exist.
-pub(super) fn entries(dir: &Path) -> Result<Vec<String>, StoreError> {
-    let failed = || StoreError::io("list", dir);
-    let listing = match fs::read_dir(dir) {
+pub(super) fn entries(disk: &dyn Disk, dir: &Path) -> Result<Vec<String>, StoreError> {
+    let mut names = match disk.list(dir) {
         Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             return Ok(Vec::new());
         }
-        listing => listing.map_err(failed())?,
+        listing => listing.map_err(StoreError::io("list", dir))?,
     };
-    let mut names = Vec::new();
-    for entry in listing {
-        // The store writes only UTF-8 names, so any other is skipped.
-        names.extend(entry.map_err(failed())?.file_name().into_string());
-    }
     names.sort_unstable();
     Ok(names)
 }
 
 /// Creates the directory of a file, as [`create_dirs`].
-pub(super) fn create_parent(path: &Path) -> Result<(), StoreError> {
-    path.parent().map_or(Ok(()), create_dirs)
+pub(super) fn create_parent(disk: &dyn Disk, path: &Path) -> Result<(), StoreError> {
+    path.parent().map_or(Ok(()), |dir| create_dirs(disk, dir))
 }
 
 /// Creates a directory and the missing ones above it, and syncs each: what is written into a
 /// directory is lost in a power cut if the directory's own entry is.
-pub(super) fn create_dirs(dir: &Path) -> Result<(), StoreError> {
+pub(super) fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
+    let is_dir = || disk.info(dir).is_ok_and(|found| found.is_dir);
     // The parent of "twins" is "", which is the current directory.
-    if dir.as_os_str().is_empty() || dir.is_dir() {
+    if dir.as_os_str().is_empty() || is_dir() {
         return Ok(());
     }
-    create_parent(dir)?;
-    match fs::create_dir(dir) {
+    create_parent(disk, dir)?;
+    match disk.create_dir(dir) {
         // Another process may have created it in between.
-        Err(error) if error.kind() != ErrorKind::AlreadyExists || !dir.is_dir() => {
+        Err(error) if error.kind() != ErrorKind::AlreadyExists || !is_dir() => {
             Err(StoreError::io("create", dir)(error))
         }
-        _ => sync_parent(dir),
+        _ => sync_parent(disk, dir),
     }
 }
 
 /// Makes a new name durable by syncing its directory.
-pub(super) fn sync_parent(path: &Path) -> Result<(), StoreError> {
-    path.parent().map_or(Ok(()), sync)
+pub(super) fn sync_parent(disk: &dyn Disk, path: &Path) -> Result<(), StoreError> {
+    path.parent().map_or(Ok(()), |dir| sync(disk, dir))
 }
 
 /// Syncs a directory.
-pub(super) fn sync(dir: &Path) -> Result<(), StoreError> {
-    let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-    File::open(dir).and_then(|dir| dir.sync_all()).map_err(StoreError::io("sync", dir))
+pub(super) fn sync(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
+    disk.sync_dir(dir).map_err(StoreError::io("sync", dir))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
+    use crate::store::local::RealDisk;
 
     #[test]
     fn directories_are_created_with_those_above_them() {
         let dir = tempfile::tempdir().unwrap();
-        create_dirs(&dir.path().join("a/b/c")).unwrap();
-        create_dirs(&dir.path().join("a/b/c")).unwrap();
+        create_dirs(&RealDisk, &dir.path().join("a/b/c")).unwrap();
+        create_dirs(&RealDisk, &dir.path().join("a/b/c")).unwrap();
         assert!(dir.path().join("a/b/c").is_dir());
         fs::write(dir.path().join("file"), "").unwrap();
-        let said = create_dirs(&dir.path().join("file/d")).unwrap_err().to_string();
+        let said = create_dirs(&RealDisk, &dir.path().join("file/d")).unwrap_err().to_string();
         assert!(said.starts_with("cannot create"), "{said}");
     }
 }

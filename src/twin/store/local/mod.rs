@@ -3,26 +3,27 @@
 mod directory;
 mod disk_cache;
 mod files;
+mod real_disk;
 mod staging;
 
 use std::collections::BTreeSet;
-use std::fs::{self, File, TryLockError};
 use std::io::{ErrorKind, Read, Seek, SeekFrom, Write};
 use std::ops::Range;
-use std::path::Path;
-use std::time::UNIX_EPOCH;
+use std::path::{Path, PathBuf};
 
 use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
 use super::backend::{ListedObject, ObjectBackend, Staging};
-use super::layout::{ACTORS, check_hash, check_side_file, is_hash, log_numbers};
+use super::disk::{FileInfo, Lock, Wait};
+use super::layout::{ACTORS, LOCK_ENDING, check_hash, check_side_file, is_hash, log_numbers};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
+pub(super) use real_disk::RealDisk;
 
-use directory::{OpenObject, PublishLock, SEPARATOR, STAGING, is_abandoned};
+use directory::{OpenObject, SEPARATOR, STAGING};
 use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, sync_parent};
 use staging::LocalStaging;
 
@@ -32,7 +33,7 @@ impl ObjectBackend for Local {
     }
 
     fn twin_names(&self) -> Result<Vec<String>, StoreError> {
-        let mut names = entries(&self.root)?;
+        let mut names = entries(&*self.disk, &self.root)?;
         names.retain(|name| {
             is_name(name) && !self.version_numbers(name).is_ok_and(|n| n.is_empty())
         });
@@ -40,12 +41,12 @@ impl ObjectBackend for Local {
     }
 
     fn version_numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
-        Ok(log_numbers(entries(&self.root.join(name).join("log"))?))
+        Ok(log_numbers(entries(&*self.disk, &self.root.join(name).join("log"))?))
     }
 
     fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
         let path = self.record_path(name, number);
-        let file = File::open(&path).map_err(StoreError::io("open", &path))?;
+        let file = self.disk.open(&path).map_err(StoreError::io("open", &path))?;
         let mut bytes = Vec::new();
         file.take(limits::LOG_RECORD_BYTES)
             .read_to_end(&mut bytes)
@@ -134,7 +135,7 @@ impl ObjectBackend for Local {
 
     fn unfinished_commits(&self) -> Result<Vec<String>, StoreError> {
         let mut names = Vec::new();
-        for entry in entries(&self.root.join(STAGING))? {
+        for entry in entries(&*self.disk, &self.root.join(STAGING))? {
             let name = entry.split_once(SEPARATOR).map(|(name, _)| name);
             names.extend(name.filter(|name| is_name(name) || *name == ACTORS).map(str::to_owned));
         }
@@ -147,17 +148,13 @@ impl ObjectBackend for Local {
         name: &str,
         named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError> {
-        let PublishLock { path, file } = self.publish_lock(name)?;
-        match file.try_lock() {
-            Ok(()) => {}
-            // Another process publishes a version or does this.
-            Err(TryLockError::WouldBlock) => return Ok(()),
-            Err(TryLockError::Error(cause)) => return Err(StoreError::io("lock", &path)(cause)),
-        }
+        // Another process publishes a version or does this.
+        let Some(_lock) = self.publish_lock(name, Wait::No)? else { return Ok(()) };
         let mut abandoned = Vec::new();
-        for entry in entries(&self.root.join(STAGING))? {
+        for entry in entries(&*self.disk, &self.root.join(STAGING))? {
             let dir = self.root.join(STAGING).join(&entry);
-            if entry.split_once(SEPARATOR).is_some_and(|(of, _)| of == name) && is_abandoned(&dir)?
+            if entry.split_once(SEPARATOR).is_some_and(|(of, _)| of == name)
+                && self.is_abandoned(&dir)?
             {
                 abandoned.push(dir);
             }
@@ -170,7 +167,7 @@ impl ObjectBackend for Local {
             self.remove_unnamed(name, &named)?;
         }
         for dir in abandoned {
-            match fs::remove_dir_all(&dir) {
+            match self.disk.remove_all(&dir) {
                 Err(error) if error.kind() != ErrorKind::NotFound => {
                     return Err(StoreError::io("remove", &dir)(error));
                 }
@@ -181,18 +178,27 @@ impl ObjectBackend for Local {
         Ok(())
     }
 
+    fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError> {
+        let _publish_lock = self.lock_publishing(name)?;
+        let path = self.record_file(name, number);
+        // Any name will do that is not ten digits: readers ignore it.
+        let id = uuid::Uuid::now_v7().as_simple().to_string();
+        let aside = path.with_extension(format!("damaged-{id}"));
+        self.disk.rename(&path, &aside).map_err(StoreError::io("rename", &path))?;
+        sync_parent(&*self.disk, &path)?;
+        Ok(aside)
+    }
+
     fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
         let objects = self.root.join(name).join("objects");
         let mut listed = Vec::new();
-        for prefix in entries(&objects)? {
-            for hash in entries(&objects.join(&prefix))? {
+        for prefix in entries(&*self.disk, &objects)? {
+            for hash in entries(&*self.disk, &objects.join(&prefix))? {
                 let path = objects.join(&prefix).join(&hash);
-                let found = fs::metadata(&path).map_err(StoreError::io("find", &path))?;
-                let written = found.modified().map_err(StoreError::io("find", &path))?;
-                let since = written.duration_since(UNIX_EPOCH).unwrap_or_default();
-                if is_hash(&hash) {
-                    let written_us = i64::try_from(since.as_micros()).unwrap_or(i64::MAX);
-                    listed.push(ListedObject { hash, bytes: found.len(), written_us });
+                let found = self.disk.info(&path).map_err(StoreError::io("find", &path))?;
+                if is_hash(&hash) && found.is_file {
+                    let FileInfo { bytes, modified_us: written_us, .. } = found;
+                    listed.push(ListedObject { hash, bytes, written_us });
                 }
             }
         }
@@ -207,21 +213,21 @@ impl ObjectBackend for Local {
         let _publish_lock = self.lock_publishing(name)?;
         for hash in which()? {
             let path = self.object_file(name, &hash);
-            fs::remove_file(&path).map_err(StoreError::io("remove", &path))?;
+            self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
         }
         self.remove_empty(name);
         Ok(())
     }
 
     fn list_side_files(&self, name: &str, folder: &str) -> Result<Vec<String>, StoreError> {
-        let mut files = entries(&self.root.join(name).join(folder))?;
+        let mut files = entries(&*self.disk, &self.root.join(name).join(folder))?;
         files.retain(|file| !file.starts_with(WRITING));
         Ok(files)
     }
 
     fn read_side_file(&self, name: &str, file: &str) -> Result<Option<Vec<u8>>, StoreError> {
         let path = self.root.join(name).join(file);
-        let file = match File::open(&path) {
+        let file = match self.disk.open(&path) {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             opened => opened.map_err(StoreError::io("open", &path))?,
         };
@@ -239,21 +245,55 @@ impl ObjectBackend for Local {
     fn write_side_file(&self, name: &str, file: &str, bytes: &[u8]) -> Result<(), StoreError> {
         let path = self.root.join(name).join(file);
         check_side_file(path.clone(), bytes)?;
-        create_parent(&path)?;
+        create_parent(&*self.disk, &path)?;
         // A unique name, because threads of one process may write the same side file.
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let writing = path.with_file_name(format!("{WRITING}{id}"));
-        let mut file = File::create(&writing).map_err(StoreError::io("write", &writing))?;
+        let mut file = self.disk.create(&writing).map_err(StoreError::io("write", &writing))?;
         file.write_all(bytes)
-            .and_then(|()| file.sync_all())
-            .and_then(|()| fs::rename(&writing, &path))
+            .and_then(|()| file.sync())
+            .and_then(|()| self.disk.rename(&writing, &path))
             .map_err(StoreError::io("write", &path))?;
-        sync_parent(&path)
+        sync_parent(&*self.disk, &path)
+    }
+
+    fn remove_leftovers(&self, name: &str, folder: &str, before_us: i64) -> Result<(), StoreError> {
+        let dir = self.root.join(name).join(folder);
+        let files = entries(&*self.disk, &dir)?;
+        for file in &files {
+            let is_leftover = match file.strip_suffix(LOCK_ENDING) {
+                Some(of) => {
+                    let is_used = files.iter().any(|other| other == of);
+                    !is_used && !self.is_held(name, &format!("{folder}/{file}"))?
+                }
+                None => file.starts_with(WRITING),
+            };
+            let path = dir.join(file);
+            if is_leftover && self.disk.info(&path).is_ok_and(|found| found.modified_us < before_us)
+            {
+                self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError> {
+        let path = self.root.join(name).join(file);
+        create_parent(&*self.disk, &path)?;
+        self.disk.lock(&path, Wait::Yes).map_err(StoreError::io("lock", &path))
+    }
+
+    fn is_held(&self, name: &str, file: &str) -> Result<bool, StoreError> {
+        let path = self.root.join(name).join(file);
+        match self.disk.lock(&path, Wait::NoAndExisting) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(false),
+            lock => Ok(lock.map_err(StoreError::io("lock", &path))?.is_none()),
+        }
     }
 
     fn remove_side_file(&self, name: &str, file: &str) -> Result<(), StoreError> {
         let path = self.root.join(name).join(file);
-        match fs::remove_file(&path) {
+        match self.disk.remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => {
                 Err(StoreError::io("remove", &path)(error))
             }
@@ -265,6 +305,8 @@ impl ObjectBackend for Local {
 #[cfg(test)]
 mod tests {
     use super::directory::LOCK;
+    use std::sync::Arc;
+
     use super::*;
 
     fn begin(local: &Local, name: &str, commit: &str) -> Result<LocalStaging, StoreError> {
@@ -274,7 +316,7 @@ mod tests {
     #[test]
     fn a_number_is_taken_once_and_a_refused_commit_leaves_nothing() {
         let dir = tempfile::tempdir().unwrap();
-        let objects = Local::new(dir.path());
+        let objects = Local::new(dir.path(), Arc::new(RealDisk));
         let commit = |content: &[u8]| {
             let mut staging = begin(&objects, "street", "a")?;
             let put = staging.put(Box::new(|out| out.write_all(content)))?;
@@ -299,7 +341,7 @@ mod tests {
     #[test]
     fn the_error_of_a_version_that_is_not_synced_says_that_it_is_in_place() {
         let dir = tempfile::tempdir().unwrap();
-        let objects = Local::new(dir.path());
+        let objects = Local::new(dir.path(), Arc::new(RealDisk));
         let staging = begin(&objects, "street", "a").unwrap();
         let source = StoreError::io("sync", dir.path())(ErrorKind::StorageFull.into());
         let said = staging.not_synced(3, source).to_string();
@@ -310,9 +352,9 @@ mod tests {
     #[test]
     fn only_abandoned_staging_is_removed() {
         let dir = tempfile::tempdir().unwrap();
-        let objects = Local::new(dir.path());
+        let objects = Local::new(dir.path(), Arc::new(RealDisk));
         let staged = || {
-            let mut names = entries(&dir.path().join(STAGING)).unwrap();
+            let mut names = entries(&RealDisk, &dir.path().join(STAGING)).unwrap();
             names.retain(|name| name.contains(SEPARATOR));
             names
         };

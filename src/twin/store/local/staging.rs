@@ -1,12 +1,12 @@
 //! A commit in preparation, in a directory of its own.
 
 use std::collections::BTreeSet;
-use std::fs::{self, File};
 use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use crate::store::StoreError;
 use crate::store::backend::{Staging, StoredObject, WriteObject};
+use crate::store::disk::{Lock, Wait};
 
 use super::directory::{LOCK, Local, SEPARATOR, STAGING};
 use super::files::{BUFFER_BYTES, HashingFile, create_parent, sync, sync_parent};
@@ -22,9 +22,9 @@ pub(super) struct LocalStaging {
     placed: Vec<PathBuf>,
     /// The publish lock. While it is held, no other commit can rely on an object that may be
     /// removed again.
-    publish_lock: Option<File>,
+    publish_lock: Option<Lock>,
     /// Released by the kernel when the process ends, however it ends.
-    _lock: File,
+    _lock: Option<Lock>,
 }
 
 impl LocalStaging {
@@ -34,10 +34,9 @@ impl LocalStaging {
         // its own lock is taken.
         let _publish_lock = local.lock_publishing(name)?;
         let dir = local.root.join(STAGING).join(format!("{name}{SEPARATOR}{commit}"));
-        fs::create_dir(&dir).map_err(StoreError::io("create", &dir))?;
+        local.disk.create_dir(&dir).map_err(StoreError::io("create", &dir))?;
         let path = dir.join(LOCK);
-        let lock = File::create_new(&path).map_err(StoreError::io("create", &path))?;
-        lock.lock().map_err(StoreError::io("lock", &path))?;
+        let lock = local.disk.lock(&path, Wait::Yes).map_err(StoreError::io("lock", &path))?;
         Ok(Self {
             local: local.clone(),
             name: name.to_owned(),
@@ -57,18 +56,18 @@ impl LocalStaging {
         let mut changed = BTreeSet::new();
         for hash in hashes {
             let staged = self.dir.join(hash);
-            if !staged.exists() {
+            if !self.local.exists(&staged) {
                 continue;
             }
             let path = self.local.object_file(&self.name, hash);
-            create_parent(&path)?;
-            if !path.exists() {
+            create_parent(&*self.local.disk, &path)?;
+            if !self.local.exists(&path) {
                 self.placed.push(path.clone());
             }
-            fs::rename(&staged, &path).map_err(StoreError::io("write", &path))?;
+            self.local.disk.rename(&staged, &path).map_err(StoreError::io("write", &path))?;
             changed.insert(path.parent().map(Path::to_owned));
         }
-        changed.iter().flatten().try_for_each(|dir| sync(dir))
+        changed.iter().flatten().try_for_each(|dir| sync(&*self.local.disk, dir))
     }
 }
 
@@ -76,20 +75,20 @@ impl Staging for LocalStaging {
     fn put(&mut self, write: WriteObject<'_>) -> Result<StoredObject, StoreError> {
         let path = self.dir.join("writing");
         let failed = || StoreError::io("write", &path);
-        let file = File::create(&path).map_err(failed())?;
+        let file = self.local.disk.create(&path).map_err(failed())?;
         let mut writer = BufWriter::with_capacity(BUFFER_BYTES, HashingFile::new(file));
         write(&mut writer).map_err(failed())?;
-        let HashingFile { inner: file, hasher } =
+        let HashingFile { inner: mut file, hasher } =
             writer.into_inner().map_err(|e| e.into_error()).map_err(failed())?;
-        file.sync_all().map_err(failed())?;
+        file.sync().map_err(failed())?;
         let hash = hasher.finalize().to_hex().to_string();
         let staged = self.dir.join(&hash);
-        fs::rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
+        self.local.disk.rename(&path, &staged).map_err(StoreError::io("rename", &staged))?;
         Ok(StoredObject { hash, bytes: hasher.count() })
     }
 
     fn lock_publishing(&mut self) -> Result<(), StoreError> {
-        self.publish_lock = Some(self.local.lock_publishing(&self.name)?);
+        self.publish_lock = self.local.lock_publishing(&self.name)?;
         Ok(())
     }
 
@@ -102,18 +101,18 @@ impl Staging for LocalStaging {
         self.place(hashes)?;
         let staged = self.dir.join("record");
         let failed = || StoreError::io("write", &staged);
-        let mut file = File::create(&staged).map_err(failed())?;
-        file.write_all(record).and_then(|()| file.sync_all()).map_err(failed())?;
+        let mut file = self.local.disk.create(&staged).map_err(failed())?;
+        file.write_all(record).and_then(|()| file.sync()).map_err(failed())?;
         let path = self.local.record_file(&self.name, number);
-        create_parent(&path)?;
+        create_parent(&*self.local.disk, &path)?;
         // Put if absent: a hard link, unlike a rename, fails if the number is taken.
-        fs::hard_link(&staged, &path).map_err(|source| match source.kind() {
+        self.local.disk.link(&staged, &path).map_err(|source| match source.kind() {
             ErrorKind::AlreadyExists => StoreError::Conflict { name: self.name.clone(), number },
             _ => StoreError::io("write", &path)(source),
         })?;
         // From here on a reader may have seen the version, so its objects are not removed again.
         self.placed.clear();
-        sync_parent(&path).map_err(|error| self.not_synced(number, error))
+        sync_parent(&*self.local.disk, &path).map_err(|error| self.not_synced(number, error))
     }
 
     fn place_objects(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
@@ -126,7 +125,7 @@ impl Staging for LocalStaging {
         self.place(hashes)?;
         self.placed.clear();
         let path = self.local.record_file(&self.name, number);
-        sync_parent(&path).map_err(|error| self.not_synced(number, error))
+        sync_parent(&*self.local.disk, &path).map_err(|error| self.not_synced(number, error))
     }
 
     fn dir(&self) -> &Path {
@@ -139,10 +138,10 @@ impl Drop for LocalStaging {
     fn drop(&mut self) {
         if self.publish_lock.is_some() {
             for path in &self.placed {
-                let _ = fs::remove_file(path);
+                let _ = self.local.disk.remove_file(path);
             }
             self.local.remove_empty(&self.name);
         }
-        let _ = fs::remove_dir_all(&self.dir);
+        let _ = self.local.disk.remove_all(&self.dir);
     }
 }

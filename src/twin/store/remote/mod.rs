@@ -13,7 +13,7 @@ mod url;
 use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::ops::Range;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use futures_util::{StreamExt, TryStreamExt};
 use object_store::{ObjectMeta, ObjectStoreExt, PutPayload};
@@ -23,6 +23,7 @@ use wildcity_scene::rig::is_name;
 
 use super::StoreError;
 use super::backend::{ListedObject, ObjectBackend, Staging};
+use super::disk::Lock;
 use super::layout::{check_side_file, is_hash, log_numbers, object_key, record_key};
 
 pub(super) use client::Remote;
@@ -138,6 +139,26 @@ impl ObjectBackend for Remote {
                 Ok(bytes)
             }
         })
+    }
+
+    fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError> {
+        let path = self.record_path(name, number);
+        let reason =
+            "an object store has no rename; move the object away with the store's own tools";
+        Err(StoreError::io("set aside", &path)(std::io::Error::new(ErrorKind::Unsupported, reason)))
+    }
+
+    fn remove_leftovers(&self, _: &str, _: &str, _: i64) -> Result<(), StoreError> {
+        // A put is all or nothing, and there are no locks.
+        Ok(())
+    }
+
+    fn hold(&self, _: &str, _: &str) -> Result<Option<Lock>, StoreError> {
+        Ok(None)
+    }
+
+    fn is_held(&self, _: &str, _: &str) -> Result<bool, StoreError> {
+        Ok(false)
     }
 
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError> {

@@ -1,17 +1,22 @@
 //! The preview of a push: compares small images of the base and of the version that the push would make.
 
+pub(crate) mod psnr;
+
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::chunk::cell_at;
-use wildcity_session::{ProposedChange, PsnrPreview};
 use wildcity_twin::store::{StoreError, Version};
 
 use crate::error::PushError;
 use crate::limits;
 use crate::report::PushReport;
 use crate::request::{PushRequest, profile_with};
+
+pub use psnr::PsnrPreview;
+
+use psnr::ProposedChange;
 
 /// What the preview compares: the base with the replaced cells. None if there is no base, or if it
 /// cannot be compared.

@@ -1,0 +1,152 @@
+//! The room that uploads take: of all tokens together, and of each.
+//!
+//! An upload takes room for the bytes that have arrived. While it is active, it also has room for a few more, so that
+//! uploads that were accepted seldom meet a full spool. An announcement whose bytes do not come loses this room after
+//! minutes: otherwise a token could keep all others from uploading without sending anything.
+
+use std::sync::Arc;
+
+use crate::config::SpoolLimits;
+use crate::fault::Fault;
+use crate::limits;
+
+use super::upload::{RemovedFiles, Upload};
+use super::{SpoolUsage, Uploads};
+
+/// The limits of uploads, in all and per token.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Quota {
+    all: SpoolUsage,
+    token: SpoolUsage,
+}
+
+/// What a new state of an upload would take.
+#[derive(Clone, Copy)]
+struct Demand<'a> {
+    upload: &'a Upload,
+    bytes: u64,
+}
+
+impl Quota {
+    /// The limits of a spool that so many tokens may use.
+    pub(super) fn new(limits: SpoolLimits, tokens: usize) -> Self {
+        let all = SpoolUsage { uploads: limits.uploads, bytes: limits.bytes };
+        // One token alone may have all.
+        let share = if tokens > 1 { limits::TOKEN_SHARE } else { 1 };
+        let bytes = limits.token_bytes.unwrap_or(all.bytes / share).min(all.bytes);
+        let uploads = all.uploads.div_ceil(share as usize);
+        Self { all, token: SpoolUsage { uploads, bytes } }
+    }
+
+    /// Removes uploads until a new one fits.
+    ///
+    /// # Errors
+    /// [`Fault::StorageFull`].
+    pub(super) fn make_room_for_new(
+        &self,
+        uploads: &mut Uploads,
+        upload: &Upload,
+        removed: &mut Vec<RemovedFiles>,
+    ) -> Result<(), Fault> {
+        // One that can never fit is refused before it is sent.
+        let size = upload.announced().size;
+        if size > self.token.bytes {
+            let most = self.token.bytes;
+            let reason = format!("{size} bytes, and a token may keep {most}; send it in parts");
+            return Err(Fault::StorageFull { reason });
+        }
+        let bytes = size.min(limits::RESERVED_BYTES);
+        self.make_room(uploads, Demand { upload, bytes }, removed)
+    }
+
+    /// Removes uploads until more bytes of one fit.
+    ///
+    /// # Errors
+    /// [`Fault::StorageFull`].
+    pub(super) fn make_room_for_more(
+        &self,
+        uploads: &mut Uploads,
+        upload: &Upload,
+        more_bytes: u64,
+        removed: &mut Vec<RemovedFiles>,
+    ) -> Result<(), Fault> {
+        let bytes = upload.offset().saturating_add(more_bytes).max(room_of(upload));
+        self.make_room(uploads, Demand { upload, bytes }, removed)
+    }
+
+    fn make_room(
+        &self,
+        uploads: &mut Uploads,
+        demand: Demand<'_>,
+        removed: &mut Vec<RemovedFiles>,
+    ) -> Result<(), Fault> {
+        let owner = demand.upload.owner();
+        loop {
+            let others = || uploads.values().filter(|known| known.stem() != demand.upload.stem());
+            let own = usage(others().filter(|known| known.owner() == owner));
+            let all = usage(others());
+            let is_own_full = !self.token.fits(own, demand.bytes);
+            if !is_own_full && self.all.fits(all, demand.bytes) {
+                return Ok(());
+            }
+            // The token's own uploads go first, and nothing else may go if the token's own quota is full.
+            let is_removable = |known: &&Arc<Upload>| {
+                is_removable(known, owner) && (!is_own_full || known.owner() == owner)
+            };
+            let first = others()
+                .filter(is_removable)
+                .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used()));
+            let Some(stem) = first.map(|known| known.stem().to_owned()) else {
+                let (whose, kept, most) = match is_own_full {
+                    true => ("this token keeps", own, self.token),
+                    false => ("the server keeps", all, self.all),
+                };
+                let reason = format!(
+                    "{whose} {} uploads of {} bytes, of at most {} uploads and {} bytes; push what is \
+                     uploaded, or wait",
+                    kept.uploads, kept.bytes, most.uploads, most.bytes
+                );
+                return Err(Fault::StorageFull { reason });
+            };
+            if let Some(upload) = uploads.remove(&stem) {
+                removed.push(upload.set_aside());
+            }
+        }
+    }
+}
+
+impl SpoolUsage {
+    /// Whether one more upload of so many bytes fits.
+    fn fits(self, used: Self, bytes: u64) -> bool {
+        let sum = used.bytes.checked_add(bytes);
+        used.uploads < self.uploads && sum.is_some_and(|sum| sum <= self.bytes)
+    }
+}
+
+/// What uploads take.
+pub(super) fn usage<'a>(uploads: impl Iterator<Item = &'a Arc<Upload>>) -> SpoolUsage {
+    uploads.fold(SpoolUsage::default(), |sum, upload| SpoolUsage {
+        uploads: sum.uploads + 1,
+        bytes: sum.bytes.saturating_add(room_of(upload)),
+    })
+}
+
+/// Bytes that an upload takes: those that have arrived, and those that are reserved.
+fn room_of(upload: &Upload) -> u64 {
+    let held = upload.offset();
+    let is_active = upload.idle() < limits::RESERVED_FOR;
+    let reserved = if is_active && !upload.is_complete() { limits::RESERVED_BYTES } else { 0 };
+    held.saturating_add(reserved).min(upload.announced().size)
+}
+
+/// Whether an upload may be removed to make room for one of a token: nothing uses it, and it is complete or has been
+/// idle for a while. A complete upload of another token must have been idle, too: its push may be about to come.
+fn is_removable(upload: &Arc<Upload>, owner: &str) -> bool {
+    if Arc::strong_count(upload) > 1 {
+        return false;
+    }
+    let is_own_complete = upload.is_complete() && upload.owner() == owner;
+    let is_empty = !upload.is_complete() && upload.offset() == 0;
+    let wait = if is_empty { limits::RESERVED_FOR } else { limits::KEPT_FOR };
+    is_own_complete || upload.idle() >= wait
+}

@@ -1,0 +1,386 @@
+//! The queue of frames in front of the render threads.
+//!
+//! There are as many render threads as the backend keeps frames in flight. The cpu backend renders one,
+//! on all cores: two at once would take as long together and hold twice the memory. A GPU renders one
+//! frame while the one before is encoded. The sessions take turns ([`fair`]).
+//!
+//! **A frame of seconds does not keep the others waiting.** While a large frame is rendered, another thread renders
+//! the small ones, if the backend can do both at once: the operating system shares the cores among them.
+//!
+//! **A frame that cannot be ready in time is not begun.** The time that large frames take per pixel is measured. One that
+//! cannot be done before its deadline is refused when it comes, or when its turn comes: otherwise a server with too
+//! many large frames would discard most of what it renders.
+
+mod fair;
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::time::Duration;
+
+use parking_lot::{Condvar, Mutex};
+use tokio::sync::oneshot;
+use tokio::time::{Instant, timeout_at};
+
+use wildcity_render::Backend;
+
+use crate::error::SessionError;
+use crate::limits;
+
+pub use fair::FrameCost;
+
+use fair::FairQueue;
+
+/// Buffers for RGB images that are encoded and then discarded. A render thread keeps its own between
+/// frames, so that no step allocates them.
+pub type Scratch = Vec<Vec<u8>>;
+
+/// One frame that waits.
+struct Job {
+    deadline: Instant,
+    work: Box<dyn FnOnce(&mut Scratch) + Send>,
+}
+
+/// The queue, whose render threads end when it is dropped.
+pub(crate) struct RenderQueue {
+    shared: Arc<Shared>,
+}
+
+struct Shared {
+    backend: Arc<dyn Backend>,
+    state: Mutex<State>,
+    /// Signalled when a frame comes, when a large one is begun, and when the queue is dropped.
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    queue: FairQueue<Job>,
+    is_closed: bool,
+    /// Pixels of the large frames that are being rendered.
+    rendering: u64,
+    /// Nanoseconds that a large frame takes per pixel: a moving average; 0 before the first one.
+    ns_per_pixel: f64,
+    /// Whether there is a thread for small frames.
+    has_side_thread: bool,
+}
+
+/// Which frames a render thread takes.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Lane {
+    /// All of them.
+    Main,
+    /// Small ones, while a large one is rendered.
+    Side,
+}
+
+impl RenderQueue {
+    /// Starts the render threads.
+    ///
+    /// # Errors
+    /// [`SessionError::Thread`] if one cannot be started.
+    pub(crate) fn start(backend: Arc<dyn Backend>) -> Result<Self, SessionError> {
+        let threads = backend.frames_in_flight().max(1);
+        let shared = Shared { backend, state: Mutex::default(), changed: Condvar::new() };
+        let queue = Self { shared: Arc::new(shared) };
+        for number in 0..threads {
+            queue.shared.clone().start_thread(format!("render-{number}"), Lane::Main)?;
+        }
+        Ok(queue)
+    }
+
+    /// The backend that the render threads use.
+    pub(crate) fn backend(&self) -> &dyn Backend {
+        &*self.shared.backend
+    }
+
+    /// Jobs that wait for a render thread.
+    pub(crate) fn len(&self) -> usize {
+        self.shared.state.lock().queue.len()
+    }
+
+    /// Runs `work` on a render thread. Returns its result and how long it was queued.
+    ///
+    /// # Errors
+    /// [`SessionError::Busy`] if the queue is full, or the frames before it leave it no time;
+    /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
+    /// result by the deadline. Work that has not started by then never starts; work that has is finished, and
+    /// its result is discarded.
+    pub(crate) async fn run<T: Send + 'static>(
+        &self,
+        cost: FrameCost,
+        deadline: Instant,
+        work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
+    ) -> Result<(T, Duration), SessionError> {
+        let (reply, answer) = oneshot::channel();
+        let requested = Instant::now();
+        let backend = self.shared.backend.clone();
+        let job = move |scratch: &mut Scratch| {
+            let queued = requested.elapsed();
+            if reply.is_closed() {
+                return;
+            }
+            // A panic in one session's frame must not end the thread that renders for all sessions.
+            let result = catch_unwind(AssertUnwindSafe(|| work(scratch, &*backend)));
+            // Sending fails if the deadline has passed and the receiver is gone.
+            let _ = reply.send(result.map(|result| (result, queued)));
+        };
+        self.shared.add(cost, Job { deadline, work: Box::new(job) })?;
+        match timeout_at(deadline, answer).await {
+            Ok(Ok(Ok(result))) => Ok(result),
+            Ok(Ok(Err(_panic))) => Err(SessionError::Crashed),
+            // The job was dropped without a reply: it could not be done by its deadline.
+            Ok(Err(_)) | Err(_) => Err(SessionError::DeadlineExceeded),
+        }
+    }
+}
+
+impl Drop for RenderQueue {
+    fn drop(&mut self) {
+        self.shared.state.lock().is_closed = true;
+        self.shared.changed.notify_all();
+    }
+}
+
+impl Shared {
+    fn start_thread(self: Arc<Self>, name: String, lane: Lane) -> Result<(), SessionError> {
+        let body = move || self.run_jobs(lane);
+        let started = std::thread::Builder::new().name(name).spawn(body);
+        started.map(|_| ()).map_err(|error| SessionError::Thread { reason: error.to_string() })
+    }
+
+    fn add(self: &Arc<Self>, cost: FrameCost, job: Job) -> Result<(), SessionError> {
+        let mut state = self.state.lock();
+        if state.queue.len() >= limits::QUEUED_FRAMES {
+            return Err(SessionError::Busy { what: "frames queued" });
+        }
+        if is_large(cost) {
+            let before = state.rendering / 2 + state.queue.pixels_above(limits::LARGE_PIXELS);
+            if Instant::now() + state.time_for(before.saturating_add(cost.pixels)) > job.deadline {
+                return Err(SessionError::Busy { what: "pixels queued" });
+            }
+        }
+        // A backend that renders one frame at a time has no use for the thread, and one without large
+        // frames never gets it.
+        let needs_side_thread =
+            state.rendering > 0 && !state.has_side_thread && self.backend.renders_beside();
+        state.queue.push(cost, job);
+        if needs_side_thread {
+            // Without the thread, small frames wait for the large one.
+            state.has_side_thread =
+                self.clone().start_thread("render-side".into(), Lane::Side).is_ok();
+        }
+        drop(state);
+        self.changed.notify_all();
+        Ok(())
+    }
+
+    /// The body of a render thread: runs one job after the other until the queue is closed.
+    fn run_jobs(&self, lane: Lane) {
+        let mut scratch = Scratch::new();
+        while let Some((cost, job)) = self.next(lane) {
+            let begun = Instant::now();
+            (job.work)(&mut scratch);
+            free_large(&mut scratch);
+            if is_large(cost) {
+                self.state.lock().rendered(cost, begun.elapsed());
+            }
+        }
+    }
+
+    /// Waits for the next job of a lane that can be done in time; `None` once the queue is closed.
+    fn next(&self, lane: Lane) -> Option<(FrameCost, Job)> {
+        let mut state = self.state.lock();
+        loop {
+            if state.is_closed {
+                return None;
+            }
+            let most_pixels = match lane {
+                Lane::Main => Some(u64::MAX),
+                Lane::Side => (state.rendering > 0).then_some(limits::LARGE_PIXELS),
+            };
+            let Some((cost, job)) = most_pixels.and_then(|most| state.queue.pop(most)) else {
+                self.changed.wait(&mut state);
+                continue;
+            };
+            let needed = if is_large(cost) { state.time_for(cost.pixels) } else { Duration::ZERO };
+            if Instant::now() + needed >= job.deadline {
+                // Dropping the job answers its session.
+                continue;
+            }
+            if is_large(cost) {
+                state.rendering += cost.pixels;
+                drop(state);
+                self.changed.notify_all();
+            }
+            return Some((cost, job));
+        }
+    }
+}
+
+impl State {
+    /// The expected time to render so many pixels of large frames.
+    fn time_for(&self, pixels: u64) -> Duration {
+        Duration::from_secs_f64(pixels as f64 * self.ns_per_pixel * 1e-9)
+    }
+
+    /// Notes that a large frame was rendered.
+    fn rendered(&mut self, cost: FrameCost, took: Duration) {
+        self.rendering -= cost.pixels;
+        let measured = took.as_secs_f64() * 1e9 / cost.pixels as f64;
+        let is_first = self.ns_per_pixel == 0.0;
+        self.ns_per_pixel =
+            if is_first { measured } else { 0.75 * self.ns_per_pixel + 0.25 * measured };
+    }
+}
+
+/// Whether a frame takes so long that small ones do not wait for it.
+fn is_large(cost: FrameCost) -> bool {
+    cost.pixels > limits::LARGE_PIXELS
+}
+
+/// Frees the buffers that only unusually large images need.
+fn free_large(scratch: &mut Scratch) {
+    scratch.retain(|image| image.capacity() <= limits::SCRATCH_IMAGE_BYTES);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use wildcity_render::{Frame, FrameStats, OnViewDone, RenderError, Target};
+
+    #[test]
+    fn buffers_of_unusually_large_images_are_freed() {
+        let mut scratch = vec![vec![0; limits::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
+        free_large(&mut scratch);
+        assert_eq!(scratch, [vec![0; 1000]]);
+    }
+
+    /// Renders nothing, and reports a given number of frames in flight.
+    struct IdleBackend {
+        frames_in_flight: usize,
+    }
+
+    impl Backend for IdleBackend {
+        fn name(&self) -> &'static str {
+            "idle"
+        }
+
+        fn renders_beside(&self) -> bool {
+            true
+        }
+
+        fn frames_in_flight(&self) -> usize {
+            self.frames_in_flight
+        }
+
+        fn render(
+            &self,
+            _: &Frame<'_>,
+            _: &mut [Target<'_>],
+            _: OnViewDone<'_>,
+        ) -> Result<FrameStats, RenderError> {
+            Ok(FrameStats::default())
+        }
+    }
+
+    const SMALL: FrameCost = FrameCost { session: 0, pixels: 768 };
+
+    /// How many jobs run now, and the most that ever ran at once.
+    #[derive(Default)]
+    struct Running {
+        now: usize,
+        most: usize,
+    }
+
+    #[tokio::test]
+    async fn as_many_frames_run_at_once_as_the_backend_renders() {
+        for frames_in_flight in [1, 3] {
+            let queue = RenderQueue::start(Arc::new(IdleBackend { frames_in_flight })).unwrap();
+            let running = Arc::new(Mutex::new(Running::default()));
+            let jobs = (0..frames_in_flight + 3).map(|_| {
+                let running = running.clone();
+                queue.run(SMALL, Instant::now() + limits::STEP_TIMEOUT, move |_, _| {
+                    let begun = Instant::now();
+                    let most = || {
+                        let mut running = running.lock();
+                        running.most = running.most.max(running.now);
+                        running.most
+                    };
+                    running.lock().now += 1;
+                    // Wait for the others that should run now, and a little longer for one too many.
+                    while most() < frames_in_flight && begun.elapsed() < Duration::from_secs(10) {
+                        std::thread::sleep(Duration::from_millis(1));
+                    }
+                    std::thread::sleep(Duration::from_millis(20));
+                    most();
+                    running.lock().now -= 1;
+                })
+            });
+            for result in futures_util::future::join_all(jobs).await {
+                result.unwrap();
+            }
+            let running = running.lock();
+            assert_eq!((running.now, running.most), (0, frames_in_flight));
+        }
+    }
+
+    fn large(session: u64) -> FrameCost {
+        FrameCost { session, pixels: 2 * limits::LARGE_PIXELS }
+    }
+
+    /// Twelve sessions with large frames of 100 ms beside one with small frames of 1 ms.
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn small_frames_do_not_wait_for_large_ones() {
+        let queue = RenderQueue::start(Arc::new(IdleBackend { frames_in_flight: 1 })).unwrap();
+        let queue = Arc::new(queue);
+        let end = Instant::now() + Duration::from_secs(2);
+        let sleeping = |cost: FrameCost, time: Duration| {
+            let queue = queue.clone();
+            async move {
+                let mut steps = 0;
+                while Instant::now() < end {
+                    let work = move |_: &mut Scratch, _: &dyn Backend| std::thread::sleep(time);
+                    queue.run(cost, Instant::now() + limits::STEP_TIMEOUT, work).await.unwrap();
+                    steps += 1;
+                }
+                steps
+            }
+        };
+        let all = (1..=12).map(|session| sleeping(large(session), Duration::from_millis(100)));
+        let all = futures_util::future::join_all(all);
+        let small = sleeping(SMALL, Duration::from_millis(1));
+        let (large_steps, small_steps) = tokio::join!(all, small);
+        // Alone, large frames would be 20, and the last of each session ends after the end.
+        let large_steps: usize = large_steps.iter().sum();
+        assert!(large_steps >= 18, "{large_steps} large frames");
+        // Its share of an otherwise idle renderer would be 2,000.
+        assert!(small_steps >= 500, "{small_steps} small frames");
+    }
+
+    /// Frames that cannot be ready by their deadline take no time from those that can.
+    #[tokio::test]
+    async fn frames_without_time_are_refused_and_not_begun() {
+        let queue = RenderQueue::start(Arc::new(IdleBackend { frames_in_flight: 1 })).unwrap();
+        let begun = Arc::new(Mutex::new(0));
+        let run = async |session: u64, time: Duration| {
+            let begun = begun.clone();
+            let work = move |_: &mut Scratch, _: &dyn Backend| {
+                *begun.lock() += 1;
+                std::thread::sleep(Duration::from_millis(100));
+            };
+            queue.run(large(session), Instant::now() + time, work).await.map(|_| ())
+        };
+        // The first one is the measure.
+        run(0, limits::STEP_TIMEOUT).await.unwrap();
+        let time = Duration::from_millis(350);
+        let runs = futures_util::future::join_all((1..=12).map(|session| run(session, time))).await;
+        let ready = runs.iter().filter(|result| result.is_ok()).count();
+        assert!((2..=4).contains(&ready), "{ready} of 12 are ready");
+        for result in runs.iter().filter_map(|result| result.as_ref().err()) {
+            let is_refused =
+                matches!(result, SessionError::Busy { .. } | SessionError::DeadlineExceeded);
+            assert!(is_refused, "{result}");
+        }
+        assert_eq!(*begun.lock(), 1 + ready, "nothing was rendered in vain");
+    }
+}

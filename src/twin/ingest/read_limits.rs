@@ -1,0 +1,51 @@
+//! What reading a scene may use.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::IngestError;
+use super::scene_files::ListedFiles;
+use crate::limits;
+
+/// What reading a scene may use, and how fine it becomes. A scene of an untrusted source gets the first three.
+#[derive(Clone, Debug)]
+pub struct ReadLimits<'a> {
+    /// The files that the scene may name; without a list, those below the folder of its own file.
+    pub listed: Option<&'a ListedFiles>,
+    /// Bytes of memory that compressed content may unpack to.
+    pub memory_bytes: u64,
+    /// Stops the reading.
+    pub stop: StopFlag,
+    /// About how many Gaussians the triangles of a mesh become; triangles smaller than one Gaussian's share add
+    /// more. Scenes of Gaussians keep theirs.
+    pub mesh_gaussians: u32,
+}
+
+/// Tells readers of other threads to stop. Clones are one flag.
+#[derive(Clone, Debug, Default)]
+pub struct StopFlag(Arc<AtomicBool>);
+
+impl ReadLimits<'_> {
+    /// The limits of a file that the user of this machine named: its folder, all of the memory, any time.
+    pub fn of_own_file() -> Self {
+        Self {
+            listed: None,
+            memory_bytes: u64::MAX,
+            stop: StopFlag::default(),
+            mesh_gaussians: limits::MESH_GAUSSIANS,
+        }
+    }
+}
+
+impl StopFlag {
+    /// Lets the readers end with [`IngestError::Stopped`], or an error that follows from it, soon.
+    pub fn stop(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    /// # Errors
+    /// [`IngestError::Stopped`] if the reading is to stop.
+    pub(super) fn check(&self) -> Result<(), IngestError> {
+        if self.0.load(Ordering::Relaxed) { Err(IngestError::Stopped) } else { Ok(()) }
+    }
+}

@@ -1,0 +1,118 @@
+//! The file system of this machine.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::Path;
+use std::time::UNIX_EPOCH;
+
+use rustix::fs::OFlags;
+
+use crate::store::disk::{Disk, FileInfo, Lock, ReadFile, Wait, WriteFile};
+
+/// The file system of this machine.
+#[derive(Clone, Copy, Debug, Default)]
+pub(in crate::store) struct RealDisk;
+
+impl Disk for RealDisk {
+    fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
+        let mut names = Vec::new();
+        for entry in fs::read_dir(dir)? {
+            names.extend(entry?.file_name().into_string());
+        }
+        Ok(names)
+    }
+
+    fn info(&self, path: &Path) -> io::Result<FileInfo> {
+        let found = fs::symlink_metadata(path)?;
+        let since = found.modified()?.duration_since(UNIX_EPOCH).unwrap_or_default();
+        Ok(FileInfo {
+            bytes: found.len(),
+            modified_us: i64::try_from(since.as_micros()).unwrap_or(i64::MAX),
+            is_file: found.is_file(),
+            // The directory of twins, or of one twin, may be a link to another disk.
+            is_dir: fs::metadata(path).is_ok_and(|found| found.is_dir()),
+        })
+    }
+
+    fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>> {
+        Ok(Box::new(open_regular(File::options().read(true), path)?))
+    }
+
+    fn create(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
+        Ok(Box::new(File::create(path)?))
+    }
+
+    fn create_dir(&self, dir: &Path) -> io::Result<()> {
+        fs::create_dir(dir)
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        fs::rename(from, to)
+    }
+
+    fn link(&self, from: &Path, to: &Path) -> io::Result<()> {
+        fs::hard_link(from, to)
+    }
+
+    fn remove_file(&self, path: &Path) -> io::Result<()> {
+        fs::remove_file(path)
+    }
+
+    fn remove_dir(&self, dir: &Path) -> io::Result<()> {
+        fs::remove_dir(dir)
+    }
+
+    fn remove_all(&self, dir: &Path) -> io::Result<()> {
+        fs::remove_dir_all(dir)
+    }
+
+    fn sync_dir(&self, dir: &Path) -> io::Result<()> {
+        // The parent of "twins" is "", which is the current directory.
+        let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
+        File::open(dir)?.sync_all()
+    }
+
+    fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>> {
+        let create = wait != Wait::NoAndExisting;
+        let file = open_regular(File::options().create(create).append(true), path)?;
+        if wait == Wait::Yes {
+            file.lock()?;
+            return Ok(Some(Lock::held_by(file)));
+        }
+        match file.try_lock() {
+            Ok(()) => Ok(Some(Lock::held_by(file))),
+            Err(TryLockError::WouldBlock) => Ok(None),
+            Err(TryLockError::Error(error)) => Err(error),
+        }
+    }
+}
+
+impl ReadFile for File {
+    fn size_bytes(&self) -> io::Result<u64> {
+        Ok(self.metadata()?.len())
+    }
+}
+
+impl WriteFile for File {
+    fn sync(&mut self) -> io::Result<()> {
+        self.sync_all()
+    }
+}
+
+/// Opens a regular file. The store writes nothing but regular files, so that anything else is damage or an attack:
+/// opening a pipe would wait for ever, and a link could lead out of the twin.
+fn open_regular(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
+    // NONBLOCK concerns pipes and devices only; regular files ignore it.
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    match options.custom_flags(flags.bits().cast_signed()).open(path) {
+        Ok(file) if file.metadata()?.is_file() => Ok(file),
+        Ok(_) => Err(io::Error::other("it is not a regular file")),
+        // The error of the system does not say what a link or a pipe is.
+        Err(error) => Err(match fs::symlink_metadata(path) {
+            Ok(found) if found.is_symlink() => io::Error::other("it is a symbolic link"),
+            Ok(found) if !found.is_file() => io::Error::other("it is not a regular file"),
+            _ => error,
+        }),
+    }
+}

@@ -1,0 +1,129 @@
+//! `wildcity scenario` and `wildcity map`: files in, files and errors with their place out.
+
+use std::fs;
+use std::path::Path;
+use std::process::Output;
+
+use serde_json::{Value, json};
+
+use crate::{support, wildcity};
+
+fn run(arguments: &[&str], dir: &Path) -> Output {
+    wildcity().args(arguments).current_dir(dir).output().unwrap()
+}
+
+fn done(arguments: &[&str], dir: &Path) -> String {
+    let output = run(arguments, dir);
+    assert!(output.status.success(), "{arguments:?}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn refused(arguments: &[&str], dir: &Path) -> String {
+    let output = run(arguments, dir);
+    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+/// On the 9 m of the twin `test`.
+fn scenario() -> Value {
+    json!({
+        "format": "wildcity.scenario/1", "name": "two", "twin": {"name": "test"},
+        "map": {"file": "test.map.json"},
+        "ego": {"start": {"trajectory": "log", "station_m": 1}},
+        "actors": [
+            {"name": "car", "idm": {"lanes": ["log"], "station_m": 5, "speed": "$v"},
+             "jitter": {"longitudinal_m": 1, "lateral_m": 0}},
+            {"name": "van", "stand": {"xyz": [7, 3, 0]}}],
+        "sweep": {"seeds": [0, 1], "v": [1, 2, 3]}})
+}
+
+#[test]
+fn a_scenario_is_checked_and_shown_with_its_map() {
+    let dir = support::twins();
+    let at = dir.path();
+    let twins = ["--twins", "."];
+    let strips =
+        ["map", "strips", "test", "--left-m", "3", "--right-m", "2", "--out", "test.map.json"];
+    assert!(done(&[&strips[..], &twins].concat(), at).contains("1 lanes"));
+    assert!(done(&["map", "check", "test.map.json"], at).contains("1 lanes, 1 areas"));
+    fs::write(at.join("two.json"), scenario().to_string()).unwrap();
+    let checked = done(&[&["scenario", "check", "two.json"][..], &twins].concat(), at);
+    assert!(checked.contains("6 episodes in test@1, 2 actors"), "{checked}");
+
+    let show = |more: &[&str]| -> Value {
+        let arguments = [&["scenario", "show", "two.json"][..], &twins, more].concat();
+        serde_json::from_str(&done(&arguments, at)).unwrap()
+    };
+    let shown = show(&["--seed", "1", "--value", "v=2"]);
+    let jitter = &shown["scenario"]["actors"][0]["jitter"]["drawn"]["longitudinal_m"];
+    assert!(jitter.as_f64().unwrap().abs() <= 1.0, "{shown}");
+    assert_eq!(shown["scenario"]["actors"][0]["idm"]["speed"], 2.0);
+    assert_eq!(shown["scenario"]["twin"]["version_hash"].as_str().unwrap().len(), 64);
+    assert_ne!(shown["hash"], show(&["--seed", "0", "--value", "v=2"])["hash"]);
+    // What is shown is a scenario, and the same episode.
+    fs::write(at.join("two.json"), shown["scenario"].to_string()).unwrap();
+    assert_eq!(show(&["--seed", "9"]), shown);
+
+    // A map that changed is another one, unless the user accepts it.
+    let map = fs::read_to_string(at.join("test.map.json")).unwrap();
+    fs::write(at.join("test.map.json"), format!("{map}\n")).unwrap();
+    let error = refused(&[&["scenario", "check", "two.json"][..], &twins].concat(), at);
+    assert!(error.contains("map.hash") && error.contains("--latest"), "{error}");
+    let accepted = [&["scenario", "check", "two.json", "--latest"][..], &twins].concat();
+    assert!(done(&accepted, at).contains("not pinned: map.hash"));
+}
+
+#[test]
+fn mistakes_name_the_file_the_place_and_the_fix() {
+    let dir = support::twins();
+    let at = dir.path();
+    let mut file = scenario();
+    file.as_object_mut().unwrap().remove("map");
+    fs::write(at.join("two.json"), file.to_string()).unwrap();
+    let check = ["scenario", "check", "two.json", "--twins", "."];
+    let error = refused(&check, at);
+    assert!(error.contains("two.json") && error.contains("actors[0].idm.lanes"), "{error}");
+    assert!(error.contains("\"map\""), "{error}");
+    file["twin"]["name"] = "town".into();
+    fs::write(at.join("two.json"), file.to_string()).unwrap();
+    assert!(refused(&check, at).contains("town"));
+    fs::write(at.join("two.json"), "{").unwrap();
+    assert!(refused(&check, at).contains("two.json"));
+    assert!(refused(&["scenario", "check", "none.json", "--twins", "."], at).contains("none"));
+}
+
+#[test]
+fn files_of_others_become_maps_and_scenarios() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let square = json!([[[0, 0], [9, 0], [9, 9], [0, 9], [0, 0]]]);
+    let area = json!({"type": "Feature", "properties": {"layer": "drivable"},
+                      "geometry": {"type": "Polygon", "coordinates": square}});
+    let collection = json!({"type": "FeatureCollection", "features": [area]});
+    fs::write(at.join("a.geojson"), collection.to_string()).unwrap();
+    let import = ["map", "import", "a.geojson", "--out", "a.map.json"];
+    assert!(done(&import, at).contains("0 lanes, 1 areas"));
+    assert!(done(&["map", "check", "a.map.json"], at).contains("1 areas"));
+    fs::write(at.join("a.geojson"), collection.to_string().replace("drivable", "lava")).unwrap();
+    let error = refused(&import, at);
+    assert!(
+        error.contains("a.geojson") && error.contains("features[0].properties.layer"),
+        "{error}"
+    );
+
+    let entity = "<ScenarioObject name=\"Ego\"><Vehicle vehicleCategory=\"car\"><BoundingBox><Center x=\"1.4\"/>\
+                  <Dimensions length=\"5\" width=\"2\" height=\"1.5\"/></BoundingBox></Vehicle></ScenarioObject>";
+    let xosc = format!(
+        "<OpenSCENARIO>\n<FileHeader revMajor=\"1\" revMinor=\"0\"/>\n<Entities>{entity}</Entities>\n\
+         <Storyboard><Init><Actions/></Init></Storyboard>\n</OpenSCENARIO>"
+    );
+    fs::write(at.join("a.xosc"), &xosc).unwrap();
+    let import = ["scenario", "import", "a.xosc", "--twin", "street", "--out", "a.json"];
+    assert!(done(&import, at).contains("wildcity scenario check"));
+    let file: Value = serde_json::from_slice(&fs::read(at.join("a.json")).unwrap()).unwrap();
+    assert_eq!((&file["name"], &file["twin"]["name"]), (&json!("a"), &json!("street")));
+    fs::write(at.join("a.xosc"), xosc.replace("<Actions/>", "<Actions><GlobalAction/></Actions>"))
+        .unwrap();
+    let error = refused(&import, at);
+    assert!(error.contains("line 4, <GlobalAction>"), "{error}");
+}

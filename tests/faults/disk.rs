@@ -1,0 +1,485 @@
+//! A disk in memory that forgets what was not synced, fails, and stops the process between two writes; and a clock
+//! that jumps.
+//!
+//! The disk has two states. The *live* one is what processes see. The *durable* one has the files as they were last
+//! synced, and the names as of the last sync of their directory. After a power cut, each name that was not synced is old
+//! or new, and each file that was not synced has its old content, some of the new one, or all of it: as file systems may
+//! do, in any combination.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, Cursor, ErrorKind, Read, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard};
+
+use wildcity_twin::store::clock::Clock;
+use wildcity_twin::store::disk::{Disk, FileInfo, Lock, ReadFile, Wait, WriteFile};
+
+use crate::random::Random;
+
+/// The root of the disk.
+pub(crate) const ROOT: &str = "/twins";
+
+/// A fault of the store, as it shows on the disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Plant {
+    /// The directories of objects are not synced.
+    MissingSync,
+    /// The log record becomes durable before the objects that it names.
+    RecordBeforeObjects,
+    /// A lease is not removed when its version is closed.
+    LeakedLease,
+}
+
+/// What happens at a write.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Fault {
+    /// The process is killed. What it wrote stays.
+    Kill,
+    /// The power fails.
+    PowerCut,
+    /// The disk is full, for this write alone.
+    Full,
+}
+
+/// The time of a simulation.
+#[derive(Debug)]
+pub(crate) struct SimClock(AtomicI64);
+
+impl SimClock {
+    pub(crate) fn new() -> Self {
+        Self(AtomicI64::new(1_700_000_000_000_000))
+    }
+
+    pub(crate) fn jump(&self, us: i64) {
+        self.0.fetch_add(us, Ordering::Relaxed);
+    }
+}
+
+impl Clock for SimClock {
+    fn now_us(&self) -> i64 {
+        // Time goes on, so that no two events have the same.
+        self.0.fetch_add(1_000, Ordering::Relaxed)
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Node {
+    Dir,
+    /// Index of the file's content.
+    File(usize),
+}
+
+#[derive(Debug, Default)]
+struct Content {
+    bytes: Vec<u8>,
+    /// As of the last sync.
+    synced: Option<Vec<u8>>,
+    modified_us: i64,
+}
+
+type Names = BTreeMap<PathBuf, Node>;
+
+#[derive(Debug)]
+struct State {
+    live: Names,
+    durable: Names,
+    contents: Vec<Content>,
+    locked: BTreeSet<PathBuf>,
+    /// Writes until the fault, and which.
+    fault: Option<(u64, Fault)>,
+    /// The fault that has happened and stopped the process.
+    stopped_by: Option<Fault>,
+    plant: Option<Plant>,
+    /// Directories whose sync is withheld until the record's ([`Plant::RecordBeforeObjects`]).
+    withheld: Vec<PathBuf>,
+}
+
+/// The disk as one process sees it. The handle is dead after the process was stopped.
+#[derive(Clone, Debug)]
+pub(crate) struct SimDisk {
+    state: Arc<Mutex<State>>,
+    clock: Arc<SimClock>,
+    is_dead: Arc<AtomicBool>,
+}
+
+fn stopped() -> io::Error {
+    io::Error::other("the process was stopped")
+}
+
+fn not_found() -> io::Error {
+    ErrorKind::NotFound.into()
+}
+
+impl SimDisk {
+    pub(crate) fn new(clock: Arc<SimClock>, plant: Option<Plant>) -> Self {
+        let names = Names::from([(PathBuf::from(ROOT), Node::Dir)]);
+        let state = State {
+            live: names.clone(),
+            durable: names,
+            contents: Vec::new(),
+            locked: BTreeSet::new(),
+            fault: None,
+            stopped_by: None,
+            plant,
+            withheld: Vec::new(),
+        };
+        Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
+    }
+
+    /// Lets a fault happen at the write after so many others.
+    pub(crate) fn fail_after(&self, writes: u64, fault: Fault) {
+        self.lock_state().fault = Some((writes, fault));
+    }
+
+    /// Whether the process was stopped.
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.is_dead.load(Ordering::Relaxed)
+    }
+
+    /// Stops the process.
+    pub(crate) fn stop(&self, fault: Fault) {
+        self.lock_state().stopped_by = Some(fault);
+        self.is_dead.store(true, Ordering::Relaxed);
+    }
+
+    /// The disk for the next process, after this one was stopped.
+    pub(crate) fn restarted(&self, random: &mut Random) -> Self {
+        let mut state = self.lock_state();
+        state.locked.clear();
+        state.fault = None;
+        state.withheld.clear();
+        if state.stopped_by.take() == Some(Fault::PowerCut) {
+            state.lose_power(random);
+        }
+        drop(state);
+        let is_dead = Arc::default();
+        Self { state: self.state.clone(), clock: self.clock.clone(), is_dead }
+    }
+
+    /// The files below a directory.
+    pub(crate) fn files_below(&self, dir: &str) -> Vec<PathBuf> {
+        let state = self.lock_state();
+        let files = state.live.iter().filter(|(_, node)| matches!(node, Node::File(_)));
+        let below = files.filter(|(path, _)| path.starts_with(Path::new(ROOT).join(dir)));
+        below.map(|(path, _)| path.clone()).collect()
+    }
+
+    fn lock_state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().expect("no test thread panics with it")
+    }
+
+    /// The state for a read.
+    fn read(&self) -> io::Result<MutexGuard<'_, State>> {
+        if self.is_stopped() { Err(stopped()) } else { Ok(self.lock_state()) }
+    }
+
+    /// The state for a write, unless the fault is due.
+    fn write(&self) -> io::Result<MutexGuard<'_, State>> {
+        let mut state = self.read()?;
+        match &mut state.fault {
+            Some((0, Fault::Full)) => {
+                state.fault = None;
+                Err(ErrorKind::StorageFull.into())
+            }
+            Some((0, fault)) => {
+                let fault = *fault;
+                state.stopped_by = Some(fault);
+                self.is_dead.store(true, Ordering::Relaxed);
+                Err(stopped())
+            }
+            Some((writes, _)) => {
+                *writes -= 1;
+                Ok(state)
+            }
+            None => Ok(state),
+        }
+    }
+}
+
+impl State {
+    fn check_parent(&self, path: &Path) -> io::Result<()> {
+        let parent = path.parent().ok_or_else(not_found)?;
+        match self.live.get(parent) {
+            Some(Node::Dir) => Ok(()),
+            Some(Node::File(_)) => Err(ErrorKind::NotADirectory.into()),
+            None => Err(not_found()),
+        }
+    }
+
+    fn file(&self, path: &Path) -> io::Result<usize> {
+        match self.live.get(path) {
+            Some(Node::File(index)) => Ok(*index),
+            Some(Node::Dir) => Err(io::Error::other("it is not a regular file")),
+            None => Err(not_found()),
+        }
+    }
+
+    fn has_children(&self, dir: &Path) -> bool {
+        self.live.keys().any(|path| path.parent() == Some(dir))
+    }
+
+    fn add_file(&mut self, path: &Path, modified_us: i64) -> usize {
+        self.contents.push(Content { modified_us, ..Content::default() });
+        let index = self.contents.len() - 1;
+        self.live.insert(path.to_owned(), Node::File(index));
+        index
+    }
+
+    /// Makes the names in a directory durable.
+    fn sync_names(&mut self, dir: &Path) {
+        let is_in = |path: &PathBuf| path.parent() == Some(dir);
+        self.durable.retain(|path, _| !is_in(path));
+        let names = self.live.iter().filter(|(path, _)| is_in(path));
+        self.durable.extend(names.map(|(path, node)| (path.clone(), *node)));
+    }
+
+    fn lose_power(&mut self, random: &mut Random) {
+        let all: BTreeSet<PathBuf> = self.live.keys().chain(self.durable.keys()).cloned().collect();
+        let mut after = Names::new();
+        for path in all {
+            let old = self.durable.get(&path);
+            let new = self.live.get(&path);
+            let node = if old != new && random.once_in(2) { new } else { old };
+            // Without its directory, a name is lost. Parents come first.
+            let has_parent =
+                path == Path::new(ROOT) || path.parent().is_some_and(|dir| after.contains_key(dir));
+            if let Some(node) = node.filter(|_| has_parent) {
+                after.insert(path, *node);
+            }
+        }
+        for content in &mut self.contents {
+            if content.synced.as_ref() != Some(&content.bytes) {
+                match random.below(3) {
+                    0 => content.bytes = content.synced.clone().unwrap_or_default(),
+                    1 => content
+                        .bytes
+                        .truncate(random.below(content.bytes.len() as u64 + 1) as usize),
+                    _ => {}
+                }
+            }
+            content.synced = Some(content.bytes.clone());
+        }
+        self.live = after.clone();
+        self.durable = after;
+    }
+}
+
+impl Disk for SimDisk {
+    fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
+        let state = self.read()?;
+        match state.live.get(dir) {
+            Some(Node::Dir) => {}
+            Some(Node::File(_)) => return Err(ErrorKind::NotADirectory.into()),
+            None => return Err(not_found()),
+        }
+        let names = state.live.keys().filter(|path| path.parent() == Some(dir));
+        Ok(names.filter_map(|path| Some(path.file_name()?.to_str()?.to_owned())).collect())
+    }
+
+    fn info(&self, path: &Path) -> io::Result<FileInfo> {
+        let state = self.read()?;
+        let node = state.live.get(path).ok_or_else(not_found)?;
+        Ok(match node {
+            Node::Dir => FileInfo { bytes: 0, modified_us: 0, is_file: false, is_dir: true },
+            Node::File(index) => {
+                let Content { bytes, modified_us, .. } = &state.contents[*index];
+                let bytes = bytes.len() as u64;
+                FileInfo { bytes, modified_us: *modified_us, is_file: true, is_dir: false }
+            }
+        })
+    }
+
+    fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>> {
+        let state = self.read()?;
+        let index = state.file(path)?;
+        Ok(Box::new(OpenFile(Cursor::new(state.contents[index].bytes.clone()))))
+    }
+
+    fn create(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
+        let mut state = self.write()?;
+        state.check_parent(path)?;
+        let index = state.add_file(path, self.clock.now_us());
+        Ok(Box::new(WrittenFile { disk: self.clone(), index }))
+    }
+
+    fn create_dir(&self, dir: &Path) -> io::Result<()> {
+        let mut state = self.write()?;
+        state.check_parent(dir)?;
+        if state.live.contains_key(dir) {
+            return Err(ErrorKind::AlreadyExists.into());
+        }
+        state.live.insert(dir.to_owned(), Node::Dir);
+        Ok(())
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let mut state = self.write()?;
+        let index = state.file(from)?;
+        state.check_parent(to)?;
+        state.live.remove(from);
+        state.live.insert(to.to_owned(), Node::File(index));
+        Ok(())
+    }
+
+    fn link(&self, from: &Path, to: &Path) -> io::Result<()> {
+        let mut state = self.write()?;
+        let index = state.file(from)?;
+        state.check_parent(to)?;
+        if state.live.contains_key(to) {
+            return Err(ErrorKind::AlreadyExists.into());
+        }
+        state.live.insert(to.to_owned(), Node::File(index));
+        Ok(())
+    }
+
+    fn remove_file(&self, path: &Path) -> io::Result<()> {
+        let mut state = self.write()?;
+        state.file(path)?;
+        let is_lease = path.parent().is_some_and(|dir| dir.ends_with("leases"));
+        if state.plant == Some(Plant::LeakedLease) && is_lease {
+            return Ok(());
+        }
+        state.live.remove(path);
+        Ok(())
+    }
+
+    fn remove_dir(&self, dir: &Path) -> io::Result<()> {
+        let mut state = self.write()?;
+        match state.live.get(dir) {
+            Some(Node::Dir) if state.has_children(dir) => Err(ErrorKind::DirectoryNotEmpty.into()),
+            Some(Node::Dir) => {
+                state.live.remove(dir);
+                Ok(())
+            }
+            Some(Node::File(_)) => Err(ErrorKind::NotADirectory.into()),
+            None => Err(not_found()),
+        }
+    }
+
+    fn remove_all(&self, dir: &Path) -> io::Result<()> {
+        // One file after the other: the process may be stopped in between.
+        let below: Vec<PathBuf> = {
+            let state = self.read()?;
+            let below = state.live.keys().filter(|path| path.starts_with(dir));
+            below.rev().cloned().collect()
+        };
+        if below.is_empty() {
+            return Err(not_found());
+        }
+        for path in below {
+            self.write()?.live.remove(&path);
+        }
+        Ok(())
+    }
+
+    fn sync_dir(&self, dir: &Path) -> io::Result<()> {
+        let mut state = self.write()?;
+        if !state.live.contains_key(dir) {
+            return Err(not_found());
+        }
+        let is_of_objects = dir.parent().is_some_and(|parent| parent.ends_with("objects"));
+        match state.plant {
+            Some(Plant::MissingSync) if is_of_objects => return Ok(()),
+            Some(Plant::RecordBeforeObjects) if is_of_objects => {
+                state.withheld.push(dir.to_owned());
+                return Ok(());
+            }
+            _ => {}
+        }
+        state.sync_names(dir);
+        if dir.ends_with("log") && !state.withheld.is_empty() {
+            drop(state);
+            // The process may be stopped between the record's sync and those of the objects.
+            let mut state = self.write()?;
+            for dir in std::mem::take(&mut state.withheld) {
+                state.sync_names(&dir);
+            }
+        }
+        Ok(())
+    }
+
+    fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>> {
+        let mut state = self.read()?;
+        if state.file(path).is_err() {
+            if wait == Wait::NoAndExisting {
+                return Err(not_found());
+            }
+            drop(state);
+            state = self.write()?;
+            state.check_parent(path)?;
+            state.add_file(path, self.clock.now_us());
+        }
+        if !state.locked.insert(path.to_owned()) {
+            assert_ne!(wait, Wait::Yes, "a deadlock: {} is locked", path.display());
+            return Ok(None);
+        }
+        drop(state);
+        Ok(Some(Lock::held_by(HeldLock { disk: self.clone(), path: path.to_owned() })))
+    }
+}
+
+/// A lock of a living process.
+#[derive(Debug)]
+struct HeldLock {
+    disk: SimDisk,
+    path: PathBuf,
+}
+
+impl Drop for HeldLock {
+    fn drop(&mut self) {
+        // The locks of a stopped process are gone already, and may be another's.
+        if !self.disk.is_stopped() {
+            self.disk.lock_state().locked.remove(&self.path);
+        }
+    }
+}
+
+#[derive(Debug)]
+struct OpenFile(Cursor<Vec<u8>>);
+
+impl Read for OpenFile {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        self.0.read(buffer)
+    }
+}
+
+impl Seek for OpenFile {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.0.seek(to)
+    }
+}
+
+impl ReadFile for OpenFile {
+    fn size_bytes(&self) -> io::Result<u64> {
+        Ok(self.0.get_ref().len() as u64)
+    }
+}
+
+#[derive(Debug)]
+struct WrittenFile {
+    disk: SimDisk,
+    index: usize,
+}
+
+impl Write for WrittenFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let mut state = self.disk.write()?;
+        let content = &mut state.contents[self.index];
+        content.bytes.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl WriteFile for WrittenFile {
+    fn sync(&mut self) -> io::Result<()> {
+        let mut state = self.disk.write()?;
+        let content = &mut state.contents[self.index];
+        content.synced = Some(content.bytes.clone());
+        Ok(())
+    }
+}

@@ -1,0 +1,388 @@
+//! One simulated machine with one twin, and what its users were promised.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{Gaussians, RecordFormat};
+use wildcity_twin::store::{
+    Catalog, Commit, CommitKind, Lease, NewVersion, Retention, StorageOptions, StoreError, Version,
+    VersionChange,
+};
+
+use crate::disk::{Fault, Plant, ROOT, SimClock, SimDisk};
+use crate::history::{Operation, Step};
+use crate::random::Random;
+
+const TWIN: &str = "city";
+
+/// How long a lease holds without renewal.
+const LEASE: Duration = Duration::from_secs(900);
+
+/// The content of a version: the number of Gaussians in each cell.
+type Cells = BTreeMap<[i32; 2], u64>;
+
+/// A session that has a version open.
+struct Session {
+    number: u64,
+    cells: Cells,
+    lease: Lease,
+}
+
+/// A push that is not published yet.
+struct Prepared {
+    commit: Commit,
+    base: u64,
+    cells: Cells,
+}
+
+/// The machine, and the promises.
+pub(crate) struct World {
+    clock: Arc<SimClock>,
+    disk: SimDisk,
+    catalog: Catalog,
+    sessions: Vec<Session>,
+    prepared: Option<Prepared>,
+    /// Versions that a client was told of: they must stay, until garbage collection may remove them.
+    acknowledged: BTreeMap<u64, Cells>,
+    /// What versions may be that no client was told of: of pushes that were interrupted.
+    possible: BTreeMap<u64, Vec<Cells>>,
+    /// Versions that garbage collection may have removed.
+    collectable: BTreeSet<u64>,
+}
+
+type Promise = Result<(), String>;
+
+fn storage() -> StorageOptions {
+    StorageOptions { record: RecordFormat::F32, levels: false }
+}
+
+fn provenance() -> Provenance {
+    Provenance::of("simulation".to_owned())
+}
+
+/// The cells of a bit mask, of a content.
+fn cells_of(mask: u8, content: u64) -> Cells {
+    (0..3).filter(|cell| mask & (1 << cell) != 0).map(|cell| ([cell, 0], content)).collect()
+}
+
+/// As many Gaussians in each cell as it is to have.
+fn gaussians_of(cells: &Cells) -> Gaussians {
+    let mut gaussians = Gaussians::default();
+    for (cell, count) in cells {
+        for index in 0..*count {
+            gaussians.means_m.push([64.0 * f64::from(cell[0]), index as f64, *count as f64]);
+            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            gaussians.ln_scales.push([-1.0; 3]);
+            gaussians.logit_opacities.push(0.0);
+            gaussians.sh.extend([0.0; 3]);
+        }
+    }
+    gaussians
+}
+
+fn content_of(version: &Version) -> Cells {
+    version.manifest.chunks.iter().map(|chunk| (chunk.cell, chunk.count)).collect()
+}
+
+fn merged(below: &Cells, above: &Cells) -> Cells {
+    let mut cells = below.clone();
+    cells.extend(above);
+    cells
+}
+
+impl World {
+    pub(crate) fn new(plant: Option<Plant>) -> Result<Self, String> {
+        let clock = Arc::new(SimClock::new());
+        let disk = SimDisk::new(clock.clone(), plant);
+        let catalog = open(&disk, &clock)?;
+        Ok(Self {
+            clock,
+            disk,
+            catalog,
+            sessions: Vec::new(),
+            prepared: None,
+            acknowledged: BTreeMap::new(),
+            possible: BTreeMap::new(),
+            collectable: BTreeSet::new(),
+        })
+    }
+
+    /// Carries out one step. If it stops the process, starts the next one and checks the promises.
+    pub(crate) fn run(&mut self, step: &Step) -> Promise {
+        if let Some((writes, fault)) = step.fault {
+            self.disk.fail_after(writes, fault);
+        }
+        let is_full = matches!(step.fault, Some((_, Fault::Full)));
+        let done = self.carry_out(step.operation);
+        if self.disk.is_stopped() {
+            return self.restart(step.seed);
+        }
+        // A disk that is full refuses; without a fault everything works.
+        match done {
+            Err(error) if !is_full => return Err(format!("{error} without a fault")),
+            _ => {}
+        }
+        self.disk.fail_after(u64::MAX, Fault::Full);
+        self.check_sessions()
+    }
+
+    fn carry_out(&mut self, operation: Operation) -> Result<(), StoreError> {
+        match operation {
+            Operation::Push { cells, content } => self.push(&cells_of(cells, content)),
+            Operation::Prepare { cells, content } => self.prepare(cells_of(cells, content)),
+            Operation::PublishPrepared => self.publish_prepared(),
+            Operation::Rollback { back } => self.rollback(back),
+            Operation::Open { back } => self.open_session(back),
+            Operation::Renew => {
+                self.sessions.iter_mut().try_for_each(|session| session.lease.renew())
+            }
+            Operation::Close => {
+                if !self.sessions.is_empty() {
+                    self.sessions.remove(0);
+                }
+                Ok(())
+            }
+            Operation::Collect { keep, grace_s } => {
+                self.collect(Retention { versions: keep, grace: Duration::from_secs(grace_s) })
+            }
+            Operation::Jump { seconds } => {
+                self.clock.jump(seconds * 1_000_000);
+                Ok(())
+            }
+            Operation::Stop(fault) => {
+                self.disk.stop(fault);
+                Ok(())
+            }
+        }
+    }
+
+    /// The latest version, if there is one.
+    fn latest(&self) -> Result<Option<Version>, StoreError> {
+        match self.catalog.version(TWIN, None) {
+            Ok(version) => Ok(Some(version)),
+            Err(StoreError::NoTwin { .. }) => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The number of the version so many before the latest.
+    fn number_before_latest(&self, back: u64) -> Result<Option<u64>, StoreError> {
+        let latest = self.latest()?.map(|version| version.number);
+        Ok(latest.map(|latest| latest.saturating_sub(back).max(1)))
+    }
+
+    /// Carries out a commit whose version is to have a content, and notes what its client is told.
+    fn commit(
+        &mut self,
+        before: u64,
+        cells: Cells,
+        commit: impl FnOnce(&mut Self) -> Result<Version, StoreError>,
+    ) -> Result<(), StoreError> {
+        // Until the answer is there, the version may be or not be.
+        self.possible.entry(before + 1).or_default().push(cells.clone());
+        let result = commit(self);
+        let is_unknown =
+            self.disk.is_stopped() || matches!(result, Err(StoreError::NotSynced { .. }));
+        if !is_unknown {
+            self.possible.entry(before + 1).or_default().pop();
+        }
+        let version = match result {
+            Err(StoreError::NotSynced { .. }) => return Ok(()),
+            result => result?,
+        };
+        if !self.disk.is_stopped() {
+            self.acknowledged.insert(version.number, cells);
+        }
+        Ok(())
+    }
+
+    fn push(&mut self, cells: &Cells) -> Result<(), StoreError> {
+        let latest = self.latest()?;
+        let before = latest.as_ref().map_or(0, |version| version.number);
+        let base = latest.as_ref().map(content_of).unwrap_or_default();
+        let gaussians = gaussians_of(cells);
+        self.commit(before, merged(&base, cells), |world| {
+            if before == 0 {
+                let new = NewVersion {
+                    storage: storage(),
+                    ..NewVersion::of(TWIN, &gaussians, provenance())
+                };
+                return world.catalog.commit(new, &mut |_, _| {});
+            }
+            let mut commit = world.catalog.begin(TWIN, CommitKind::Push, storage())?;
+            commit.put(&gaussians, None, &mut |_, _| {})?;
+            commit.change(before, cells_alone())
+        })
+    }
+
+    fn prepare(&mut self, cells: Cells) -> Result<(), StoreError> {
+        let Some(latest) = self.latest()? else { return Ok(()) };
+        let mut commit = self.catalog.begin(TWIN, CommitKind::Push, storage())?;
+        commit.put(&gaussians_of(&cells), None, &mut |_, _| {})?;
+        self.prepared = Some(Prepared { commit, base: latest.number, cells });
+        Ok(())
+    }
+
+    fn publish_prepared(&mut self) -> Result<(), StoreError> {
+        let Some(Prepared { commit, base, cells }) = self.prepared.take() else { return Ok(()) };
+        let Some(latest) = self.latest()? else { return Ok(()) };
+        let content = merged(&content_of(&latest), &cells);
+        let published = self.commit(latest.number, content, |_| commit.change(base, cells_alone()));
+        match published {
+            // Others changed the same cells, or the base is gone.
+            Err(StoreError::Overlap { .. }) if latest.number != base => Ok(()),
+            Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&base) => Ok(()),
+            published => published,
+        }
+    }
+
+    fn rollback(&mut self, back: u64) -> Result<(), StoreError> {
+        let Some(number) = self.number_before_latest(back)? else { return Ok(()) };
+        let latest = self.catalog.latest(TWIN)?;
+        let content = match self.catalog.version(TWIN, Some(number)) {
+            Ok(version) => content_of(&version),
+            Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&number) => {
+                return Ok(());
+            }
+            Err(error) => return Err(error),
+        };
+        self.commit(latest, content, |world| world.catalog.rollback(TWIN, number))
+    }
+
+    fn open_session(&mut self, back: u64) -> Result<(), StoreError> {
+        let Some(number) = self.number_before_latest(back)? else { return Ok(()) };
+        let lease = match self.catalog.lease(TWIN, number, "simulation", LEASE) {
+            Ok(lease) => lease,
+            Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&number) => {
+                return Ok(());
+            }
+            Err(error) => return Err(error),
+        };
+        let cells = content_of(&self.catalog.version(TWIN, Some(number))?);
+        self.sessions.push(Session { number, cells, lease });
+        Ok(())
+    }
+
+    fn collect(&mut self, keep: Retention) -> Result<(), StoreError> {
+        let latest = match self.catalog.latest(TWIN) {
+            Ok(latest) => latest,
+            Err(StoreError::NoTwin { .. }) => return Ok(()),
+            Err(error) => return Err(error),
+        };
+        let leased: BTreeSet<u64> = self.sessions.iter().map(|session| session.number).collect();
+        let old = (1..=latest.saturating_sub(keep.versions as u64))
+            .filter(|number| !leased.contains(number));
+        self.collectable.extend(old);
+        self.catalog.collect(TWIN, keep, false).map(|_| ())
+    }
+
+    /// Starts the next process, as after a kill or a power cut.
+    fn restart(&mut self, seed: u64) -> Promise {
+        // The sessions and the commits of the stopped process write nothing any more.
+        self.sessions.clear();
+        self.prepared = None;
+        self.disk = self.disk.restarted(&mut Random::new(seed));
+        self.catalog = open(&self.disk, &self.clock)?;
+        let staged = self.disk.files_below(".staging");
+        let left: Vec<_> = staged
+            .iter()
+            .filter(|path| path.parent() != Some(&Path::new(ROOT).join(".staging")))
+            .collect();
+        if !left.is_empty() {
+            return Err(format!("the start left {left:?}"));
+        }
+        self.check()
+    }
+
+    /// Checks that each session can read its version, as it was.
+    fn check_sessions(&self) -> Promise {
+        for Session { number, cells, .. } in &self.sessions {
+            let version = self.catalog.version(TWIN, Some(*number));
+            let version = version.map_err(|e| format!("a session's version {number}: {e}"))?;
+            for chunk in &version.manifest.chunks {
+                for section in &chunk.sections {
+                    let read = self.catalog.section(&version, chunk, section);
+                    read.map_err(|e| format!("a session's version {number}: {e}"))?;
+                }
+            }
+            if content_of(&version) != *cells {
+                return Err(format!("a session's version {number} changed"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks all promises.
+    fn check(&self) -> Promise {
+        let entries = match self.catalog.versions(TWIN) {
+            Err(StoreError::NoTwin { .. }) if self.acknowledged.is_empty() => return Ok(()),
+            entries => entries.map_err(|e| e.to_string())?,
+        };
+        let numbers: Vec<u64> = entries.iter().map(|entry| entry.number).collect();
+        if numbers != (1..=numbers.len() as u64).collect::<Vec<_>>() {
+            return Err(format!("the log has the versions {numbers:?}"));
+        }
+        if let Some(lost) = self.acknowledged.keys().find(|number| !numbers.contains(number)) {
+            return Err(format!("version {lost} was acknowledged and is lost"));
+        }
+        for number in numbers {
+            let version = match self.catalog.version(TWIN, Some(number)) {
+                Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&number) => {
+                    continue;
+                }
+                version => version.map_err(|e| format!("version {number}: {e}"))?,
+            };
+            let content = content_of(&version);
+            let is_possible = match self.acknowledged.get(&number) {
+                Some(told) => *told == content,
+                None => self.possible.get(&number).is_some_and(|may| may.contains(&content)),
+            };
+            if !is_possible {
+                return Err(format!("version {number} has {content:?}, which no push made"));
+            }
+        }
+        let checked = self.catalog.fsck(TWIN, &mut |_, _| {}).map_err(|e| e.to_string())?;
+        match checked.is_sound() {
+            true => self.check_sessions(),
+            false => Err(format!("fsck: {:?}", checked)),
+        }
+    }
+
+    /// Checks that the store goes on working, and that nothing is left that no version needs.
+    pub(crate) fn finish(mut self) -> Promise {
+        self.check()?;
+        self.sessions.clear();
+        self.prepared = None;
+        let failed = |what: &'static str| move |e: StoreError| format!("{what}: {e}");
+        self.push(&cells_of(7, 9)).map_err(failed("a push"))?;
+        let left = self.disk.files_below("city/leases");
+        // The leases of processes that were stopped expire; those of sessions that ended are gone.
+        let keep = Retention { versions: 1, grace: Duration::from_secs(60) };
+        for _ in 0..2 {
+            self.clock.jump(30 * 86_400_000_000);
+            self.collect(keep).map_err(failed("a garbage collection"))?;
+        }
+        let expired = self.disk.files_below("city/leases");
+        if !expired.is_empty() {
+            return Err(format!("of the leases {left:?}, {expired:?} do not end"));
+        }
+        let checked = self.catalog.fsck(TWIN, &mut |_, _| {}).map_err(failed("fsck"))?;
+        if checked.unreferenced.objects > 0 {
+            return Err(format!("{} objects stay for ever", checked.unreferenced.objects));
+        }
+        self.check()
+    }
+}
+
+fn open(disk: &SimDisk, clock: &Arc<SimClock>) -> Result<Catalog, String> {
+    let opened = Catalog::on(Path::new(ROOT), Arc::new(disk.clone()), clock.clone());
+    opened.map_err(|error| format!("the store does not open: {error}"))
+}
+
+fn cells_alone() -> VersionChange {
+    let provenance = provenance();
+    VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
+}

@@ -1,0 +1,97 @@
+//! What is fuzzed: one function per parser of bytes that others write. Each ends in an answer or an error, and never
+//! in a panic, a hang or an absurd allocation.
+//!
+//! `cargo fuzz run --fuzz-dir tests/fuzz scene` lets libFuzzer search (nightly); the test `fuzz` of this package does
+//! the same with simple mutations, for a bounded time, on stable.
+
+use std::fs;
+
+use wildcity_client::Observation;
+use wildcity_protocol::message::Request;
+use wildcity_scene::{Rig, Trajectory};
+use wildcity_server::Tokens;
+use wildcity_session::RecordedEpisode;
+use wildcity_twin::ingest;
+use wildcity_twin::store::Catalog;
+
+/// A target: its name, which is also that of its folder in the corpus, and its function.
+type Target = (&'static str, fn(&[u8]));
+
+/// All targets.
+pub(crate) const TARGETS: [Target; 8] = [
+    ("scene", scene),
+    ("record", record),
+    ("observation", observation),
+    ("request", request),
+    ("episode", episode),
+    ("tokens", tokens),
+    ("rig", rig),
+    ("trajectory", trajectory),
+];
+
+/// A scene file of any format.
+pub(crate) fn scene(data: &[u8]) {
+    let dir = tempfile::tempdir().expect("a directory");
+    let path = dir.path().join("scene");
+    fs::write(&path, data).expect("written");
+    if let Ok(gaussians) = ingest::read(&path, &mut |_, _| {}) {
+        let colours = 3 * wildcity_scene::sh::coefficients(gaussians.sh_degree);
+        assert_eq!(gaussians.sh.len(), gaussians.len() * colours);
+    }
+}
+
+/// The newest log record of a twin.
+pub(crate) fn record(data: &[u8]) {
+    let dir = tempfile::tempdir().expect("a directory");
+    let log = dir.path().join("city/log");
+    fs::create_dir_all(&log).expect("created");
+    fs::write(log.join("0000000001"), data).expect("written");
+    let catalog = Catalog::open(dir.path()).expect("damage of one twin is no error");
+    let list = catalog.twins().expect("damage of one twin is no error");
+    assert_eq!(list.twins.len() + list.damaged.len(), 1);
+    assert!(catalog.version("city", None).is_err(), "it has no manifest");
+}
+
+/// An observation, as a client gets it.
+pub(crate) fn observation(data: &[u8]) {
+    if let Ok(observation) = Observation::decode(data.to_vec()) {
+        let _ = observation.verify();
+    }
+}
+
+/// A request, as the server gets it.
+pub(crate) fn request(data: &[u8]) {
+    let Ok(mut value) = serde_json::from_slice::<serde_json::Value>(data) else { return };
+    if let Some(fields) = value.as_object_mut() {
+        fields.remove("seq");
+    }
+    let _ = serde_json::from_value::<Request>(value);
+}
+
+/// The file of an episode.
+pub(crate) fn episode(data: &[u8]) {
+    let file = tempfile::NamedTempFile::new().expect("a file");
+    fs::write(file.path(), data).expect("written");
+    let _ = RecordedEpisode::read(file.path());
+}
+
+/// A file of tokens.
+pub(crate) fn tokens(data: &[u8]) {
+    if let Err(error) = Tokens::parse(data) {
+        assert!(!error.to_string().contains("secret"), "the message has a token");
+    }
+}
+
+/// A file of cameras.
+pub(crate) fn rig(data: &[u8]) {
+    if let Ok(rig) = serde_json::from_slice::<Rig>(data) {
+        let _ = rig.check();
+    }
+}
+
+/// A file of a recorded drive.
+pub(crate) fn trajectory(data: &[u8]) {
+    if let Ok(trajectory) = serde_json::from_slice::<Trajectory>(data) {
+        let _ = trajectory.check();
+    }
+}
