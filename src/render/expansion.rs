@@ -61,7 +61,7 @@ impl ExpansionBound {
         if let Some(windshield) = &camera.windshield {
             second_px += 0.5 * px_per_rad * windshield_bend(camera, windshield);
         }
-        Some(Self { max_error_px: profile.lens_error_px, second_px, third_px: 1.5 * third_px })
+        Some(Self { max_error_px: profile.lens_error_px, second_px, third_px: 2.0 * third_px })
     }
 }
 

@@ -183,13 +183,18 @@ fn rolling(views: &[View]) -> Vec<View> {
 
 /// Time of a step and of its stage `project`, in milliseconds.
 #[derive(Clone, Copy)]
-struct StepMs {
-    step: f64,
-    project: f64,
+pub(crate) struct StepMs {
+    pub(crate) step: f64,
+    pub(crate) project: f64,
 }
 
 /// Renders a step to 8-bit colours.
-fn step_ms(backend: &Cpu, scene: &Scene, profile: &RenderProfile, views: &[View]) -> StepMs {
+pub(crate) fn step_ms(
+    backend: &Cpu,
+    scene: &Scene,
+    profile: &RenderProfile,
+    views: &[View],
+) -> StepMs {
     let mut images: Vec<Vec<u8>> =
         views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
     let targets = images.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() });
@@ -209,10 +214,10 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 /// Times of two steps that ran in turn: the medians, and the median of the ratios of pairs.
-fn paired(name: &str, a: &dyn Fn() -> StepMs, b: &dyn Fn() -> StepMs) -> f64 {
+pub(crate) fn paired(name: &str, a: &dyn Fn() -> StepMs, b: &dyn Fn() -> StepMs) -> f64 {
     a();
     b();
-    let pairs: Vec<[StepMs; 2]> = (0..7).map(|_| [a(), b()]).collect();
+    let pairs: Vec<[StepMs; 2]> = (0..15).map(|_| [a(), b()]).collect();
     let of =
         |i: usize, part: fn(&StepMs) -> f64| median(pairs.iter().map(|p| part(&p[i])).collect());
     let ratio = median(pairs.iter().map(|[a, b]| a.step / b.step).collect());

@@ -12,6 +12,7 @@ use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
 use crate::data::real;
+use crate::expansion::{paired, step_ms};
 use crate::images::{Image, agree, cpu, psnr, render_one, view_along};
 use crate::lenses::{lenses, rolling_view, street_scene};
 use crate::truths::read;
@@ -178,4 +179,25 @@ fn a_part_of_a_small_image_is_the_image_of_the_part() {
     let whole = render_one(&cpu(), &street, &profile, whole);
     let cut = crop_rgba(&whole, 80, [20, 10], [40, 30]);
     assert!(psnr(&image.rgba, &cut) > 90.0);
+}
+
+/// Small images against images of the same size with the blur of their own pixels.
+#[test]
+#[ignore = "times: cargo test --release -p wildcity-render --test render small_images_cost -- --ignored --nocapture"]
+fn small_images_cost_nothing() {
+    let backend = cpu();
+    let profile = RenderProfile::default();
+    let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
+    let scene = Scene::from_gaussians(&street.gaussians);
+    let world_from_rig = street.trajectory.at_station(60.0);
+    let views = View::of_rig(&Rig::preset("vehicle6").unwrap().cameras, world_from_rig);
+    for divisor in [2, 3, 4] {
+        let both: Vec<[View; 2]> = views.iter().map(|view| small(*view, divisor)).collect();
+        let [shrunk, own] = [0, 1].map(|k| both.iter().map(|pair| pair[k]).collect::<Vec<_>>());
+        let name = format!("six images at 1/{divisor}, shrunk and with their own blur");
+        let ratio = paired(&name, &|| step_ms(&backend, &scene, &profile, &shrunk), &|| {
+            step_ms(&backend, &scene, &profile, &own)
+        });
+        assert!(ratio <= 1.02, "{name}: {ratio:.3}");
+    }
 }

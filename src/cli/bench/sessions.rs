@@ -11,10 +11,11 @@ use serde_json::json;
 use super::temporary_dir::TemporaryDir;
 use crate::cli::backend_options::{self, BackendOptions};
 use crate::cli::directories::{TwinVersion, Twins};
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Outputs, RigChoice, Session, SessionOptions, Start,
+    Encoding, Engine, EngineSettings, Outputs, RigChoice, Scenarios, Session, SessionOptions, Start,
 };
 use wildcity_twin::residency::Cache;
 
@@ -103,6 +104,7 @@ impl Sessions {
         let engine = Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
             episodes: episodes.path().to_owned(),
+            scenarios: Scenarios::in_dir(""),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
         })?;
@@ -132,16 +134,21 @@ impl Sessions {
         let trajectory = manifest.trajectories.first();
         let trajectory =
             trajectory.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
-        let route = Arc::new(Route::new(trajectory)?);
+        let route = Route::new(trajectory)?;
+        // Poses along the route, one per step.
+        let count_of_poses = (route.length_m() / Driver::STEP_M) as usize + 1;
+        let poses: Arc<[Pose]> = (0..count_of_poses)
+            .map(|index| route.at(index as f64 * Driver::STEP_M).world_from_rig)
+            .collect();
         let mut drivers = Vec::new();
         for number in 0..count {
-            let from_m = route.length_m() * f64::from(number) / f64::from(count);
+            let at = poses.len() * number as usize / count as usize;
             let name = format!("bench-{number}");
             let options = self.options(manifest)?;
             let mut session = Session::open(engine.clone(), name, options).await?;
-            let start = Start::Pose(route.at(from_m).world_from_rig);
+            let start = Start::Pose(poses[at]);
             session.reset(0, Some(start)).await?;
-            drivers.push(Driver { session, route: route.clone(), station_m: from_m });
+            drivers.push(Driver { session, poses: poses.clone(), at });
         }
 
         let processor_before = processor_time()?;
@@ -199,8 +206,10 @@ impl Sessions {
 /// A session that drives in circles.
 struct Driver {
     session: Session,
-    route: Arc<Route>,
-    station_m: f64,
+    /// Poses along the route.
+    poses: Arc<[Pose]>,
+    /// Index of the last pose.
+    at: usize,
 }
 
 impl Driver {
@@ -211,8 +220,8 @@ impl Driver {
     async fn drive_until(mut self, end: Instant) -> anyhow::Result<Vec<StepTime>> {
         let mut steps = Vec::new();
         while Instant::now() < end {
-            self.station_m = (self.station_m + Self::STEP_M) % self.route.length_m();
-            let pose = self.route.at(self.station_m).world_from_rig;
+            self.at = (self.at + 1) % self.poses.len();
+            let pose = self.poses[self.at];
             let begun = Instant::now();
             let observation = self.session.step(pose, false).await?;
             let whole = begun.elapsed();

@@ -39,18 +39,20 @@ impl FramePart<'_> {
         ]
     }
 
-    /// A bound of its splats: all Gaussians of the clusters that its views may see. Small scenes are not looked
-    /// at, but have a bound below [`limits::FRAME_SPLATS`].
+    /// A bound of its splats: all Gaussians of actors and of the clusters that its views may see. Small scenes are not
+    /// looked at, but have a bound below [`limits::FRAME_SPLATS`].
     pub(super) fn max_splats(&self) -> usize {
         let Frame { scene, views, .. } = self.frame;
         let all = scene.gaussians() * views.len();
         if all <= limits::FRAME_SPLATS {
             return all;
         }
-        views.par_iter().map(|view| self.visible_gaussians(view)).sum()
+        let of_actors: usize = scene.placed.iter().map(|placed| placed.chunk.len()).sum();
+        let of_twin: usize = views.par_iter().map(|view| self.visible_gaussians(view)).sum();
+        of_twin + of_actors * views.len()
     }
 
-    /// Gaussians of the clusters that a view may see.
+    /// Gaussians of the twin's clusters that a view may see.
     fn visible_gaussians(&self, view: &View) -> usize {
         let Frame { scene, profile, .. } = self.frame;
         let unscented = UnscentedView::new(view, profile);
