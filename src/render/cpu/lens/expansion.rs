@@ -96,21 +96,19 @@ impl<S: Simd> Px<S> {
 }
 
 impl LensProjection {
-    /// The expansion around points of the camera's frame at the end of the exposure, which are exposed as
-    /// `exposed` says; `None` for a lens that no short series describes. Lanes with a negative margin are
-    /// meaningless.
+    /// The expansion around points of the camera's frame at the moment of their exposure ([`Self::at_exposure`]);
+    /// `None` for a lens that no short series describes. Lanes with a negative margin are meaningless.
     #[inline(always)]
     pub(in crate::cpu) fn expand<S: Simd>(
         &self,
         simd: S,
-        at_end_m: Vec3x16<S>,
+        then_m: Vec3x16<S>,
         exposed: &ExposedPixels<S>,
     ) -> Option<Expansion<S>> {
-        let Some(shutter) = &self.shutter else { return self.expand_static(simd, at_end_m) };
+        let ExposedPixels { pixels: LensPixels { x_px, y_px, per_sin, .. }, remaining } = *exposed;
+        let mut expansion = self.expand_static(simd, then_m, per_sin)?;
+        let Some(shutter) = &self.shutter else { return Some(expansion) };
         let splat = |value: f32| f32x16::splat(simd, value);
-        let ExposedPixels { pixels: LensPixels { x_px, y_px, .. }, remaining } = *exposed;
-        let then_m = shutter.to_exposure_frame(simd, at_end_m, remaining);
-        let mut expansion = self.expand_static(simd, then_m)?;
 
         // The motion of the point in the camera's frame, and on the image.
         let motion_m = shutter.velocity(simd, then_m, remaining);
@@ -133,16 +131,23 @@ impl LensProjection {
         Some(expansion)
     }
 
-    /// The expansion around points of the camera's frame.
+    /// The expansion around points of the camera's frame. `per_sin` is [`LensPixels::per_sin`].
     #[inline(always)]
-    fn expand_static<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> Option<Expansion<S>> {
-        let Some(windshield) = &self.windshield else { return self.expand_lens(simd, point_m) };
+    fn expand_static<S: Simd>(
+        &self,
+        simd: S,
+        point_m: Vec3x16<S>,
+        per_sin: f32x16<S>,
+    ) -> Option<Expansion<S>> {
+        let Some(windshield) = &self.windshield else {
+            return self.expand_lens(simd, point_m, per_sin);
+        };
         let splat = |value: f32| f32x16::splat(simd, value);
         let distance_m = point_m.dot(point_m).sqrt();
         let unit = point_m.scale(splat(1.0) / distance_m);
         let refraction = windshield.expand(simd, unit);
         let inside = refraction.inside;
-        let mut expansion = self.expand_lens(simd, inside.scale(distance_m))?;
+        let mut expansion = self.expand_lens(simd, inside.scale(distance_m), per_sin)?;
         expansion.room = expansion.room.min(refraction.margin);
         // A displacement v becomes inside (unit · v) + by_x (x̂ - x unit) · v + by_y (ŷ - y unit) · v, where x̂ and ŷ
         // are the camera's axes. So each row has a part along the ray, and one along x̂ and ŷ.
@@ -161,13 +166,18 @@ impl LensProjection {
 
     /// The expansion around points, or directions behind the windshield, by the lens alone.
     #[inline(always)]
-    fn expand_lens<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> Option<Expansion<S>> {
+    fn expand_lens<S: Simd>(
+        &self,
+        simd: S,
+        point_m: Vec3x16<S>,
+        per_sin: f32x16<S>,
+    ) -> Option<Expansion<S>> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let zero = splat(0.0);
         let one = splat(1.0);
         let Vec3x16 { x, y, z } = point_m;
         match &self.model {
-            Model::Round { px_from_round, series, derivatives, max_t } => {
+            Model::Round { px_from_round, derivatives, max_t, beyond, .. } => {
                 let RoundDerivatives { slope, curvature } = derivatives.as_ref()?;
                 let rho2 = x.mul_add(x, y * y);
                 let rho = rho2.sqrt();
@@ -183,9 +193,20 @@ impl LensProjection {
                 let cos = z * per_distance;
                 let sin = rho * per_distance;
 
-                let alpha = slope.at(simd, t);
-                let beta = series.at(simd, t) * inverse * distance;
-                let gamma = curvature.at(simd, t);
+                let end = splat(*max_t);
+                let within = t.simd_le(end);
+                let mut alpha = slope.at(simd, t.min(end));
+                let beta = per_sin;
+                let mut gamma = curvature.at(simd, t.min(end));
+                // dt/dθ = (1 + t²)/2
+                let mut room = (end - t) * splat(2.0) / t.mul_add(t, one);
+                if let Some(tangent) = beyond
+                    && !within.all_true()
+                {
+                    alpha = within.select(alpha, splat(tangent.per_rad()));
+                    gamma = within.select(gamma, zero);
+                    room = within.select(room, tangent.past_begin_rad(simd, t));
+                }
                 // Below 1e-3 rad off the axis the numerators are of second order, and rounding errors.
                 let per_sin = one / sin.max(splat(1e-3));
                 let kappa = (alpha * cos - beta) * per_sin;
@@ -213,8 +234,26 @@ impl LensProjection {
                     kappa,
                     mu,
                     plane,
-                    // dt/dθ = (1 + t²)/2
-                    room: (splat(*max_t) - t) * splat(2.0) / t.mul_add(t, one),
+                    room,
+                    shutter: None,
+                })
+            }
+            Model::Pinhole { focal_px, max_slope2, .. } => {
+                let inverse = one / z;
+                let x = x * inverse;
+                let y = y * inverse;
+                let [fx, fy] = focal_px.map(splat);
+                let in_front = z.simd_gt(zero);
+                let room = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
+                Some(Expansion {
+                    rows: slope_rows(simd, x, y, inverse),
+                    alpha: one,
+                    beta: one,
+                    gamma: zero,
+                    kappa: zero,
+                    mu: zero,
+                    plane: [[fx, zero], [zero, fy]],
+                    room: in_front.select(room, splat(-1.0)),
                     shutter: None,
                 })
             }
@@ -248,13 +287,8 @@ impl LensProjection {
                     [fx * (along_x + twice(prism_x * x)), fx * (across + twice(prism_x * y))],
                     [fy * (across + twice(prism_y * x)), fy * (along_y + twice(prism_y * y))],
                 ];
-                let rows = [
-                    Vec3x16 { x: inverse, y: zero, z: -(x * inverse) },
-                    Vec3x16 { x: zero, y: inverse, z: -(y * inverse) },
-                    Vec3x16 { x: zero, y: zero, z: inverse },
-                ];
                 Some(Expansion {
-                    rows,
+                    rows: slope_rows(simd, x, y, inverse),
                     alpha: one,
                     beta: one,
                     gamma: zero,
@@ -267,6 +301,22 @@ impl LensProjection {
             }
         }
     }
+}
+
+/// Rows that take displacements of points with slopes x, y at a depth of 1/`inverse` to (a, b, c).
+#[inline(always)]
+fn slope_rows<S: Simd>(
+    simd: S,
+    x: f32x16<S>,
+    y: f32x16<S>,
+    inverse: f32x16<S>,
+) -> [Vec3x16<S>; 3] {
+    let zero = f32x16::splat(simd, 0.0);
+    [
+        Vec3x16 { x: inverse, y: zero, z: -(x * inverse) },
+        Vec3x16 { x: zero, y: inverse, z: -(y * inverse) },
+        Vec3x16 { x: zero, y: zero, z: inverse },
+    ]
 }
 
 impl<S: Simd> Expansion<S> {

@@ -132,19 +132,20 @@ fn project_lanes<S: Simd>(
     let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
     let at_end_m = [x, y, z];
 
-    // Cull what is too faint, and what surely misses the image.
+    // Cull what is too faint, and what surely misses the image, before the lens is applied.
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
     let scale = Vec3x16::load(simd, columns, column::SCALE);
     let bound = view.unscented.cull_bound();
     let sigma_m = scale.x.max(scale.y).max(scale.z);
-    let in_range = log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut))
-        & !surely_unseen(simd, center, sigma_m, bound);
+    let angles = CenterAngles::new(simd, center, sigma_m, bound);
+    let in_range =
+        log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut)) & !angles.surely_unseen(simd, bound);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
 
     // When each centre is exposed, and where the camera is then.
-    let exposed = lens.project(simd, center, splat(0.0));
+    let exposed = lens.project(simd, center, splat(0.0), in_range);
     let ExposedPixels { pixels: center_px, remaining } = exposed;
     let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     if let Some(shutter) = lens.shutter() {
@@ -161,14 +162,11 @@ fn project_lanes<S: Simd>(
         None => splat(0.0).simd_ge(splat(0.0)),
         Some(_) => found,
     };
-    let mut in_range = in_range & (in_depth | !is_depth);
-    if lens.shutter().is_none() {
-        let beside = beside(simd, center_px, center, sigma_m, view);
-        in_range = match lens.ends_on_azimuth() {
-            true => in_range & !beside,
-            false => in_range & !(found & beside),
-        };
-    }
+    // Too far outside of the lens' field, or so far beside the image that no point of it lands there.
+    let then_m = lens.at_exposure(simd, center, remaining);
+    let least_z = splat(bound.max_center_cos as f32) * then_m.dot(then_m).sqrt();
+    let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view);
+    let in_range = in_range & (in_depth | !is_depth) & !(found & too_far);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
@@ -177,6 +175,7 @@ fn project_lanes<S: Simd>(
     let axes = rotation_columns(simd, columns);
     let gaussians = CenteredBlock {
         center,
+        then_m,
         axes_m: [axes[0].scale(scale.x), axes[1].scale(scale.y), axes[2].scale(scale.z)],
         exposed,
         depth_m,
@@ -197,6 +196,8 @@ fn project_lanes<S: Simd>(
 struct CenteredBlock<S: Simd> {
     /// Centres in the camera's frame at the end of the exposure, in metres.
     center: Vec3x16<S>,
+    /// Centres in the camera's frame at the moments of their exposure, in metres.
+    then_m: Vec3x16<S>,
     /// Own axes times their standard deviations, in the chunk's axes, in metres.
     axes_m: [Vec3x16<S>; 3],
     /// The centres' images.
@@ -223,10 +224,11 @@ fn expand<S: Simd>(
     lens: &LensProjection,
     cutoffs: &Cutoffs,
 ) -> (SplatBlock, mask32x16<S>) {
-    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range } = *gaussians;
+    let CenteredBlock { then_m, axes_m, ref exposed, depth_m, log2_opacity, in_range, .. } =
+        *gaussians;
     let none = (SplatBlock::default(), in_range);
     let Some(bound) = view.unscented.expansion_bound() else { return none };
-    let Some(mut expansion) = lens.expand(simd, center, exposed) else { return none };
+    let Some(mut expansion) = lens.expand(simd, then_m, exposed) else { return none };
     expansion.in_frame(rotation_rows(simd, view));
     let ExpandedAxes { columns, mean_shift, remainder } = expansion.axes(simd, axes_m);
     let pixels = exposed.pixels;
@@ -261,32 +263,6 @@ fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) 
     within & error_px.simd_le(splat(bound.max_error_px))
 }
 
-/// Which Gaussians miss the image, given the images of their centres: none of their points lands farther from
-/// there than the most pixels per radian allow ([`CullBound`]).
-#[inline(always)]
-fn beside<S: Simd>(
-    simd: S,
-    center_px: LensPixels<S>,
-    center_m: Vec3x16<S>,
-    sigma_m: f32x16<S>,
-    view: &UnscentedChunkView<'_>,
-) -> mask32x16<S> {
-    let splat = |value: f64| f32x16::splat(simd, value as f32);
-    let bound = view.unscented.cull_bound();
-    let share = splat(3.0_f64.sqrt()) * sigma_m / center_m.dot(center_m).sqrt();
-    // Below s = 1/2, asin s is at most s π/3. A windshield changes the angle between two rays by less than half
-    // of it.
-    let widened = if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 };
-    let spread_rad = share * splat(widened * std::f64::consts::FRAC_PI_3);
-    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
-    let [width, height] = view.size_px.map(|side| f32x16::splat(simd, side));
-    let beyond = |at: f32x16<S>, side: f32x16<S>| (-at).max(at - side);
-    let off_px = beyond(center_px.x_px, width).max(beyond(center_px.y_px, height));
-    // Where the points may lie near the axis' other end, the lens is not continued, and no bound holds.
-    let forward = center_m.z.simd_gt(splat(0.0));
-    share.simd_lt(splat(0.5)) & forward & off_px.simd_gt(reach_px)
-}
-
 /// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
 /// and a bit for each other Gaussian that may be seen.
 #[inline(always)]
@@ -298,7 +274,8 @@ fn project_six_points<S: Simd>(
     cutoffs: &Cutoffs,
 ) -> (SplatBlock, u64) {
     let splat = |value: f32| f32x16::splat(simd, value);
-    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range } = *gaussians;
+    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range, .. } =
+        *gaussians;
 
     // The six points: ±√3 standard deviations along each own axis.
     let [right, down, forward] = rotation_rows(simd, view);
@@ -312,10 +289,10 @@ fn project_six_points<S: Simd>(
         let plus = center.plus(offset);
         let minus = center.minus(offset);
         // Each search begins with the moment at which the centre is exposed.
-        let LensPixels { x_px: ax, y_px: ay, margin: a } =
-            lens.project(simd, plus, exposed.remaining).pixels;
-        let LensPixels { x_px: bx, y_px: by, margin: b } =
-            lens.project(simd, minus, exposed.remaining).pixels;
+        let LensPixels { x_px: ax, y_px: ay, margin: a, .. } =
+            lens.project(simd, plus, exposed.remaining, in_range).pixels;
+        let LensPixels { x_px: bx, y_px: by, margin: b, .. } =
+            lens.project(simd, minus, exposed.remaining, in_range).pixels;
         margin = margin.min(a).min(b);
         *pair = [ax, ay, bx, by];
         mean_x += ax + bx;
@@ -362,45 +339,96 @@ fn moments_of_root<S: Simd>(simd: S, root: [[f32x16<S>; 2]; 6]) -> Moments<S> {
     Moments { xx, yy, xy, det }
 }
 
-/// Which Gaussians certainly miss the image: the test of [`CullBound`] in f32. Its bounds of the angles are
-/// widened by the errors of the approximations here.
-#[inline(always)]
-fn surely_unseen<S: Simd>(
-    simd: S,
-    center_m: Vec3x16<S>,
-    sigma_m: f32x16<S>,
-    bound: &CullBound,
-) -> mask32x16<S> {
-    let splat = |value: f64| f32x16::splat(simd, value as f32);
-    let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
-    let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
+/// Angles of 16 centres and their points, in radians, for the tests of [`CullBound`]. They are widened by the errors of the
+/// approximations here.
+struct CenterAngles<S: Simd> {
+    /// Least angle off the axis of the centres during the exposure.
+    least: f32x16<S>,
+    /// Largest angle off the axis of the centres and their points during the exposure.
+    most: f32x16<S>,
+    /// Largest angle between a centre and one of its points.
+    spread: f32x16<S>,
+    /// By how much the shutter changes that angle, if both are exposed at different moments.
+    motion: f32x16<S>,
+    /// Not close to the camera, where these bounds do not hold.
+    far: mask32x16<S>,
+    /// No point comes near the axis' other end, where the lens is not continued.
+    continued: mask32x16<S>,
+}
 
-    // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
-    // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
-    let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
-    let steep = t.simd_gt(splat(1.0));
-    let low = steep.select(splat(1.0) / t, t);
-    let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
-    let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+impl<S: Simd> CenterAngles<S> {
+    #[inline(always)]
+    fn new(simd: S, center_m: Vec3x16<S>, sigma_m: f32x16<S>, bound: &CullBound) -> Self {
+        let splat = |value: f64| f32x16::splat(simd, value as f32);
+        let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
+        let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
 
-    // Below s = 1/2, asin s is at most s π/3.
-    let third_turn = splat(std::f64::consts::FRAC_PI_3);
-    let translation = splat(bound.translation_m) / distance_m;
-    let slack_rad = translation.mul_add(third_turn, splat(0.01 + bound.rotation_rad));
-    let least_rad = half + half - slack_rad;
-    let most_rad = half + half + slack_rad;
-    let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.translation_m));
-    let spread_rad = share.mul_add(third_turn, splat(bound.windshield_rad));
+        // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
+        // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
+        let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
+        let steep = t.simd_gt(splat(1.0));
+        let low = steep.select(splat(1.0) / t, t);
+        let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
+        let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+        let off_axis = half + half;
 
-    // Out: the distance from the image is more than any splat reaches, and no point comes near the axis'
-    // other end, where the lens is not continued.
-    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
-    let out_px =
-        (least_rad - splat(bound.windshield_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
-    let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
-    // Close to the camera the bounds above do not hold, and nothing is decided.
-    let far = translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5));
-    far & (out | least_rad.simd_gt(splat(bound.max_center_rad)))
+        // Below s = 1/2, asin s is at most s π/3.
+        let third_turn = splat(std::f64::consts::FRAC_PI_3);
+        let translation = splat(bound.translation_m) / distance_m;
+        let motion = translation.mul_add(third_turn, splat(bound.rotation_rad));
+        let slack = motion + splat(0.01);
+        let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.translation_m));
+        let spread = share * third_turn;
+        let most = off_axis + slack + spread + splat(bound.windshield_rad);
+        Self {
+            least: off_axis - slack,
+            most,
+            spread,
+            motion,
+            far: translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5)),
+            continued: most.simd_lt(splat(WIDEST_RAD)),
+        }
+    }
+
+    /// Which Gaussians certainly miss the image: the test of [`CullBound`].
+    #[inline(always)]
+    fn surely_unseen(&self, simd: S, bound: &CullBound) -> mask32x16<S> {
+        let splat = |value: f64| f32x16::splat(simd, value as f32);
+        let reach_px = self.reach_px(simd, self.spread + splat(bound.windshield_rad), bound);
+        let off_rad = self.least - splat(bound.windshield_rad + bound.image_rad);
+        let out = (off_rad * splat(bound.least_px_per_rad)).simd_gt(reach_px);
+        self.far & (self.continued & out | self.least.simd_gt(splat(bound.max_center_rad)))
+    }
+
+    /// Which Gaussians miss the image, given the images of their centres: none of their points lands farther from there
+    /// than the most pixels per radian allow. A windshield changes the angle between two rays by less than half of it.
+    #[inline(always)]
+    fn beside(
+        &self,
+        simd: S,
+        center_px: LensPixels<S>,
+        view: &UnscentedChunkView<'_>,
+    ) -> mask32x16<S> {
+        let bound = view.unscented.cull_bound();
+        let widened = f32x16::splat(simd, if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 });
+        let reach_px = self.reach_px(simd, (self.spread + self.motion) * widened, bound);
+        let [width, height] = view.size_px.map(|side| f32x16::splat(simd, side));
+        let beyond = |at: f32x16<S>, side: f32x16<S>| (-at).max(at - side);
+        let off_px = beyond(center_px.x_px, width).max(beyond(center_px.y_px, height));
+        self.far & self.continued & off_px.simd_gt(reach_px)
+    }
+
+    /// How far splats reach from the images of their centres, in pixels, if their points spread by some angles.
+    #[inline(always)]
+    fn reach_px(&self, simd: S, spread_rad: f32x16<S>, bound: &CullBound) -> f32x16<S> {
+        let splat = |value: f64| f32x16::splat(simd, value as f32);
+        let mut px_per_rad = splat(f64::INFINITY);
+        for cone in bound.reaches.iter().rev() {
+            let within = self.most.simd_le(splat(cone.rad));
+            px_per_rad = within.select(splat(cone.px_per_rad), px_per_rad);
+        }
+        spread_rad.mul_add(px_per_rad, splat(bound.blur_px))
+    }
 }
 
 #[inline(always)]

@@ -32,7 +32,7 @@ pub mod windshield;
 
 use glam::{DVec2, DVec3};
 
-pub use field::{FieldCone, FieldMask};
+pub use field::{FieldCone, FieldMask, ScaleWithin};
 pub use fisheye::Fisheye;
 pub use ftheta::{FTheta, FThetaReference};
 pub use monotone::MonotonePolynomial;
