@@ -123,17 +123,27 @@ struct Footprint {
     units_per_px: f32,
 }
 
-// The shape of a footprint after the blur, and whether any of it lies on the rows that are drawn.
+// The shape of a footprint after the pixel filter (`PixelFilter` in `src/render/layout.rs`), and whether any
+// of it lies on the rows that are drawn. A native image has a branch of its own, which keeps its bytes.
 fn shape_of(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projected {
-    let blur = frame.blur_px2 * foot.units_per_px * foot.units_per_px;
+    let image = frame.view[view];
+    let units2 = foot.units_per_px * foot.units_per_px;
+    let blur = image.total_px2.x * foot.units_per_px * foot.units_per_px;
     let xx = foot.covariance.x;
     let yy = foot.covariance.z;
-    let det = blur * (xx + yy + blur) + foot.det_unblurred;
+    var det = blur * (xx + yy + blur) + foot.det_unblurred;
     let a = xx + blur;
-    let c = yy + blur;
+    var c = yy + blur;
+    var det_native = det;
     var log2_opacity = gaussian_log2_opacity;
+    if any(image.native_px2 != image.total_px2) {
+        det_native = det_with(foot, image.native_px2 * units2);
+        det = det_with(foot, image.total_px2 * units2);
+        c = yy + image.total_px2.y * units2;
+        log2_opacity += 0.75 * log2(det_native / det);
+    }
     if frame.antialiased != 0u {
-        log2_opacity += 0.5 * log2(max(foot.det_unblurred / det, 0.005 * 0.005));
+        log2_opacity += 0.5 * log2(max(foot.det_unblurred / det_native, 0.005 * 0.005));
     }
     let unit = 0.8493218 * foot.units_per_px; // sqrt(log2(e) / 2)
     let root_c = sqrt(c);
@@ -146,13 +156,17 @@ fn shape_of(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projected
     let power = log2_opacity - frame.log2_alpha_cut;
     let reach = sqrt(max(power, 0.0)) / unit;
     let extent_px = reach * vec2f(sqrt(a), root_c) + EXTENT_SLACK_PX;
-    let image = frame.view[view];
     let first_px = vec2u(0u, image.rows.x * TILE_PX);
     let end_px = vec2u(image.size_px.x, min(image.rows.y * TILE_PX, image.size_px.y));
     let on_image = all(foot.mean_px + extent_px >= vec2f(first_px) + 0.5)
         && all(foot.mean_px - extent_px <= vec2f(end_px) - 0.5);
     let shape = SplatShape(foot.mean_px, extent_px, vec3f(l0, l1, l2), log2_opacity);
     return Projected(power >= 0.0 && on_image, shape, 0.0, vec3f(0.0));
+}
+
+// Determinant of a footprint's covariance with two variances added along x and y.
+fn det_with(foot: Footprint, add: vec2f) -> f32 {
+    return add.x * (foot.covariance.z + add.y) + (add.y * foot.covariance.x + foot.det_unblurred);
 }
 
 // A product and its rounding error (TwoProduct, Dekker 1971). `fma` would be shorter, but WGSL allows it

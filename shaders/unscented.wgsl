@@ -1,5 +1,6 @@
 // Stage project for lenses and rolling shutters by the unscented transform: the mean and covariance of
-// six projected sigma points. Twin of `src/render/unscented.rs`, which explains the choice of points.
+// six projected sigma points. Twin of `src/render/unscented.rs`, which explains the choice of points. Where the
+// camera's expansion around the centre gives the same within a bound, it stands for the points.
 //
 // f32 suffices because no large numbers cancel: the six points are taken relative to where the centre
 // lands, polynomials take fractions of the lens' field, a windshield's polynomials give the change of the
@@ -7,6 +8,7 @@
 // motion back from there.
 
 #import lens
+#import expansion
 
 // Most iterations of the search for the row that sees a point, and the change (a fraction of the
 // exposure) at which it ends.
@@ -32,14 +34,29 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
         return Projected();
     }
 
+    let chunk_from_gaussian = rotation_from_quat(gaussian.quat_wxyz);
+    var axes_m: array<vec3f, 3>;
+    for (var axis = 0u; axis < 3u; axis++) {
+        let axis_m = chunk_from_gaussian[axis] * gaussian.scale_m[axis];
+        axes_m[axis] = vec3f(dot(rows[0].xyz, axis_m), dot(rows[1].xyz, axis_m), dot(rows[2].xyz, axis_m));
+    }
+    let from_camera_m =
+        gaussian.mean_m - view.camera_m + center.fraction * lenses[lens].moved_world_m;
+
+    // Small Gaussians: the expansion around the centre.
+    let expanded = expand_axes(lens, center, axes_m);
+    if expanded.close {
+        return splat_of_root(
+            center.at_px + expanded.shift_px, expanded.root_px, gaussian.log2_opacity, index_of_view(view), depth_m, from_camera_m,
+        );
+    }
+
     // The sigma points at +-sqrt(3) standard deviations along each axis, relative to where the centre
     // lands, so that the shape of small Gaussians is not lost to rounding.
-    let chunk_from_gaussian = rotation_from_quat(gaussian.quat_wxyz);
     var pairs: array<vec4f, 3>;
     var sum_px = vec2f(0.0);
     for (var axis = 0u; axis < 3u; axis++) {
-        let axis_m = chunk_from_gaussian[axis] * (ROOT_3 * gaussian.scale_m[axis]);
-        let offset_m = vec3f(dot(rows[0].xyz, axis_m), dot(rows[1].xyz, axis_m), dot(rows[2].xyz, axis_m));
+        let offset_m = ROOT_3 * axes_m[axis];
         let one_px = project_point(lens, center_m + offset_m, center.fraction).at_px - center.at_px;
         let other_px = project_point(lens, center_m - offset_m, center.fraction).at_px - center.at_px;
         pairs[axis] = vec4f(one_px, other_px);
@@ -50,32 +67,49 @@ fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projecte
     // A square root of the covariance with six columns. For each pair of points, half their difference
     // and the offset of their middle from the mean contribute as much as the two points themselves.
     var root_px: array<vec2f, 6>;
-    var widest = 0.0;
     for (var axis = 0u; axis < 3u; axis++) {
         let pair = pairs[axis];
         let across = (0.5 / ROOT_3) * (pair.xy - pair.zw);
         let middle = (1.0 / ROOT_3) * (0.5 * (pair.xy + pair.zw) - mean_px);
         root_px[axis] = across;
         root_px[axis + 3u] = middle;
-        widest = max(widest, max(max(abs(across.x), abs(across.y)), max(abs(middle.x), abs(middle.y))));
+    }
+    return splat_of_root(
+        center.at_px + mean_px, root_px, gaussian.log2_opacity, index_of_view(view), depth_m, from_camera_m,
+    );
+}
+
+// The splat with a mean and a root of the covariance, in pixels.
+fn splat_of_root(
+    mean_px: vec2f,
+    root_px: array<vec2f, 6>,
+    log2_opacity: f32,
+    view: u32,
+    depth_m: f32,
+    from_camera_m: vec3f,
+) -> Projected {
+    var root = root_px;
+    var widest = 0.0;
+    for (var i = 0u; i < 6u; i++) {
+        widest = max(widest, max(abs(root[i].x), abs(root[i].y)));
     }
     // Covariance, and its determinant as the sum of the squares of all 2 x 2 minors (Cauchy-Binet).
     let units_per_px = min(MAX_SIGMA_PX / max(widest, 1e-30), 1.0);
     var covariance = vec3f(0.0);
     var det_unblurred = 0.0;
     for (var i = 0u; i < 6u; i++) {
-        let column = root_px[i] * units_per_px;
+        let column = root[i] * units_per_px;
         covariance += vec3f(column.x * column, column.y * column.y);
         for (var k = 0u; k < i; k++) {
-            let other = root_px[k] * units_per_px;
+            let other = root[k] * units_per_px;
             let minor = column.x * other.y - column.y * other.x;
             det_unblurred += minor * minor;
         }
     }
-    let foot = Footprint(center.at_px + mean_px, covariance, det_unblurred, units_per_px);
-    var projected = shape_of(foot, gaussian.log2_opacity, index_of_view(view));
+    let foot = Footprint(mean_px, covariance, det_unblurred, units_per_px);
+    var projected = shape_of(foot, log2_opacity, view);
     projected.depth_m = depth_m;
-    projected.from_camera_m = gaussian.mean_m - view.camera_m + center.fraction * lenses[lens].moved_world_m;
+    projected.from_camera_m = from_camera_m;
     return projected;
 }
 

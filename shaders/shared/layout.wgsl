@@ -8,6 +8,8 @@ struct FrameView {
     macro_columns: u32,
     first_macro_tile: u32,
     rows: vec2u,
+    native_px2: vec2f,
+    total_px2: vec2f,
 }
 
 struct Frame {
@@ -19,14 +21,10 @@ struct Frame {
     macro_tiles: u32,
     near_m: f32,
     far_m: f32,
-    blur_px2: f32,
     antialiased: u32,
     alpha_cap: f32,
     log2_alpha_cut: f32,
     stop: f32,
-    pad0: u32,
-    pad1: u32,
-    pad2: u32,
     view: array<FrameView, MAX_VIEWS>,
 }
 
@@ -97,6 +95,7 @@ struct Lens {
     moved_world_m: vec3f,
     pad2: u32,
     axis_angle: vec4f,
+    expansion: vec4f,
 }
 
 struct Owner {

@@ -18,6 +18,7 @@ pub mod automatic;
 pub mod compare;
 pub mod constants;
 pub mod cpu;
+pub mod expansion;
 pub mod gpu;
 pub mod hybrid;
 pub mod layout;
@@ -129,7 +130,7 @@ pub struct FrameStats {
     pub evaluations: u64,
 }
 
-/// Why a frame was not rendered. No target was written then.
+/// Why a frame was not rendered. Its targets may have been written in part.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RenderError {
     /// No view, or more than the sort key has bits for.

@@ -14,3 +14,8 @@ pub const PARTITION_CACHE_ENTRIES: usize = 64;
 
 /// Smallest limit of a binding that the gpu backend supports: one cluster of SH degree 3 takes 34 kB.
 pub const BINDING_BYTES_MIN: u64 = 64 << 10;
+
+/// Most splats of the views that the cpu backend renders together, counted as all Gaussians of the visible
+/// clusters. A splat takes 56 B with its sort key, and its instances about as much again on a street: 300 MB if
+/// every Gaussian of these clusters were visible, and half of that is usual. One view alone may have more.
+pub const FRAME_SPLATS: usize = 3 << 20;

@@ -25,9 +25,11 @@
 
 use glam::{DMat3, DVec2, DVec3, Vec3};
 
+use super::expansion::ExpansionBound;
+use super::layout::PixelFilter;
 use super::{RollingShutter, View};
 use wildcity_scene::RenderProfile;
-use wildcity_scene::geometry::camera::{FieldCone, WIDEST_RAD};
+use wildcity_scene::geometry::camera::{FieldCone, ScaleWithin, WIDEST_RAD};
 use wildcity_scene::geometry::{Camera, Pose};
 
 /// How far beyond the lens' field a centre may lie and still be drawn, in radians: as far as a pinhole of 62°
@@ -42,6 +44,7 @@ pub struct UnscentedView<'a> {
     /// Nearest and farthest depth of a centre, in metres.
     range_m: [f64; 2],
     cull_bound: CullBound,
+    expansion_bound: Option<ExpansionBound>,
 }
 
 /// A Gaussian on the image.
@@ -69,25 +72,45 @@ pub struct Footprint {
 /// The left side of the second condition is the least distance of the centre's image from the image, in pixels,
 /// and the right side the farthest that its splat reaches. A Gaussian at distance d has its points within
 /// `s = asin(√3 σ/d)` of its centre, and their images within L s of the centre's image, where L is the most
-/// pixels per radian. So no splat reaches farther than `(1 + sigmas) L s` and the blur.
+/// pixels per radian between them. So no splat reaches farther than `(1 + sigmas) L s` and the blur. L rises with the angle
+/// off the axis, so `reach` is a bound within the narrowest of some cones that has all points.
 #[derive(Clone, Copy, Debug)]
 pub struct CullBound {
     /// How far off the axis a centre may lie and still be drawn, in radians.
     pub max_center_rad: f64,
+    /// The cosine of that angle.
+    pub max_center_cos: f64,
     /// How far off the axis the image's corner is, in radians.
     pub image_rad: f64,
     /// Least pixels per radian between a point and the image.
     pub least_px_per_rad: f64,
-    /// Farthest reach of a splat, in pixels per radian of its points' spread.
-    pub reach_px_per_rad: f64,
+    /// Farthest reach of splats with all their points in a cone, from the narrowest cone to the widest.
+    pub reaches: [ReachWithin; FieldCone::SCALES],
     /// What the blur adds to the reach, in pixels.
     pub blur_px: f64,
-    /// Most that a windshield changes angles, in radians; 0 without one.
+    /// Most that a windshield changes the angle between two rays, in radians; 0 without one.
     pub windshield_rad: f64,
     /// How far the camera moves during the exposure, in metres.
     pub translation_m: f64,
     /// How far the camera rotates during the exposure, in radians.
     pub rotation_rad: f64,
+}
+
+/// A bound of the reach of splats whose points lie within a cone around the camera's axis.
+#[derive(Clone, Copy, Debug)]
+pub struct ReachWithin {
+    /// The cone's angle, in radians off the axis.
+    pub rad: f64,
+    /// Farthest reach of a splat, in pixels per radian of its points' spread.
+    pub px_per_rad: f64,
+}
+
+impl CullBound {
+    /// Farthest reach of a splat with all points within an angle of the axis, in pixels per radian of their spread.
+    fn reach_px_per_rad(&self, within_rad: f64) -> f64 {
+        let cone = self.reaches.iter().find(|cone| within_rad <= cone.rad);
+        cone.map_or(f64::INFINITY, |cone| cone.px_per_rad)
+    }
 }
 
 impl<'a> UnscentedView<'a> {
@@ -99,15 +122,20 @@ impl<'a> UnscentedView<'a> {
         let [translation_m, rotation_rad] = motion(view);
         // The largest extent of any splat, in standard deviations.
         let sigmas = (-2.0 * profile.alpha_cut.ln()).sqrt() + 1e-3;
-        let FieldCone { image_rad, least_px_per_rad, most_px_per_rad } =
-            FieldCone::of(&view.camera);
+        let FieldCone { image_rad, least_px_per_rad, scales } = FieldCone::of(&view.camera);
+        let max_center_rad = max_center_angle_rad(&view.camera);
         let cull_bound = CullBound {
-            max_center_rad: max_center_angle_rad(&view.camera),
+            max_center_rad,
+            max_center_cos: max_center_rad.cos(),
             image_rad,
             least_px_per_rad,
-            reach_px_per_rad: (1.0 + sigmas) * most_px_per_rad,
-            blur_px: sigmas * profile.blur.sqrt() + 2.0,
-            windshield_rad: view.camera.windshield.map_or(0.0, |_| 0.4),
+            reaches: scales.map(|ScaleWithin { rad, most_px_per_rad }| ReachWithin {
+                rad,
+                px_per_rad: (1.0 + sigmas) * most_px_per_rad,
+            }),
+            blur_px: sigmas * PixelFilter::new(profile, &view.camera).max_sigma_px() + 2.0,
+            // Both rays of an angle are refracted.
+            windshield_rad: view.camera.windshield.map_or(0.0, |glass| 2.0 * glass.most_rad()),
             translation_m,
             rotation_rad,
         };
@@ -116,6 +144,7 @@ impl<'a> UnscentedView<'a> {
             camera_from_world: view.world_from_camera.inverse(),
             range_m: [profile.near, profile.far],
             cull_bound,
+            expansion_bound: ExpansionBound::of(view, profile),
         })
     }
 
@@ -127,6 +156,8 @@ impl<'a> UnscentedView<'a> {
             camera_from_world: view.world_from_camera.inverse(),
             range_m: self.range_m,
             cull_bound: CullBound { translation_m, rotation_rad, ..self.cull_bound },
+            // The lens is the same.
+            expansion_bound: self.expansion_bound.filter(|_| rotation_rad <= 0.5),
         }
     }
 
@@ -183,6 +214,11 @@ impl<'a> UnscentedView<'a> {
         &self.cull_bound
     }
 
+    /// When an expansion stands for the six points; `None` if never.
+    pub fn expansion_bound(&self) -> Option<&ExpansionBound> {
+        self.expansion_bound.as_ref()
+    }
+
     /// Size of the image, in pixels.
     pub fn size_px(&self) -> DVec2 {
         self.view.camera.size_px()
@@ -220,7 +256,8 @@ impl<'a> UnscentedView<'a> {
         if most_rad + spread_rad >= WIDEST_RAD {
             return true;
         }
-        let CullBound { least_px_per_rad, reach_px_per_rad, blur_px, .. } = self.cull_bound;
+        let CullBound { least_px_per_rad, blur_px, .. } = self.cull_bound;
+        let reach_px_per_rad = self.cull_bound.reach_px_per_rad(most_rad + spread_rad);
         let reach_px = reach_px_per_rad * spread_rad + blur_px;
         let distance_px = least_px_per_rad * (least_rad - windshield_rad - image_rad);
         let out = distance_px > reach_px;

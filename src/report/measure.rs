@@ -101,7 +101,7 @@ impl Benchmark<'_> {
         let mut by_sample_point = Vec::new();
         for (point, references) in self.sample_points.iter().zip(&reference.windows) {
             // The scene as this setting renders it: its images, its detail, its record format.
-            let scaled_point = point.scaled(setting.scale)?;
+            let scaled_point = point.scaled(setting)?;
             let pinned = self.scene(&scaled_point.views, &profile)?;
             let converted = setting.record.map(|record| round_trip(&pinned, record).scene);
             let scene: &Scene = converted.as_ref().unwrap_or(&pinned);
@@ -110,9 +110,19 @@ impl Benchmark<'_> {
             let views = &scaled_point.windows;
             let drawings = render_images(backend, scene, &profile, views)?;
             let mut images = Vec::with_capacity(views.len());
-            for ((view, drawing), reference) in views.iter().zip(&drawings).zip(references) {
-                images.push(received(setting, view, drawing, reference.size_px)?);
+            for (view, drawing) in views.iter().zip(&drawings) {
+                images.push(received(setting, view, drawing)?);
             }
+            // An image of another size is compared with the reference shrunk to it.
+            let shrunk: Vec<Image>;
+            let references = match setting.scale == 1.0 {
+                true => references,
+                false => {
+                    let pairs = references.iter().zip(&images);
+                    shrunk = pairs.map(|(truth, image)| truth.averaged(image.size_px)).collect();
+                    &shrunk
+                }
+            };
             let PointErrors { psnr_db, min_db } = errors.add(point, images, references);
 
             // Cost, of whole steps on the drive.
@@ -297,13 +307,8 @@ pub(super) fn sky_bytes(scene: &Scene, profile: &RenderProfile) -> Result<u64, R
     })
 }
 
-/// The image that an agent receives, at the size of the reference.
-fn received(
-    setting: &Setting,
-    view: &View,
-    drawing: &RenderedImage,
-    size_px: [u32; 2],
-) -> Result<Image, ReportError> {
+/// The image that an agent receives.
+fn received(setting: &Setting, view: &View, drawing: &RenderedImage) -> Result<Image, ReportError> {
     let mut image = displayed(view, drawing);
     if setting.encoding.is_some() {
         let encoded = encode(setting.encoding, view, &drawing.rgb8);
@@ -314,7 +319,7 @@ fn received(
         };
         image.rgb = rgb8.iter().map(|&byte| f32::from(byte) / 255.0).collect();
     }
-    Ok(if image.size_px == size_px { image } else { image.resized(size_px) })
+    Ok(image)
 }
 
 fn decode(file: &[u8]) -> Result<Vec<u8>, ReportError> {

@@ -39,6 +39,7 @@ fn color(family: Family) -> RGBColor {
         Family::Antialiasing => RGBColor(120, 94, 240),
         Family::AlphaCut => RGBColor(213, 94, 0),
         Family::Stop => RGBColor(204, 121, 167),
+        Family::Lens => RGBColor(150, 150, 60),
         Family::Sky => RGBColor(0, 170, 200),
         Family::Rays => RGBColor(110, 70, 30),
         Family::Scale => RGBColor(86, 180, 233),

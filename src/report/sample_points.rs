@@ -2,6 +2,7 @@
 
 use glam::{DQuat, DVec3};
 
+use super::setting::Setting;
 use wildcity_render::View;
 use wildcity_render::compare::images::{crop_view, view_along};
 use wildcity_scene::geometry::{Bounds, CameraError, Pose};
@@ -173,9 +174,14 @@ impl SamplePoint {
     ///
     /// # Errors
     /// A camera cannot be scaled to so small an image.
-    pub(super) fn scaled(&self, scale: f64) -> Result<Self, CameraError> {
+    pub(super) fn scaled(&self, setting: &Setting) -> Result<Self, CameraError> {
         let scale_all = |views: &[View]| -> Result<Vec<View>, CameraError> {
-            views.iter().map(|view| scaled(*view, scale)).collect()
+            let mut views: Vec<View> =
+                views.iter().map(|view| scaled(*view, setting.scale)).collect::<Result<_, _>>()?;
+            if setting.own_blur {
+                views.iter_mut().for_each(|view| view.camera.native_size_px = None);
+            }
+            Ok(views)
         };
         Ok(Self {
             views: scale_all(&self.views)?,

@@ -20,6 +20,9 @@ pub struct Setting {
     pub profile: Vec<String>,
     /// Width and height of the images, as a share of the cameras'.
     pub scale: f64,
+    /// Whether images of another size are drawn with the blur of their own pixels, and not as the native
+    /// images shrunk.
+    pub own_blur: bool,
     /// Encoding of the images. None compares values before they are rounded to 8 bits, and times no
     /// encoding.
     #[serde(rename = "sent")]
@@ -82,6 +85,8 @@ pub enum Family {
     Stop,
     /// How exactly the sky is looked up.
     Sky,
+    /// How exactly Gaussians are projected by lenses and rolling shutters.
+    Lens,
     /// Splats of non-pinhole cameras, compared with a ray for every pixel.
     Rays,
     /// Size of the images.
@@ -106,6 +111,7 @@ impl Family {
             Self::AlphaCut => "alpha cut",
             Self::Stop => "stop",
             Self::Sky => "sky",
+            Self::Lens => "lens",
             Self::Rays => "rays",
             Self::Scale => "image scale",
             Self::Encoding => "as sent",
@@ -122,6 +128,7 @@ impl Family {
             Self::AlphaCut => "smallest alpha",
             Self::Stop => "stop transmittance",
             Self::Sky => "sky map",
+            Self::Lens => "six points or expansion",
             Self::Rays => "reference: exact rays",
             Self::Encoding => "encoding",
             Self::Combined => "several",

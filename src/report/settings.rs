@@ -5,6 +5,10 @@
 //! see `TILE_SIZE_REASON`; BENCHMARKS.md has what was measured of it (rows or blocks of pixels, one level
 //! of tiles or two).
 //!
+//! **Small images are compared with the reference's image shrunk** to their size, since that is what they stand
+//! for. "Own blur" is the same image with the profile's blur in its own pixels: what a camera of that size
+//! without a native size renders.
+//!
 //! **Non-pinhole cameras have two references.** All settings are compared with splats, so that their own
 //! errors show. One more row compares the twin as it is served with a ray for every pixel.
 
@@ -75,8 +79,10 @@ const ALPHA_CUTS: [f64; 3] = [0.008, 0.016, 0.032];
 const STOPS: [f64; 3] = [1e-3, 4e-3, 1.6e-2];
 /// Values of `sky_error`: colour error of the baked sky; 0 evaluates it for every pixel.
 const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
-/// Scales of the image's sides.
-const SCALES: [f64; 2] = [0.5, 0.25];
+/// Scales of the image's sides. An agent that reads 576 x 320 px of a camera of 1920 x 1080 px has 0.3.
+const SCALES: [f64; 3] = [0.5, 1.0 / 3.0, 0.25];
+/// Values of `lens_error_px`; 0 projects six points of every Gaussian.
+const LENS_ERRORS_PX: [f64; 5] = [0.0, 1.0 / 256.0, 1.0 / 64.0, 1.0 / 16.0, 0.25];
 /// JPEG qualities; 90 is the server's default.
 const JPEG_QUALITIES: [u8; 4] = [50, 75, 90, 98];
 /// `tau_px` and `alpha_cut` of the combined settings, from cautious to coarse.
@@ -110,6 +116,7 @@ pub fn settings_to_compare(twin: &TwinFeatures, backends: &[&str]) -> SettingLis
     list.add_records();
     list.add_blending();
     list.add_sky();
+    list.add_lens_errors();
     list.add_exact_rays();
     list.add_scales();
     list.add_encodings();
@@ -134,6 +141,7 @@ impl<'a> ListBuilder<'a> {
             record: None,
             profile: Vec::new(),
             scale: 1.0,
+            own_blur: false,
             encoding: None,
             reference_rays: Rays::Splats,
         };
@@ -232,6 +240,20 @@ impl<'a> ListBuilder<'a> {
         }
     }
 
+    fn add_lens_errors(&mut self) {
+        if !self.twin.has_non_pinhole {
+            self.skip(
+                "lens_error_px",
+                "every camera is a pinhole at rest, which has no six points",
+            );
+            return;
+        }
+        let own = self.twin.profile.lens_error_px;
+        for error_px in LENS_ERRORS_PX.into_iter().filter(|error_px| *error_px != own) {
+            self.add_profile_change(Family::Lens, format!("lens_error_px={error_px}"));
+        }
+    }
+
     fn add_exact_rays(&mut self) {
         if !self.twin.has_non_pinhole {
             self.skip(
@@ -249,14 +271,17 @@ impl<'a> ListBuilder<'a> {
     }
 
     fn add_scales(&mut self) {
-        let scaled = |scale: f64| Setting {
-            name: format!("scale {scale}"),
-            family: Family::Scale,
-            scale,
-            ..self.as_served.clone()
-        };
-        let scaled = SCALES.map(scaled);
-        self.settings.extend(scaled);
+        for scale in SCALES {
+            let scaled = Setting {
+                name: format!("scale {}", (scale * 1e3).round() / 1e3),
+                family: Family::Scale,
+                scale,
+                ..self.as_served.clone()
+            };
+            let name = format!("{}, own blur", scaled.name);
+            self.settings.push(scaled.clone());
+            self.settings.push(Setting { name, own_blur: true, ..scaled });
+        }
     }
 
     fn add_encodings(&mut self) {

@@ -17,6 +17,10 @@ pub enum Rays {
     Exact,
 }
 
+fn is_default_lens_error(lens_error_px: &f64) -> bool {
+    *lens_error_px == RenderProfile::DEFAULT.lens_error_px
+}
+
 impl Rays {
     fn is_splats(&self) -> bool {
         *self == Self::Splats
@@ -63,6 +67,11 @@ pub struct RenderProfile {
     /// How Gaussians are evaluated. Serialized only if it is not the default.
     #[serde(skip_serializing_if = "Rays::is_splats")]
     pub rays: Rays,
+    /// Largest difference between the expansion of a lens or a rolling shutter around the centre of a Gaussian,
+    /// and the six points that define its splat, in pixels. Gaussians with a larger one are projected by six
+    /// points; with 0 all are. Pinholes at rest have neither. Serialized only if it is not the default.
+    #[serde(skip_serializing_if = "is_default_lens_error")]
+    pub lens_error_px: f64,
     /// Largest error of a baked sky in any direction, as a colour from 0 to 1; 0 evaluates the sky network
     /// for every pixel. At 0.025 the edge of a cloud may be wrong by six steps of 8 bits, but 99 of 100
     /// directions of the demo's sky are wrong by less than one step. Ignored by twins without a sky.
@@ -126,12 +135,13 @@ impl RenderProfile {
         tau_px: 1.0,
         reach_m: None,
         rays: Rays::Splats,
+        lens_error_px: 0.0,
         sky_error: 0.025,
         background: [0.0; 3],
     };
 
     /// Names of the fields in `--profile` and in manifests.
-    pub const KEYS: [&'static str; 12] = [
+    pub const KEYS: [&'static str; 13] = [
         "near",
         "far",
         "blur",
@@ -142,6 +152,7 @@ impl RenderProfile {
         "tau_px",
         "reach_m",
         "rays",
+        "lens_error_px",
         "sky_error",
         "background",
     ];
@@ -184,6 +195,12 @@ impl RenderProfile {
                 self.reach_m.unwrap_or(f64::INFINITY),
                 self.reach_m.is_none_or(|reach_m| (0.0..=1e9).contains(&reach_m)),
                 "reach_m is from 0 to 1e9 m, or none",
+            ),
+            (
+                "lens_error_px",
+                self.lens_error_px,
+                (0.0..=1.0).contains(&self.lens_error_px),
+                "lens_error_px is from 0 (always six points) to 1 px",
             ),
             (
                 "sky_error",
@@ -230,6 +247,7 @@ impl RenderProfile {
             "rays" if value == "splats" => self.rays = Rays::Splats,
             "rays" if value == "exact" => self.rays = Rays::Exact,
             "rays" => return Err(bad("expected splats or exact".into())),
+            "lens_error_px" => self.lens_error_px = number()?,
             "sky_error" => self.sky_error = number()?,
             "background" => {
                 let colours: Result<Vec<f64>, _> = value.split(',').map(str::parse).collect();
@@ -327,6 +345,7 @@ mod tests {
             "reach_m=far",
             "rays=some",
             "sky_error=1e-9",
+            "lens_error_px=-1",
             "background=1,1",
             "background=1,1,2",
         ] {
@@ -336,8 +355,9 @@ mod tests {
 
     #[test]
     fn keys_lists_every_field() {
-        let json = serde_json::to_value(RenderProfile { rays: Rays::Exact, ..Default::default() });
-        let json = json.unwrap();
+        // Fields that are written only if they are not the default.
+        let other = RenderProfile { rays: Rays::Exact, lens_error_px: 0.25, ..Default::default() };
+        let json = serde_json::to_value(other).unwrap();
         let mut fields: Vec<_> = json.as_object().unwrap().keys().map(String::as_str).collect();
         let mut keys = RenderProfile::KEYS.to_vec();
         fields.sort_unstable();

@@ -15,7 +15,7 @@ use crate::geometry::{Camera, CameraError, Pose};
 /// JSON in rig files, manifests and recordings is the same as on the wire: `{"name", "width", "height", "fx",
 /// "fy", "cx", "cy", "camera_to_rig": {"xyz", "q"}}`, sizes and intrinsics in pixels. Optional fields are
 /// `lens`, `windshield` and `shutter` ([`crate::geometry::camera::json`]), `exposure` and `overlay`
-/// ([`Appearance`]).
+/// ([`Appearance`]), and `native_size` ([`Camera::native_size_px`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "CameraFields", into = "CameraFields")]
 pub struct RigCamera {
@@ -268,6 +268,8 @@ struct CameraFields {
     exposure: Option<Exposure>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     overlay: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    native_size: Option<[f64; 2]>,
     camera_to_rig: Pose,
 }
 
@@ -296,7 +298,8 @@ impl TryFrom<RigFields> for Rig {
 impl From<RigCamera> for CameraFields {
     fn from(from: RigCamera) -> Self {
         let RigCamera { name, camera, rig_from_camera: camera_to_rig, shutter, appearance } = from;
-        let Intrinsics { size_px, focal_px, center_px, lens, windshield } = Intrinsics::of(&camera);
+        let Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px } =
+            Intrinsics::of(&camera);
         let [width, height] = size_px;
         let [fx, fy] = focal_px;
         let [cx, cy] = center_px;
@@ -315,6 +318,7 @@ impl From<RigCamera> for CameraFields {
             shutter,
             exposure,
             overlay,
+            native_size: native_size_px,
             camera_to_rig,
         }
     }
@@ -330,7 +334,9 @@ impl TryFrom<CameraFields> for RigCamera {
         let size_px = [width, height];
         let focal_px = [fx, fy];
         let center_px = [cx, cy];
-        let intrinsics = Intrinsics { size_px, focal_px, center_px, lens, windshield };
+        let native_size_px = fields.native_size;
+        let intrinsics =
+            Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px };
         let camera = match intrinsics.camera() {
             Ok(camera) => camera,
             Err(cause) => return Err(RigError::Camera { name, cause }),

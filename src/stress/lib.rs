@@ -7,7 +7,7 @@
 //! places     centimetres away, behind, 4,500 km off, 10 km deep     T4 T5 T7 T9 T10
 //! order      equal depths, duplicates, popping, millions of keys    T6 T8 T20 T21 T27
 //! opacities  every opacity, NaN and infinity, the stop rule         T11 T12 T19 T28
-//! sizes      nothing, one pixel, 8K, growing buffers, crops         T14 to T18
+//! sizes      nothing, one pixel, 8K, growing buffers, crops, shrunk T14 to T18 T31
 //! lenses     a wide splat, more than 180°, rolling shutters         T22 T23 T24
 //! actors     colours that rotate with an actor, places, motion       T25 T29 T30
 //! ```
@@ -69,7 +69,7 @@ enum CaseBody {
 type Body = fn(&mut CaseRun<'_>) -> Result<(), RenderError>;
 
 /// All cases, in order of their numbers.
-pub static CASES: [Case; 30] = [
+pub static CASES: [Case; 31] = [
     shapes::T1,
     shapes::T2,
     shapes::T3,
@@ -100,6 +100,7 @@ pub static CASES: [Case; 30] = [
     opacities::T28,
     actors::T29,
     actors::T30,
+    sizes::T31,
 ];
 
 /// The result of a case on one backend.

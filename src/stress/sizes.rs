@@ -1,13 +1,14 @@
 //! Empty scenes, one pixel, 8K, buffers that must grow, and crops.
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 
 use super::order::low_discrepancy;
 use super::places::street_view;
 use super::{Case, CaseBody, CaseRun};
 use wildcity_render::RenderError;
 use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, scene_of};
-use wildcity_render::compare::images::{crop_rgba, crop_view, max_difference};
+use wildcity_render::compare::images::{RenderedImage, crop_rgba, crop_view, max_difference};
+use wildcity_render::compare::psnr::psnr_db;
 use wildcity_scene::{RenderProfile, Scene};
 
 pub(super) const T14: Case = Case {
@@ -209,4 +210,76 @@ fn t18(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
         );
     }
     Ok(())
+}
+
+pub(super) const T31: Case = Case {
+    number: "T31",
+    what: "images of a half to a quarter of the native size, of dust and of large Gaussians",
+    bound: "agrees with f64; 2 dB nearer to the native image shrunk than with the blur of its own pixels",
+    body: CaseBody::Light(t31),
+};
+
+fn t31(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
+    let profile = RenderProfile::default();
+    let scene = scene_of(&(0..3_000).map(of_any_size).collect::<Vec<_>>());
+    let native = forward_view([192, 144], 150.0);
+    let native_rgb = rgb(&run.render_reference(&scene, &profile, native)?);
+    for [wide, high] in [[96, 72], [64, 48], [48, 36], [96, 36]] {
+        let what = format!("{wide} x {high}");
+        let mut small = native;
+        small.camera = match native.camera.scaled(wide, high) {
+            Ok(camera) => camera,
+            Err(error) => {
+                run.check(format!("{what}: {error}"), false);
+                continue;
+            }
+        };
+        let image = run.render_and_compare(what.clone(), &scene, &profile, small)?;
+        let shrunk = mean_of(&native_rgb, [192 / wide as usize, 144 / high as usize]);
+        let db = |image: &RenderedImage| {
+            let differences = rgb(image).into_iter().zip(&shrunk).map(|(a, b)| f64::from(a - b));
+            psnr_db(differences)
+        };
+        small.camera.native_size_px = None;
+        let own_blur = run.render_reference(&scene, &profile, small)?;
+        let better_db = db(&image) - db(&own_blur);
+        run.check_at_least_db(format!("{what}: nearer to native by dB"), better_db, 2.0);
+    }
+    Ok(())
+}
+
+/// Gaussians with standard deviations of 0.05 to 6 native px in the view of T31, thin ones among them.
+fn of_any_size(i: usize) -> GaussianSpec {
+    let [x, y, z, size, flat, ..] = low_discrepancy(i);
+    let away_m = 4.0 + 8.0 * z;
+    let sigma_m = away_m / 150.0 * 0.05 * 120.0_f64.powf(size.powi(2));
+    GaussianSpec {
+        mean_m: away_m * DVec3::new(1.4 * x - 0.7, 1.1 * y - 0.55, 1.0),
+        rotation: DQuat::from_rotation_z(6.0 * flat) * DQuat::from_rotation_x(2.0 * x),
+        sigma_m: sigma_m * DVec3::new(1.0, 0.05 + flat, 0.3),
+        opacity: 0.3 + 0.65 * y,
+        rgb: [x, flat, z],
+    }
+}
+
+/// The colours of an image.
+fn rgb(image: &RenderedImage) -> Vec<f32> {
+    image.rgba.chunks_exact(4).flat_map(|rgba| [rgba[0], rgba[1], rgba[2]]).collect()
+}
+
+/// The colours of an image of 192 px width with the mean of `columns` by `rows` pixels in each of its own.
+fn mean_of(image: &[f32], [columns, rows]: [usize; 2]) -> Vec<f32> {
+    let row = 3 * 192;
+    let height = image.len() / row;
+    let mut mean = Vec::with_capacity(image.len() / (columns * rows));
+    for top in (0..height).step_by(rows) {
+        for left in (0..192).step_by(columns) {
+            for channel in 0..3 {
+                let values = (0..columns * rows)
+                    .map(|i| image[(top + i / columns) * row + (left + i % columns) * 3 + channel]);
+                mean.push(values.sum::<f32>() / (columns * rows) as f32);
+            }
+        }
+    }
+    mean
 }

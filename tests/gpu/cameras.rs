@@ -64,6 +64,26 @@ fn lenses_and_shutters_are_drawn_as_by_the_cpu() {
     }
 }
 
+/// Images below the native size, by every lens and shutter, and by pinholes with another share along each axis.
+#[test]
+fn small_images_are_drawn_as_by_the_cpu() {
+    let street = Scene::from_gaussians(&street(20_000, 1, 31));
+    let mut views: Vec<View> = lens_views().into_iter().step_by(2).chain([straight()]).collect();
+    for view in &mut views {
+        view.camera = view.camera.scaled(75, 30).unwrap();
+    }
+    let gpu = gpu();
+    for setting in ["near=0.01", "antialiased=true"] {
+        let mut profile = RenderProfile { lens_error_px: 0.0, ..RenderProfile::default() };
+        profile.set(setting).unwrap();
+        let truths = render(&cpu(), &street, &profile, &views);
+        let images = render(&gpu, &street, &profile, &views);
+        for (k, (image, truth)) in images.iter().zip(&truths).enumerate() {
+            agree(image, truth).unwrap_or_else(|e| panic!("view {k}, {setting}: {e}"));
+        }
+    }
+}
+
 /// Thousands of surfels of one plane, ordered by z, by distance, and by the depth of a moving camera.
 #[test]
 fn the_demo_street_through_lenses_and_shutters() {

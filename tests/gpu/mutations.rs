@@ -150,6 +150,18 @@ pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("2.0 * moved.x * (offset.y + moved.y - view.depth_low[axis])", "0.0"),
     ("/ max(2.0 * root, 1e-30)", "* 0.0"),
     ("for (var k = 0u; k < i; k++)", "for (var k = 0u; k < 1u; k++)"),
+    (
+        "let turn = mat2x2f(azimuth, vec2f(-azimuth.y, azimuth.x));",
+        "let turn = mat2x2f(azimuth, azimuth);",
+    ),
+    (
+        "vec4f(alpha, beta, radius.z, (alpha * cosine - beta) * per_sine)",
+        "vec4f(beta, beta, 0.0, 0.0)",
+    ),
+    ("let column_x = vec3f(by_x,", "let column_x = vec3f(1.1 * by_x,"),
+    ("expansion.plane *= jacobian(view_index, slope);", ""),
+    ("abc += moment * shutter.rolls * shutter.motion;", ""),
+    ("expanded.shift_px += bend;", ""),
 ];
 
 /// A street of SH degree 3 with large translucent Gaussians, some over more macro tiles than one thread

@@ -80,10 +80,12 @@ macro_rules! layouts {
 #[test]
 fn layouts_are_the_same() {
     let mut rust: Vec<Layout> = layouts! {
-        FrameView { size_px, columns, first_tile, macro_columns, first_macro_tile, rows }
+        FrameView {
+            size_px, columns, first_tile, macro_columns, first_macro_tile, rows, native_px2, total_px2,
+        }
         Frame {
             splat_capacity, touch_capacity, instance_capacity, views, tiles, macro_tiles, near_m, far_m,
-            blur_px2, antialiased, alpha_cap, log2_alpha_cut, stop, pad0, pad1, pad2, view,
+            antialiased, alpha_cap, log2_alpha_cut, stop, view,
         }
         Background {
             scale, offset, edge, width, octaves, encoded, identity, skip, sky_from_pixel,
@@ -95,7 +97,7 @@ fn layouts_are_the_same() {
         Lens {
             center_px, model, windshield, linear, end, end_value, end_slope, end_rad, widest_rad, by_distance,
             non_pinhole, pad0, coefficients, windshield_shift, remaining_exposure, moved_m, pad1,
-            moved_world_m, pad2, axis_angle,
+            moved_world_m, pad2, axis_angle, expansion,
         }
         ChunkLight { tint, first_shadow, shadows, pad0, pad1, pad2 }
         ChunkShadow { actor_from_chunk, half_m, pad }

@@ -125,6 +125,7 @@ pub(crate) fn front() -> RigCamera {
         shutter: None,
         exposure: None,
         overlay: None,
+        native_size: None,
         camera_to_rig: pose([1.6, 0.0, 1.5], [0.5, -0.5, 0.5, -0.5]),
     }
 }
@@ -149,6 +150,7 @@ fn requests() -> Vec<(&'static str, Request)> {
     let seen = RigCamera {
         exposure: Some(Exposure { matrix: None, gain: Some([1.5, 1.0, 0.75]), offset: [0.0; 3] }),
         overlay: Some("data:image/png;base64,aG9vZA==".into()),
+        native_size: Some([8.0, 6.5]),
         ..front()
     };
     let rig = Rig { name: "pair".into(), cameras: vec![seen, rear()] };

@@ -85,7 +85,7 @@ fn coarser_settings_have_larger_errors_and_lower_costs() {
     let dir = tempfile::tempdir().unwrap();
     let (all, left_out) = measured(&commit(dir.path(), vec![drive()]), &rig(), &|_| true);
     let left_out: Vec<&str> = left_out.iter().map(|out| out.what.as_str()).collect();
-    assert_eq!(left_out, ["tile size", "reach_m", "sky_error", "rays"]);
+    assert_eq!(left_out, ["tile size", "reach_m", "sky_error", "lens_error_px", "rays"]);
     let of = |name: &str| all.iter().find(|m| m.setting.name == name).unwrap();
     let db = |name: &str| of(name).errors.psnr_db;
     // At full detail the cpu backend agrees with the reference.
@@ -96,7 +96,8 @@ fn coarser_settings_have_larger_errors_and_lower_costs() {
         &["as served", "alpha_cut=0.008", "alpha_cut=0.016", "alpha_cut=0.032"],
         &["as served", "stop=0.004", "stop=0.016"],
         &["as served", "8 bits", "jpeg 98", "jpeg 90", "jpeg 75", "jpeg 50"],
-        &["as served", "scale 0.5", "scale 0.25"],
+        &["as served", "scale 0.5", "scale 0.5, own blur"],
+        &["as served", "scale 0.25", "scale 0.25, own blur"],
     ] {
         assert!(
             falling.windows(2).all(|w| db(w[0]) > db(w[1])),

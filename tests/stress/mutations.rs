@@ -115,6 +115,8 @@ enum Mutation {
     NoLens,
     /// One (Gaussian, tile) pair more is counted.
     DuplicateInstance,
+    /// An image below its native size is drawn with the blur of its own pixels.
+    OwnBlur,
     /// Actors are not drawn.
     NoActors,
     /// Actors are drawn 2 cm off.
@@ -165,6 +167,9 @@ impl Backend for MutatedBackend<'_> {
                 *position_m = position_m.as_vec3().as_dvec3();
             }),
             Mutation::NoLens => views.iter_mut().for_each(|view| view.camera.lens = Lens::Pinhole),
+            Mutation::OwnBlur => {
+                views.iter_mut().for_each(|view| view.camera.native_size_px = None)
+            }
             Mutation::NoActors => scene.placed.clear(),
             Mutation::OnlyActors => scene.chunks.clear(),
             Mutation::ActorsOff => scene.placed.iter_mut().for_each(|placed| {
@@ -269,8 +274,8 @@ fn folded(scene: &Scene, view: &mut View) -> Scene {
 use Mutation::{
     ActorsOff, Background, CapAndStop, CentredPrincipalPoint, CoarseCentres, Culled,
     DuplicateInstance, Flicker, Folded, FrozenActors, GlobalShutter, HalfNear, Mirror, MoreBlur,
-    NoActors, NoLens, Nondeterministic, OneByte, OnlyActors, OtherClamp, Paler, PoseF32, Reversed,
-    Unmasked, Unwritten,
+    NoActors, NoLens, Nondeterministic, OneByte, OnlyActors, OtherClamp, OwnBlur, Paler, PoseF32,
+    Reversed, Unmasked, Unwritten,
 };
 
 /// Mutations for each case, and the checks that must fail with each, by a part of their text.
@@ -342,6 +347,7 @@ const MUTATIONS: &[(&str, Mutation, &[&str])] = &[
     ("T29", ActorsOff, &["overlapping: as f64"]),
     ("T30", FrozenActors, &["across: exact rays", "across: as f64", "along: as at rest"]),
     ("T30", FrozenActors, &["along: as f64"]),
+    ("T31", OwnBlur, &["nearer to native by dB", "as f64"]),
 ];
 
 /// The check that no mutation of a backend affects: the bound of the record format. In the unit tests of

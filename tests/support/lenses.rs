@@ -105,7 +105,10 @@ pub(crate) fn check_projections(
         let image = render_one(backend, &scene_of(&[ball]), &fine, view);
         let found_px = centroid(&image.opacity, size_px, at_px, f64::INFINITY);
         let off_px = found_px.unwrap_or(DVec2::INFINITY).distance(at_px);
-        assert!(off_px < 0.1, "{name}, {}: {off_px:.3} px from {at_px}", backend.name());
+        // Samples at pixel centres move the centroid of a thin splat by up to 4π σ² exp(-2π² σ²) along each axis: by 0.13
+        // and 0.10 px in these shrunk images (variances 0.12 and 0.15 px²).
+        let most_px = if camera.native_size_px.is_some() { 0.17 } else { 0.1 };
+        assert!(off_px < most_px, "{name}, {}: {off_px:.3} px from {at_px}", backend.name());
         seen += 1;
     }
     seen

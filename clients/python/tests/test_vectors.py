@@ -59,7 +59,7 @@ REAR = dataclasses.replace(
     ),
 )
 SEEN = dataclasses.replace(
-    FRONT, exposure=Exposure(gain=(1.5, 1.0, 0.75)), overlay=png_data_uri(b"hood")
+    FRONT, exposure=Exposure(gain=(1.5, 1.0, 0.75)), overlay=png_data_uri(b"hood"), native_size=(8.0, 6.5)
 )
 
 REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {

@@ -272,6 +272,10 @@ pub struct RigCamera {
     /// the image, as `data:image/png;base64,..`. Answers do not repeat it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub overlay: Option<String>,
+    /// Width and height of what the image shows, in pixels of the camera's native size. An image below its
+    /// native size is the native image shrunk. If absent, the image has native size.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub native_size: Option<[f64; 2]>,
     /// `rig_from_camera`: camera axes are x right, y down, z forward.
     pub camera_to_rig: Pose,
 }

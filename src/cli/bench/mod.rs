@@ -3,15 +3,18 @@
 mod drive;
 mod gpu;
 mod load;
+mod sessions;
 mod step;
+mod temporary_dir;
 mod timed;
 
-/// Measure the speed of the renderer, of a session, and of reading twins.
+/// Measure the speed of the renderer, of sessions, and of reading twins.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
   wildcity bench step street.ply --cameras cameras.json
   wildcity bench drive street --csv steps.csv
+  wildcity bench sessions street --size 96x60
   wildcity bench load street")]
 pub(super) struct Bench {
     #[command(subcommand)]
@@ -23,6 +26,7 @@ enum Subcommand {
     Step(step::Step),
     Gpu(gpu::Gpu),
     Drive(Box<drive::Drive>),
+    Sessions(Box<sessions::Sessions>),
     Load(load::Load),
 }
 
@@ -32,6 +36,7 @@ impl Bench {
             Subcommand::Step(step) => step.run(),
             Subcommand::Gpu(gpu) => gpu.run(),
             Subcommand::Drive(drive) => drive.run(),
+            Subcommand::Sessions(sessions) => sessions.run(),
             Subcommand::Load(load) => load.run(),
         }
     }

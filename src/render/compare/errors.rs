@@ -39,42 +39,62 @@ pub struct Image {
     pub opacity: Vec<f32>,
 }
 
+/// The part of each row or column of an image that one of a smaller image covers.
+struct Coverage {
+    /// The first one.
+    first: usize,
+    /// How much of it and of those that follow is covered; the sum is 1.
+    shares: Vec<f32>,
+}
+
+impl Coverage {
+    /// Of all `count` new rows over `own` rows.
+    fn of_all(count: u32, own: u32) -> Vec<Self> {
+        let step = f64::from(own) / f64::from(count);
+        let of_one = |i: u32| {
+            let begin = f64::from(i) * step;
+            let end = begin + step;
+            let first = begin.floor() as usize;
+            let last = (end.ceil() as usize).min(own as usize);
+            let covered = |k: usize| end.min(k as f64 + 1.0) - begin.max(k as f64);
+            let shares = (first..last).map(|k| (covered(k).max(0.0) / step) as f32).collect();
+            Self { first, shares }
+        };
+        (0..count).map(of_one).collect()
+    }
+}
+
 impl Image {
-    /// The image at another size: colour and opacity are interpolated bilinearly; depth is that of the
-    /// nearest pixel, since there is no surface between two depths.
-    pub fn resized(&self, [width, height]: [u32; 2]) -> Self {
-        let [own_width, own_height] = self.size_px.map(|px| px as usize);
+    /// The image with each pixel the mean of what it covers, as an agent shrinks an image. The mean of depths is
+    /// weighted by opacity, as depths of Gaussians are within a pixel.
+    pub fn averaged(&self, [width, height]: [u32; 2]) -> Self {
+        let [own_width, own_height] = self.size_px;
         let mut new = Self {
             size_px: [width, height],
-            rgb: Vec::with_capacity(3 * (width * height) as usize),
-            depth_m: Vec::with_capacity((width * height) as usize),
-            opacity: Vec::with_capacity((width * height) as usize),
+            rgb: Vec::new(),
+            depth_m: Vec::new(),
+            opacity: Vec::new(),
         };
-        // Of a new pixel's centre, the two neighbouring centres of the old image, and the position between
-        // them.
-        let neighbours = |i: u32, count: u32, own: usize| {
-            let at = (f64::from(i) + 0.5) * own as f64 / f64::from(count) - 0.5;
-            let at = at.clamp(0.0, (own - 1) as f64);
-            let low = at.floor() as usize;
-            (low, (low + 1).min(own - 1), at.fract() as f32)
-        };
-        for y in 0..height {
-            let (top, bottom, down) = neighbours(y, height, own_height);
-            for x in 0..width {
-                let (left, right, across) = neighbours(x, width, own_width);
-                let mixed = |value: &dyn Fn(usize) -> f32| {
-                    let row = |y: usize| {
-                        let l = value(y * own_width + left);
-                        let r = value(y * own_width + right);
-                        l + across * (r - l)
-                    };
-                    row(top) + down * (row(bottom) - row(top))
-                };
-                new.rgb.extend([0, 1, 2].map(|c| mixed(&|pixel| self.rgb[3 * pixel + c])));
-                new.opacity.push(mixed(&|pixel| self.opacity[pixel]));
-                let nearest = |near, far, share| if share < 0.5 { near } else { far };
-                let pixel = nearest(top, bottom, down) * own_width + nearest(left, right, across);
-                new.depth_m.push(self.depth_m[pixel]);
+        let columns = Coverage::of_all(width, own_width);
+        for row in Coverage::of_all(height, own_height) {
+            for column in &columns {
+                let mut rgb = [0.0; 3];
+                let mut opacity = 0.0;
+                let mut depth = 0.0;
+                for (y, down) in row.shares.iter().enumerate() {
+                    for (x, across) in column.shares.iter().enumerate() {
+                        let pixel = (row.first + y) * own_width as usize + column.first + x;
+                        let share = down * across;
+                        for (sum, value) in rgb.iter_mut().zip(&self.rgb[3 * pixel..]) {
+                            *sum += share * value;
+                        }
+                        opacity += share * self.opacity[pixel];
+                        depth += share * self.opacity[pixel] * self.depth_m[pixel];
+                    }
+                }
+                new.rgb.extend(rgb);
+                new.opacity.push(opacity);
+                new.depth_m.push(if opacity > 0.0 { depth / opacity } else { 0.0 });
             }
         }
         new
@@ -240,19 +260,20 @@ mod tests {
     }
 
     #[test]
-    fn half_the_size_and_back_is_the_mean_of_four() {
+    fn a_shrunk_image_is_the_mean_of_what_its_pixels_cover() {
         let ramp = Image {
-            size_px: [2, 2],
-            rgb: vec![0.0, 0.0, 0.0, 0.4, 0.4, 0.4, 0.8, 0.8, 0.8, 0.4, 0.4, 0.4],
-            depth_m: vec![1.0, 2.0, 3.0, 4.0],
-            opacity: vec![0.0, 1.0, 1.0, 1.0],
+            size_px: [3, 1],
+            rgb: vec![0.0, 0.0, 0.0, 0.3, 0.3, 0.3, 0.9, 0.9, 0.9],
+            depth_m: vec![5.0, 1.0, 2.0],
+            opacity: vec![0.0, 0.5, 1.0],
         };
-        let one = ramp.resized([1, 1]);
-        assert!((one.rgb[0] - 0.4).abs() < 1e-6 && (one.opacity[0] - 0.75).abs() < 1e-6);
-        let larger = ramp.resized([4, 4]);
-        assert_eq!([larger.rgb[0], larger.depth_m[0], larger.depth_m[15]], [0.0, 1.0, 4.0]);
-        assert!((larger.rgb[3] - 0.1).abs() < 1e-6, "{}", larger.rgb[3]);
-        assert_eq!(ramp.resized([2, 2]).rgb, ramp.rgb);
+        let one = ramp.averaged([1, 1]);
+        assert!((one.rgb[0] - 0.4).abs() < 1e-6 && (one.opacity[0] - 0.5).abs() < 1e-6);
+        assert!((one.depth_m[0] - 2.5 / 1.5).abs() < 1e-6, "{}", one.depth_m[0]);
+        // The second of two pixels covers half of the middle one: (0.15 + 0.9)/1.5.
+        let two = ramp.averaged([2, 1]);
+        assert!((two.rgb[3] - 0.7).abs() < 1e-6, "{}", two.rgb[3]);
+        assert_eq!(ramp.averaged([3, 1]).rgb, ramp.rgb);
     }
 
     #[test]

@@ -78,7 +78,7 @@ impl Span {
 /// Sorted splats of one view that one thread bins.
 struct Job<'a> {
     view: usize,
-    keys: &'a [u64],
+    keys: &'a [AtomicU64],
 }
 
 /// A view's grid of tiles.
@@ -218,7 +218,7 @@ impl Bins {
 #[inline(always)]
 fn count(
     projected: &Projected,
-    keys: &[u64],
+    keys: &[AtomicU64],
     grid: &Grid,
     log2_cut: f32,
     spans: &mut Vec<Span>,
@@ -228,8 +228,8 @@ fn count(
     // misses overlap and cost little more than one.
     let mut splats = [Splat::default(); READ_BATCH];
     for keys in keys.chunks(READ_BATCH) {
-        for (splat, &key) in splats.iter_mut().zip(keys) {
-            *splat = *projected.splat(key as u32);
+        for (splat, key) in splats.iter_mut().zip(keys) {
+            *splat = *projected.splat(key.load(Relaxed) as u32);
         }
         for splat in &splats[..keys.len()] {
             let before = spans.len();
@@ -256,12 +256,13 @@ fn count(
 }
 
 /// Second pass: writes the instances of a segment to the places that its cursors give.
-fn write_lists(keys: &[u64], spans: &[Span], cursors: &mut [u32], instances: &[AtomicU32]) {
+fn write_lists(keys: &[AtomicU64], spans: &[Span], cursors: &mut [u32], instances: &[AtomicU32]) {
     let mut spans = spans.iter();
-    for &key in keys {
+    for key in keys {
+        let place = key.load(Relaxed) as u32;
         for span in spans.by_ref() {
             for cursor in &mut cursors[span.tiles()] {
-                instances[*cursor as usize].store(key as u32, Relaxed);
+                instances[*cursor as usize].store(place, Relaxed);
                 *cursor += 1;
             }
             if span.is_last() {

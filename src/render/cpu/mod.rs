@@ -2,7 +2,8 @@
 //!
 //! Each file is a stage: `project`, `sort`, `bin`, `rasterize`, `resolve`. The images are
 //! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
-//! splats in one order. Scratch buffers are kept from frame to frame.
+//! splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that would
+//! exceed it together are rendered one half after the other.
 
 mod appearance;
 mod background;
@@ -11,6 +12,7 @@ mod export;
 mod lanes;
 mod lens;
 mod math;
+mod part;
 mod project;
 mod rasterize;
 mod resolve;
@@ -26,6 +28,7 @@ use rayon::ThreadPool;
 use crate::limits;
 
 use self::background::Background;
+use self::part::FramePart;
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
@@ -186,7 +189,7 @@ impl Scratch {
         let mut timer = StageTimer::start();
         projected.project(level, frame, cutoffs);
         timer.finish("project", stats);
-        stats.visible_pairs = projected.len() as u64;
+        stats.visible_pairs += projected.len() as u64;
         if last >= Stage::Sort {
             sorted.sort(projected, cutoffs);
             timer.finish("sort", stats);
@@ -194,7 +197,7 @@ impl Scratch {
         if last >= Stage::Bin {
             bins.bin(level, projected, sorted, frame.views, cutoffs)?;
             timer.finish("bin", stats);
-            stats.instances = bins.instances() as u64;
+            stats.instances += bins.instances() as u64;
         }
         Ok(())
     }
@@ -232,23 +235,42 @@ impl Backend for Cpu {
         let backgrounds = Background::of(frame)?;
         let BusyLane { pool, mut scratch } = self.lane();
         let scratch = &mut *scratch;
-        let cutoffs = Cutoffs::new(frame.profile);
         pool.install(|| {
             let mut stats = FrameStats::default();
-            scratch.run(self.level, frame, &cutoffs, Stage::Bin, &mut stats)?;
-            let mut timer = StageTimer::start();
-            let Scratch { projected, bins, .. } = scratch;
-            let input = rasterize::Input {
-                projected,
-                bins,
-                views: frame.views,
-                backgrounds: &backgrounds,
-                cutoffs: &cutoffs,
-            };
-            stats.evaluations = rasterize::rasterize(self.level, input, targets, finished);
-            timer.finish("rasterize", &mut stats);
+            let part = FramePart { frame: *frame, backgrounds: &backgrounds, first_view: 0 };
+            self.render_part(scratch, part, targets, finished, &mut stats)?;
             Ok(stats)
         })
+    }
+}
+
+impl Cpu {
+    /// Renders a part of a frame; views that together have more splats than fit into
+    /// [`limits::FRAME_SPLATS`] one half after the other. The images do not depend on it.
+    fn render_part(
+        &self,
+        scratch: &mut Scratch,
+        part: FramePart<'_>,
+        targets: &mut [Target<'_>],
+        finished: OnViewDone<'_>,
+        stats: &mut FrameStats,
+    ) -> Result<(), RenderError> {
+        let FramePart { frame, backgrounds, first_view } = part;
+        if frame.views.len() > 1 && part.max_splats() > limits::FRAME_SPLATS {
+            let [first, second] = part.halves();
+            let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
+            self.render_part(scratch, first, of_first, finished, stats)?;
+            return self.render_part(scratch, second, of_second, finished, stats);
+        }
+        let cutoffs = &Cutoffs::new(frame.profile);
+        scratch.run(self.level, &frame, cutoffs, Stage::Bin, stats)?;
+        let mut timer = StageTimer::start();
+        let Scratch { projected, bins, .. } = scratch;
+        let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
+        let finished = |view: usize, target: &Target<'_>| finished(first_view + view, target);
+        stats.evaluations += rasterize::rasterize(self.level, input, targets, &finished);
+        timer.finish("rasterize", stats);
+        Ok(())
     }
 }
 
@@ -262,10 +284,14 @@ impl StageTimer {
         Self { start: Instant::now() }
     }
 
-    /// Records the time since the end of the previous stage.
+    /// Adds the time since the end of the previous stage.
     fn finish(&mut self, name: &'static str, stats: &mut FrameStats) {
         let now = Instant::now();
-        stats.stages_ms.push((name, (now - self.start).as_secs_f64() * 1e3));
+        let ms = (now - self.start).as_secs_f64() * 1e3;
+        match stats.stages_ms.iter_mut().find(|(stage, _)| *stage == name) {
+            Some((_, sum_ms)) => *sum_ms += ms,
+            None => stats.stages_ms.push((name, ms)),
+        }
         self.start = now;
     }
 }

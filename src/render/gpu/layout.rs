@@ -7,8 +7,11 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 
 use super::partition::{Region, TileRows};
-use crate::layout::{ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Cutoffs};
+use crate::layout::{
+    ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Cutoffs, PixelFilter,
+};
 use crate::{MAX_VIEWS, View, constants};
+use wildcity_scene::RenderProfile;
 
 /// Threads of a workgroup. wgpu's default limits guarantee 256 on every device; Vulkan itself guarantees
 /// only 128.
@@ -42,7 +45,7 @@ pub const VIEW_BITS: u32 = 4;
 /// Words of a Gaussian without its colour: mean (3), scale (3), opacity (1), and quaternion (2).
 pub const GEOMETRY_WORDS: u32 = 9;
 
-/// The grid of tiles of one view, and the rows of it that are drawn (32 bytes).
+/// The grid of tiles of one view, the rows of it that are drawn, and its pixel filter (48 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct FrameView {
@@ -58,9 +61,13 @@ pub struct FrameView {
     pub first_macro_tile: u32,
     /// Rows of tiles that are drawn: first, and end (exclusive).
     pub rows: [u32; 2],
+    /// Variances of [`PixelFilter::native_px2`].
+    pub native_px2: [f32; 2],
+    /// Variances of [`PixelFilter::total_px2`].
+    pub total_px2: [f32; 2],
 }
 
-/// Parameters of a frame that all stages read (576 bytes).
+/// Parameters of a frame that all stages read (816 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Frame {
@@ -80,8 +87,6 @@ pub struct Frame {
     pub near_m: f32,
     /// Farthest depth, in metres.
     pub far_m: f32,
-    /// Variance of the blur, in px².
-    pub blur_px2: f32,
     /// 1 if opacity is compensated for the blur, else 0.
     pub antialiased: u32,
     /// Largest alpha.
@@ -90,24 +95,18 @@ pub struct Frame {
     pub log2_alpha_cut: f32,
     /// Transmittance at which a pixel stops.
     pub stop: f32,
-    /// Zero.
-    pub pad0: u32,
-    /// Zero.
-    pub pad1: u32,
-    /// Zero.
-    pub pad2: u32,
     /// The views, in order.
     pub view: [FrameView; MAX_VIEWS],
 }
 
 impl Frame {
     /// A frame of these views, drawn completely. The caller fills in the capacities.
-    pub(super) fn new(views: &[View], cutoffs: &Cutoffs) -> Self {
+    pub(super) fn new(views: &[View], profile: &RenderProfile) -> Self {
+        let cutoffs = Cutoffs::new(profile);
         let mut frame = Self {
             views: views.len() as u32,
             near_m: cutoffs.near_m,
             far_m: cutoffs.far_m,
-            blur_px2: cutoffs.blur_px2,
             antialiased: cutoffs.antialiased.into(),
             alpha_cap: cutoffs.alpha_cap,
             log2_alpha_cut: cutoffs.log2_alpha_cut,
@@ -118,6 +117,7 @@ impl Frame {
             let size_px = [view.camera.width_px, view.camera.height_px];
             let [columns, rows] = size_px.map(|size| size.div_ceil(constants::TILE_PX));
             let macro_columns = columns.div_ceil(MACRO_COLUMNS);
+            let filter = PixelFilter::new(profile, &view.camera);
             *slot = FrameView {
                 size_px,
                 columns,
@@ -125,6 +125,8 @@ impl Frame {
                 macro_columns,
                 first_macro_tile: frame.macro_tiles,
                 rows: [0, rows],
+                native_px2: filter.native_px2.as_vec2().to_array(),
+                total_px2: filter.total_px2.as_vec2().to_array(),
             };
             // At most 16 views of 1024 x 1024 tiles, 2^24: this cannot overflow.
             frame.tiles += columns * rows;
@@ -283,7 +285,7 @@ fn low(exact: f64) -> f32 {
     (exact - f64::from(exact as f32)) as f32
 }
 
-/// Lens, windshield, and rolling shutter of a view that is no static pinhole (352 bytes). Read by
+/// Lens, windshield, and rolling shutter of a view that is no static pinhole (368 bytes). Read by
 /// `shaders/lens.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -333,6 +335,8 @@ pub struct Lens {
     pub pad2: u32,
     /// The camera's rotation during the exposure: unit axis, and angle in radians.
     pub axis_angle: [f32; 4],
+    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all zero for six points of every Gaussian.
+    pub expansion: [f32; 4],
 }
 
 /// Whose splats begin with a cluster view (8 bytes). The first record of a list holds its length as `instance`.

@@ -18,9 +18,11 @@ use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::layout::Lens;
 use crate::actor_views::ActorViews;
+use crate::expansion::ExpansionBound;
 use crate::unscented::max_center_angle_rad;
 use crate::view::ShutterMotion;
 use crate::{Frame, MAX_VIEWS, View};
+use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::camera::{
     self, FTheta, FThetaReference, Fisheye, MonotonePolynomial, OpenCv, Windshield,
     WindshieldReference,
@@ -40,14 +42,15 @@ impl Lenses {
         let pairs = frame.views.iter().zip(actors.all());
         let pairs =
             pairs.flat_map(|(view, relative)| relative.iter().map(move |from| (view, from)));
-        let mut own = pairs.filter(is_own).map(|(_, relative)| Lens::of(relative)).peekable();
+        let mut own =
+            pairs.filter(is_own).map(|(_, relative)| Lens::of(relative, frame.profile)).peekable();
         if frame.views.iter().all(View::is_static_pinhole) && own.peek().is_none() {
             return;
         }
         let mut lenses = vec![Lens::zeroed(); MAX_VIEWS];
         for (lens, view) in lenses.iter_mut().zip(frame.views) {
             if !view.is_static_pinhole() {
-                *lens = Lens::of(view);
+                *lens = Lens::of(view, frame.profile);
             }
         }
         lenses.extend(own);
@@ -98,7 +101,7 @@ fn has_own_lens(view: &View, relative: &View) -> bool {
 
 impl Lens {
     /// The parameters of a view that is no static pinhole.
-    fn of(view: &View) -> Self {
+    fn of(view: &View, profile: &RenderProfile) -> Self {
         let camera = &view.camera;
         let pinhole = &camera.pinhole;
         let mut lens = Self {
@@ -123,6 +126,11 @@ impl Lens {
         }
         if let Some(motion) = view.shutter_motion() {
             lens.set_shutter_motion(&motion);
+        }
+        if let Some(bound) = ExpansionBound::of(view, profile) {
+            let ExpansionBound { max_error_px, second_px, third_px } = bound;
+            let bound = [max_error_px, second_px, third_px, 0.0];
+            lens.expansion = bound.map(|value| value as f32);
         }
         lens
     }

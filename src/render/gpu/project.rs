@@ -36,9 +36,9 @@ use crate::actor_views::ActorViews;
 use crate::layout::{ChunkShadow as CpuChunkShadow, ChunkView as CpuChunkView, Frustum};
 use crate::unscented::UnscentedView;
 use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
-use wildcity_scene::Chunk;
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::chunk::Cluster;
+use wildcity_scene::{Chunk, RenderProfile};
 
 /// The clusters that a region projects.
 #[derive(Debug, Default)]
@@ -161,7 +161,7 @@ impl ProjectWork {
             for ClusterPlace { page, line, shadowed } in clusters {
                 let variant = pair.variant(shadowed);
                 let chunk_view = *chunk_views[usize::from(shadowed)].get_or_insert_with(|| {
-                    work.chunk_views.push(pair.chunk_view(variant));
+                    work.chunk_views.push(pair.chunk_view(variant, frame.profile));
                     if has_actors {
                         work.add_light(&pair, shadowed);
                     }
@@ -280,7 +280,7 @@ impl ChunkInView<'_> {
     }
 
     /// The view relative to the chunk.
-    fn chunk_view(&self, variant: Variant) -> ChunkView {
+    fn chunk_view(&self, variant: Variant, profile: &RenderProfile) -> ChunkView {
         let Self { chunk, relative, .. } = *self;
         let view = self.view as u32;
         let view = match self.of {
@@ -288,7 +288,7 @@ impl ChunkInView<'_> {
             Owner::Twin { .. } => view | view << VIEW_BITS,
             Owner::Actor { lens, .. } => view | lens << VIEW_BITS,
         };
-        let chunk_view = ChunkView::new(view, &CpuChunkView::new(relative, chunk));
+        let chunk_view = ChunkView::new(view, &CpuChunkView::new(relative, chunk, profile));
         if !relative.camera.depth_is_distance() {
             return chunk_view;
         }

@@ -92,6 +92,7 @@ const FILES: &[(&str, &str)] = &[
     ("background", include_str!("../../../shaders/background.wgsl")),
     ("bin", include_str!("../../../shaders/bin.wgsl")),
     ("constants", include_str!("../../../shaders/shared/constants.wgsl")),
+    ("expansion", include_str!("../../../shaders/expansion.wgsl")),
     ("expand", include_str!("../../../shaders/expand.wgsl")),
     ("instances", include_str!("../../../shaders/instances.wgsl")),
     ("layout", include_str!("../../../shaders/shared/layout.wgsl")),

@@ -6,6 +6,7 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
+use crate::layout::{Filtered, PixelFilter};
 use crate::unscented::max_center_angle_rad;
 use crate::{FIRST_ACTOR_INSTANCE, TWIN_INSTANCE, View};
 use wildcity_scene::actor::PlacedChunk;
@@ -85,15 +86,15 @@ fn project_one(chunk: &Chunk, index: usize, profile: &RenderProfile, view: &View
         project_unscented(mean_world, axes_m, profile, view)
     }?;
     let Footprint { depth_m, mean_px, xx, xy, yy, det_before, camera_m } = footprint;
-    let det = det_before + profile.blur * (xx + yy + profile.blur);
-    let xx = xx + profile.blur;
-    let yy = yy + profile.blur;
+    let filter = PixelFilter::new(profile, &view.camera);
+    let Filtered { xx, yy, det, blur_share, shrink_share } = filter.filtered(xx, yy, det_before);
 
     let mut opacity = f64::from(chunk.value(index, column::LOG2_OPACITY)).exp2();
     if profile.antialiased {
         // Yu et al. 2024 (Mip-Splatting), with gsplat's floor.
-        opacity *= (det_before / det).max(0.005 * 0.005).sqrt();
+        opacity *= blur_share.max(0.005 * 0.005).sqrt();
     }
+    opacity *= shrink_share.powf(PixelFilter::SHRINK_POWER);
     let visible = opacity >= profile.alpha_cut;
     visible.then(|| Splat {
         gaussian: [0, index],

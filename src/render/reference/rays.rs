@@ -11,6 +11,7 @@ use glam::{DMat3, DVec2, DVec3};
 use super::blend::Pixel;
 use super::project::{Splat, mean_and_axes};
 use crate::View;
+use crate::layout::{Filtered, PixelFilter};
 use wildcity_scene::{RenderProfile, Scene};
 
 /// A Gaussian in the world, or one of an actor in the actor's axes.
@@ -66,7 +67,8 @@ pub(super) fn row(
     let pixel = |column: u32| {
         let mut pixel = Pixel::EMPTY;
         let at_px = DVec2::new(f64::from(column) + 0.5, y_px);
-        let rays: Vec<Option<Ray>> = views.iter().map(|view| Ray::of(view, at_px)).collect();
+        let rays: Vec<Option<Ray>> =
+            views.iter().map(|view| Ray::of(view, at_px, profile)).collect();
         for (splat, gaussian) in splats.iter().zip(gaussians) {
             let Some(ray) = &rays[gaussian.view] else { continue };
             let alpha = ray.alpha(gaussian, profile);
@@ -88,11 +90,13 @@ struct Ray {
     px_per_rad: [DVec3; 2],
     /// A lower bound of the Jacobian's smaller singular value.
     least_px_per_rad: f64,
+    /// What is added to screen covariances.
+    filter: PixelFilter,
 }
 
 impl Ray {
     /// `None` outside of the lens' field.
-    fn of(view: &View, at_px: DVec2) -> Option<Self> {
+    fn of(view: &View, at_px: DVec2, profile: &RenderProfile) -> Option<Self> {
         let direction = view.ray_world(at_px)?;
         let pose = view.world_from_camera_at(at_px);
         // How the ray changes per pixel, by differences to both sides, or to the one that is within the field.
@@ -119,7 +123,8 @@ impl Ray {
         // norm.
         let least_px_per_rad = x.cross(y).length() / x.length().hypot(y.length());
         let origin_m = pose.position_m;
-        Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad })
+        let filter = PixelFilter::new(profile, &view.camera);
+        Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad, filter })
     }
 
     /// Alpha before the cap; 0 where it surely is below the cut, or the closest point lies behind the camera.
@@ -130,7 +135,8 @@ impl Ray {
         // far end.
         let across_m2 = to_mean_m.length_squared() - along_m * along_m;
         let farthest_m = along_m.max(0.0) + 4.0 * gaussian.sigma_m;
-        let blur_m2 = profile.blur * (farthest_m / self.least_px_per_rad).powi(2);
+        let blur_px2 = self.filter.total_px2.max_element();
+        let blur_m2 = blur_px2 * (farthest_m / self.least_px_per_rad).powi(2);
         let sigmas2 = 2.0 * (gaussian.opacity / profile.alpha_cut).ln() + 1e-6;
         let near = across_m2 <= sigmas2 * (gaussian.sigma_m * gaussian.sigma_m + blur_m2);
         if !near {
@@ -158,14 +164,13 @@ impl Ray {
         let xx = row_x.dot(row_x);
         let xy = row_x.dot(row_y);
         let yy = row_y.dot(row_y);
-        let det = det_before + profile.blur * (xx + yy + profile.blur);
-        let xx = xx + profile.blur;
-        let yy = yy + profile.blur;
+        let Filtered { xx, yy, det, blur_share, shrink_share } =
+            self.filter.filtered(xx, yy, det_before);
         let DVec2 { x: dx, y: dy } = offset_px;
         let power = -0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det;
-        let mut opacity = gaussian.opacity;
+        let mut opacity = gaussian.opacity * shrink_share.powf(PixelFilter::SHRINK_POWER);
         if profile.antialiased {
-            opacity *= (det_before / det).max(0.005 * 0.005).sqrt();
+            opacity *= blur_share.max(0.005 * 0.005).sqrt();
         }
         opacity * power.exp()
     }

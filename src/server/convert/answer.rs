@@ -251,6 +251,7 @@ pub(super) fn camera(camera: &wildcity_scene::rig::RigCamera) -> RigCamera {
         shutter: camera.shutter.map(shutter_to),
         exposure: camera.appearance.exposure.map(exposure_to),
         overlay: None,
+        native_size: camera.camera.native_size_px.map(|size_px| size_px.to_array()),
         camera_to_rig: pose(&camera.rig_from_camera),
     }
 }

@@ -47,6 +47,7 @@ fn camera_of(field: &str, camera: message::RigCamera) -> Result<RigCamera, Fault
         center_px: [cx, cy],
         lens: camera.lens.map(lens_of),
         windshield: camera.windshield.map(windshield_of),
+        native_size_px: camera.native_size,
     };
     let fault = |cause| Fault::Camera { field: field.to_owned(), cause };
     let checked = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));

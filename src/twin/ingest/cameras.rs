@@ -196,8 +196,14 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let world_from_camera =
         pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
     let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
-    let intrinsics =
-        Intrinsics { size_px, focal_px: [fx, fy], center_px: [cx, cy], lens, windshield };
+    let intrinsics = Intrinsics {
+        size_px,
+        focal_px: [fx, fy],
+        center_px: [cx, cy],
+        lens,
+        windshield,
+        native_size_px: None,
+    };
     let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near })

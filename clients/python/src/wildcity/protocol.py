@@ -212,6 +212,8 @@ class Camera:
     `camera_to_rig` transforms camera coordinates (x right, y down, z forward) to the rig frame. The polynomial of
     an f-theta lens determines its focal lengths: leave fx and fy None there. `overlay` is the part of the own
     car that the camera sees: `png_data_uri(bytes)` of a PNG with alpha, of the image's size. Answers omit it.
+    `native_size` is the width and height of what the image shows, in pixels of the camera's native size: an image below
+    its native size is the native image shrunk. None if the image has native size.
     """
 
     name: str
@@ -227,6 +229,7 @@ class Camera:
     shutter: Shutter | None = None
     exposure: Exposure | None = None
     overlay: str | None = None
+    native_size: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

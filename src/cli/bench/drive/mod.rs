@@ -4,7 +4,7 @@ mod report;
 mod step;
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -21,6 +21,7 @@ use wildcity_session::{
 };
 use wildcity_twin::residency::{Cache, Stats};
 
+use super::temporary_dir::TemporaryDir;
 use report::{Report, Row};
 use step::DriveStep;
 
@@ -94,7 +95,7 @@ impl Drive {
         let episodes = TemporaryDir::new()?;
         let engine = wildcity_session::Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
-            episodes: episodes.0.clone(),
+            episodes: episodes.path().to_owned(),
             scenarios: Scenarios::in_dir(""),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
@@ -249,24 +250,6 @@ fn rss_bytes() -> anyhow::Result<Rss> {
     let both = field("VmRSS:").zip(field("VmHWM:"));
     let memory = both.map(|(now, peak)| Rss { now, peak });
     memory.context("/proc/self/status does not say how much memory is used")
-}
-
-/// A temporary directory for the recorded episode.
-struct TemporaryDir(PathBuf);
-
-impl TemporaryDir {
-    fn new() -> anyhow::Result<Self> {
-        let dir = std::env::temp_dir().join(format!("wildcity-bench-{}", std::process::id()));
-        output::create_dir(&dir)?;
-        Ok(Self(dir))
-    }
-}
-
-impl Drop for TemporaryDir {
-    fn drop(&mut self) {
-        // If it cannot be removed, the system's cleaning of temporary files removes it.
-        let _ = fs::remove_dir_all(Path::new(&self.0));
-    }
 }
 
 fn speed(text: &str) -> Result<f64, String> {

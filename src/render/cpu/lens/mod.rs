@@ -8,15 +8,18 @@
 //! 8e-4 px of f64, also with a rolling shutter. With Newton's method instead, a step of a real six-camera rig
 //! spent four fifths of its time in it.
 //!
-//! Three kinds of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field,
-//! those for which the search finds no row, and those of cameras that this module does not describe.
+//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three kinds
+//! of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field of other lenses, those for
+//! which the search finds no row, and those of cameras that this module does not describe.
 
 mod chebyshev;
+mod expansion;
 mod rays;
 mod shutter;
+mod tangent;
 mod windshield;
 
-use fearless_simd::{f32x16, prelude::*};
+use fearless_simd::{f32x16, mask32x16, prelude::*};
 
 use super::lanes::Vec3x16;
 use crate::View;
@@ -24,8 +27,10 @@ use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::Lens;
 
 use chebyshev::ChebyshevSeries;
+pub(super) use expansion::{ExpandedAxes, Remainder};
 pub(super) use rays::LensRays;
 use shutter::SimdShutter;
+use tangent::Tangent;
 use windshield::{Refracted, SimdWindshield};
 
 /// Largest error of a series, in pixels: a tenth of the resolution of f32 away from the middle of an image.
@@ -43,9 +48,27 @@ pub(super) struct LensProjection {
 #[derive(Clone, Debug)]
 enum Model {
     /// Fisheye and f-theta: `center + px_from_round (x, y)/(|p| + z) r(t)/t`, up to a largest t.
-    Round { px_from_round: [[f32; 2]; 2], series: ChebyshevSeries, max_t: f32 },
-    /// Pinhole, and OpenCV's polynomials of the slopes x/z and y/z, up to a largest squared slope.
+    Round {
+        px_from_round: [[f32; 2]; 2],
+        series: ChebyshevSeries,
+        derivatives: Option<RoundDerivatives>,
+        max_t: f32,
+        /// Beyond the largest t, if that is the end of the lens' field.
+        beyond: Option<Tangent>,
+    },
+    /// Slopes x/z and y/z up to a largest squared slope, and a line beyond.
+    Pinhole { focal_px: [f32; 2], max_slope2: f32, beyond: Tangent },
+    /// OpenCV's polynomials of the slopes x/z and y/z, up to a largest squared slope.
     Slopes { focal_px: [f32; 2], k: [f32; 6], p: [f32; 2], s: [f32; 4], max_slope2: f32 },
+}
+
+/// Derivatives of the radius r(θ) of a round lens, as series in t.
+#[derive(Clone, Debug)]
+struct RoundDerivatives {
+    /// r′(θ).
+    slope: ChebyshevSeries,
+    /// r″(θ).
+    curvature: ChebyshevSeries,
 }
 
 /// Image points.
@@ -53,8 +76,10 @@ enum Model {
 pub(super) struct LensPixels<S: Simd> {
     pub(super) x_px: f32x16<S>,
     pub(super) y_px: f32x16<S>,
-    /// Not below 0 where the point is within the field. Elsewhere the pixels are meaningless.
+    /// Not below 0 where the pixels are those of the point: within the field, or where the lens is continued.
     pub(super) margin: f32x16<S>,
+    /// Of round lenses: the distance from the principal point by the sine of the angle off the axis.
+    per_sin: f32x16<S>,
 }
 
 /// Image points, and when they are exposed.
@@ -85,8 +110,10 @@ impl LensProjection {
         let model = match lens {
             // A pinhole behind a windshield or in motion: slopes without a distortion.
             Lens::Pinhole => {
-                let max_slope2 = view.camera.extrapolation_slope().powi(2) as f32 * INSIDE;
-                Model::Slopes { focal_px, k: [0.0; 6], p: [0.0; 2], s: [0.0; 4], max_slope2 }
+                let straight = view.camera.extrapolation_slope();
+                let beyond = Tangent::new(straight.atan(), straight, 1.0 + straight * straight);
+                let max_slope2 = straight.powi(2) as f32 * INSIDE;
+                Model::Pinhole { focal_px, max_slope2, beyond }
             }
             Lens::OpenCv(lens) => {
                 let max_slope = view.camera.extrapolation_slope().min(lens.limit_slope());
@@ -103,13 +130,17 @@ impl LensProjection {
                 // The series gives radii in focal lengths.
                 let px_from_round = [[pinhole.fx as f32, 0.0], [0.0, pinhole.fy as f32]];
                 let max_error = MAX_SERIES_ERROR_PX / pinhole.fx.max(pinhole.fy);
-                Model::round(max_rad(), px_from_round, max_error, &|angle| lens.radius().at(angle))?
+                let limit_rad = lens.limit_rad();
+                Model::round(max_rad(), limit_rad, px_from_round, max_error, &|angle| {
+                    lens.radius().at(angle)
+                })?
             }
             Lens::FTheta(lens) => {
                 // The series gives radii in pixels.
                 let [c, d, e] = lens.linear_cde().map(|value| value as f32);
                 let px_from_round = [[c, d], [e, 1.0]];
-                Model::round(max_rad(), px_from_round, MAX_SERIES_ERROR_PX, &|angle| {
+                let limit_rad = lens.limit_rad();
+                Model::round(max_rad(), limit_rad, px_from_round, MAX_SERIES_ERROR_PX, &|angle| {
                     lens.radius_px(angle)
                 })?
             }
@@ -130,34 +161,63 @@ impl LensProjection {
     /// Projects points of the camera's frame at the end of the exposure.
     ///
     /// With a rolling shutter the image row decides when a point is exposed, that decides where the camera
-    /// is, and that decides the row. A fixed-point iteration finds it, from a first guess of the fraction
-    /// that remains. A point for which it does not converge, or that is not within the field, has a negative
-    /// margin.
+    /// is, and that decides the row. The secant method finds the fixed point, from a first guess of the fraction
+    /// that remains; where its slope is not that of a slow motion over the image, it takes a step of the fixed-point
+    /// iteration instead. A point for which it does not converge, or that is not within the field, has a negative
+    /// margin. The search does not wait for points that are not `wanted`.
     #[inline(always)]
     pub(super) fn project<S: Simd>(
         &self,
         simd: S,
         at_end_m: Vec3x16<S>,
         guess: f32x16<S>,
+        wanted: mask32x16<S>,
     ) -> ExposedPixels<S> {
         let Some(shutter) = &self.shutter else {
             return ExposedPixels { pixels: self.project_static(simd, at_end_m), remaining: guess };
         };
-        let zero = f32x16::splat(simd, 0.0);
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let zero = splat(0.0);
         let mut remaining = guess;
         let mut round = 0;
+        // The difference between the fraction that follows from an image point and the one that it was computed for; and by
+        // how much that fraction changed in the round before.
+        let mut off_before = zero;
+        let mut step = zero;
         loop {
             let then_m = shutter.to_exposure_frame(simd, at_end_m, remaining);
             let pixels = self.project_static(simd, then_m);
             let next = shutter.remaining_at(simd, pixels.x_px, pixels.y_px);
             let converged = SimdShutter::converged(simd, next, remaining);
-            let decided = converged | !pixels.margin.simd_ge(zero);
+            let decided = converged | !pixels.margin.simd_ge(zero) | !wanted;
             if round == SimdShutter::ROUNDS || decided.all_true() {
                 let margin = converged.select(pixels.margin, f32x16::splat(simd, -1.0));
                 return ExposedPixels { pixels: LensPixels { margin, ..pixels }, remaining };
             }
-            remaining = next;
+            let off = next - remaining;
+            // A point at rest on the image has -1. A NaN, as in the first round, is replaced.
+            let slope = (off - off_before) / step;
+            let slow = slope.simd_ge(splat(-1.5)) & slope.simd_le(splat(-0.5));
+            let slope = slow.select(slope, splat(-1.0));
+            let at = (remaining - off / slope).max(zero).min(splat(1.0));
+            step = at - remaining;
+            off_before = off;
+            remaining = at;
             round += 1;
+        }
+    }
+
+    /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in metres.
+    #[inline(always)]
+    pub(super) fn at_exposure<S: Simd>(
+        &self,
+        simd: S,
+        at_end_m: Vec3x16<S>,
+        remaining: f32x16<S>,
+    ) -> Vec3x16<S> {
+        match &self.shutter {
+            None => at_end_m,
+            Some(shutter) => shutter.to_exposure_frame(simd, at_end_m, remaining),
         }
     }
 
@@ -183,17 +243,54 @@ impl LensProjection {
         let Vec3x16 { x, y, z } = point_m;
         let [cx, cy] = self.center_px.map(splat);
         match &self.model {
-            Model::Round { px_from_round, series, max_t } => {
+            Model::Round { px_from_round, series, max_t, beyond, .. } => {
                 let off_axis2 = x.mul_add(x, y * y);
-                let inverse = splat(1.0) / (z.mul_add(z, off_axis2).sqrt() + z);
-                let t = off_axis2.sqrt() * inverse;
-                let radius = series.at(simd, t) * inverse;
+                let distance = z.mul_add(z, off_axis2).sqrt();
+                let inverse = splat(1.0) / (distance + z);
+                let off_axis = off_axis2.sqrt();
+                let t = off_axis * inverse;
+                let end = splat(*max_t);
+                // A NaN is not within the field.
+                let within = t.simd_le(end);
+                let mut radius = series.at(simd, t.min(end)) * inverse;
+                let mut margin = within.select(end - t, splat(-1.0));
+                if let Some(tangent) = beyond
+                    && !within.all_true()
+                {
+                    radius = within.select(radius, tangent.radius(simd, t) / off_axis);
+                    margin = within.select(margin, Tangent::margin(simd, t));
+                }
                 let [[c, d], [e, f]] = px_from_round.map(|row| row.map(splat));
                 LensPixels {
                     x_px: c.mul_add(x, d * y).mul_add(radius, cx),
                     y_px: e.mul_add(x, f * y).mul_add(radius, cy),
-                    // A NaN is not within the field.
-                    margin: t.simd_le(splat(*max_t)).select(splat(*max_t) - t, splat(-1.0)),
+                    margin,
+                    per_sin: radius * distance,
+                }
+            }
+            Model::Pinhole { focal_px, max_slope2, beyond } => {
+                let inverse = splat(1.0) / z;
+                let mut x_slope = x * inverse;
+                let mut y_slope = y * inverse;
+                let slope2 = x_slope.mul_add(x_slope, y_slope * y_slope);
+                // Points behind the camera are not within, and neither is a NaN (a point beside it).
+                let within = z.simd_gt(splat(0.0)) & slope2.simd_le(splat(*max_slope2));
+                let mut margin = within.select(splat(0.0), splat(-1.0));
+                if !within.all_true() {
+                    let off_axis2 = x.mul_add(x, y * y);
+                    let off_axis = off_axis2.sqrt();
+                    let t = off_axis / (z.mul_add(z, off_axis2).sqrt() + z);
+                    let slope = beyond.radius(simd, t) / off_axis;
+                    x_slope = within.select(x_slope, x * slope);
+                    y_slope = within.select(y_slope, y * slope);
+                    margin = within.select(margin, Tangent::margin(simd, t));
+                }
+                let [fx, fy] = focal_px.map(splat);
+                LensPixels {
+                    x_px: x_slope.mul_add(fx, cx),
+                    y_px: y_slope.mul_add(fy, cy),
+                    margin,
+                    per_sin: splat(0.0),
                 }
             }
             Model::Slopes { focal_px, k, p, s, max_slope2 } => {
@@ -222,6 +319,7 @@ impl LensProjection {
                     y_px: (y.mul_add(radial, tangential_y) + prism_y).mul_add(fy, cy),
                     // Points behind the camera are outside, and so is a NaN (a point beside it).
                     margin: z.simd_gt(splat(0.0)).select(splat(*max_slope2) - r2, splat(-1.0)),
+                    per_sin: splat(0.0),
                 }
             }
         }
@@ -232,17 +330,64 @@ impl LensProjection {
 const INSIDE: f32 = 1.0 - 1e-5;
 
 impl Model {
-    /// A lens by its radius at an angle: the series of `r(2 atan t)/t`, within `max_error` of the radius.
+    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`, within `max_error` of the
+    /// radius. The lens' field ends at `limit_rad`.
     fn round(
         max_rad: f64,
+        limit_rad: f64,
         px_from_round: [[f32; 2]; 2],
         max_error: f64,
         radius: &dyn Fn(f64) -> f64,
     ) -> Option<Self> {
         let max_t = (0.5 * max_rad).tan();
         let series = ChebyshevSeries::fit(max_t, max_error, &|t| radius(2.0 * t.atan()))?;
-        Some(Self::Round { px_from_round, series, max_t: max_t as f32 * INSIDE })
+        let derivatives = RoundDerivatives::new(max_rad, radius);
+        let beyond = (max_rad >= limit_rad).then(|| {
+            let end = radius(max_rad);
+            Tangent::new(max_rad, end, radius(max_rad + 1.0) - end)
+        });
+        let max_t = max_t as f32 * INSIDE;
+        Some(Self::Round { px_from_round, series, derivatives, max_t, beyond })
     }
+}
+
+impl RoundDerivatives {
+    /// Largest error of the slope, as a share of the slope at the axis: of the size of a splat.
+    const SLOPE_ERROR: f64 = 1e-5;
+
+    /// The same of the curvature, which only moves the mean of a splat by a pixel or so.
+    const CURVATURE_ERROR: f64 = 1e-3;
+
+    /// `None` if no short series describes them.
+    fn new(max_rad: f64, radius: &dyn Fn(f64) -> f64) -> Option<Self> {
+        let slope = |rad: f64| round_slope(radius, max_rad, rad);
+        let curvature = |rad: f64| round_curvature(radius, max_rad, rad);
+        // A series is fitted to f(t)/t.
+        let fit = |error: f64, of_rad: &dyn Fn(f64) -> f64| {
+            let max_t = (0.5 * max_rad).tan();
+            let max_error = error * slope(0.0) * max_t;
+            ChebyshevSeries::fit(max_t, max_error, &|t| t * of_rad(2.0 * t.atan()))
+        };
+        Some(Self {
+            slope: fit(Self::SLOPE_ERROR, &slope)?,
+            curvature: fit(Self::CURVATURE_ERROR, &curvature)?,
+        })
+    }
+}
+
+/// `r′` of a radius at an angle, by a central difference within the field. Series are sampled at angles that are
+/// farther than the difference from the field's ends.
+fn round_slope(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
+    let h = 1e-4;
+    let rad = rad.clamp(h, max_rad - h);
+    (radius(rad + h) - radius(rad - h)) / (2.0 * h)
+}
+
+/// `r″`, likewise.
+fn round_curvature(radius: &dyn Fn(f64) -> f64, max_rad: f64, rad: f64) -> f64 {
+    let h = 5e-4;
+    let rad = rad.clamp(h, max_rad - h);
+    (radius(rad + h) - 2.0 * radius(rad) + radius(rad - h)) / (h * h)
 }
 
 /// The largest angle off the axis that the image shows, behind the windshield, in radians. The field may be
@@ -336,7 +481,7 @@ mod tests {
         assert!(max_error_rad < 2e-6, "{max_error_rad:e} rad");
     }
 
-    /// Points on a spiral from the axis to a little beyond the end of the field.
+    /// Points on a spiral from the axis to far beyond the end of the field.
     #[test]
     fn projected_points_match_f64() {
         let mut max_error_px: f64 = 0.0;
@@ -344,32 +489,38 @@ mod tests {
             for view in views(camera) {
                 let projection = LensProjection::new(&view).expect(&name);
                 let mut inside = 0;
-                for step in 0..4_000 {
-                    let angle_rad = 1.02 * camera.limit_rad() * f64::from(step) / 4_000.0;
+                let mut beyond = 0;
+                for step in 0..5_000 {
+                    let angle_rad = camera.limit_rad() * f64::from(step) / 4_000.0;
                     let (sin, cos) = angle_rad.sin_cos();
                     let azimuth = 0.37 * f64::from(step);
                     let direction = DVec3::new(sin * azimuth.cos(), sin * azimuth.sin(), cos);
                     let point = (17.0 * direction).as_vec3();
                     let [x_px, y_px, margin] = dispatch!(Level::new(), simd => {
                         let point = Vec3x16::splat(simd, point.to_array());
+                        let zero = f32x16::splat(simd, 0.0);
+                        let wanted = zero.simd_ge(zero);
                         let ExposedPixels { pixels, .. } =
-                            projection.project(simd, point, f32x16::splat(simd, 0.0));
+                            projection.project(simd, point, zero, wanted);
                         [pixels.x_px, pixels.y_px, pixels.margin]
                             .map(|value| f64::from(value.to_array()[0]))
                     });
                     let point_m = view.world_from_camera.transform_point(point.as_dvec3());
-                    match view.project_world(point_m) {
-                        Some(at_px) if margin >= 0.0 => {
-                            let off = at_px - DVec2::new(x_px, y_px);
-                            max_error_px = max_error_px.max(off.length());
-                            inside += 1;
+                    // The others are left to the f64 path.
+                    if margin >= 0.0 {
+                        let at_px = view.project_extrapolated(point_m, 1.0).at_px;
+                        let off = at_px - DVec2::new(x_px, y_px);
+                        max_error_px = max_error_px.max(off.length());
+                        match view.project_world(point_m) {
+                            Some(_) => inside += 1,
+                            None => beyond += 1,
                         }
-                        // Left to the f64 path.
-                        Some(_) => {}
-                        None => assert!(margin < 0.0, "{name}: {angle_rad} rad is beyond"),
                     }
                 }
                 assert!(inside > least_inside, "{name}: {inside}");
+                let is_bare = camera.windshield.is_none();
+                let is_continued = is_bare && matches!(camera.lens, Lens::FTheta(_));
+                assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
             }
         }
         eprintln!("largest error: {max_error_px:.1e} px");

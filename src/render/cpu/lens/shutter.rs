@@ -57,6 +57,47 @@ impl SimdShutter {
         remaining.max(f32x16::splat(simd, 0.0)).min(f32x16::splat(simd, 1.0))
     }
 
+    /// The same without the limits of the exposure.
+    #[inline(always)]
+    pub(super) fn unclamped_remaining_at<S: Simd>(
+        &self,
+        simd: S,
+        x_px: f32x16<S>,
+        y_px: f32x16<S>,
+    ) -> f32x16<S> {
+        let [a, b, c] = self.remaining.map(|value| f32x16::splat(simd, value));
+        x_px.mul_add(a, y_px.mul_add(b, c))
+    }
+
+    /// Change of the remaining fraction per pixel along x and along y.
+    pub(super) fn remaining_per_px(&self) -> [f32; 2] {
+        let [a, b, _] = self.remaining;
+        [a, b]
+    }
+
+    /// The camera's rotation during the exposure, in radians.
+    pub(super) fn rotation_rad(&self) -> f32 {
+        self.rotation_rad
+    }
+
+    /// How a point moves in the camera's frame, in metres per unit of the remaining fraction. `then_m` is its
+    /// place in that frame while `remaining` remains.
+    ///
+    /// The place is `R(r) (p + r t)` with the rotation R by `r ω` about the axis k, so that its derivative is
+    /// `ω k × place + R t`.
+    #[inline(always)]
+    pub(super) fn velocity<S: Simd>(
+        &self,
+        simd: S,
+        then_m: Vec3x16<S>,
+        remaining: f32x16<S>,
+    ) -> Vec3x16<S> {
+        let axis = Vec3x16::splat(simd, self.axis);
+        let translation_m = Vec3x16::splat(simd, self.translation_m);
+        let rotated_m = translation_m.plus(self.rotation_change(simd, translation_m, remaining));
+        axis.cross(then_m).mul_add(f32x16::splat(simd, self.rotation_rad), rotated_m)
+    }
+
     /// Whether two fractions are the same moment.
     #[inline(always)]
     pub(super) fn converged<S: Simd>(simd: S, one: f32x16<S>, other: f32x16<S>) -> mask32x16<S> {

@@ -22,12 +22,30 @@ pub(super) struct SimdWindshield {
 #[derive(Clone, Debug)]
 struct Polynomial2(Vec<Vec<f32>>);
 
+/// A polynomial of two angles and its derivatives.
+struct ValueAndSlopes<S: Simd> {
+    value: f32x16<S>,
+    by_phi: f32x16<S>,
+    by_theta: f32x16<S>,
+}
+
 /// Directions behind a windshield.
 #[derive(Clone, Copy)]
 pub(super) struct Refracted<S: Simd> {
     /// Unit directions inside.
     pub(super) direction: Vec3x16<S>,
     /// Not below 0 where the refraction is complete.
+    pub(super) margin: f32x16<S>,
+}
+
+/// The refraction around a direction.
+pub(super) struct RefractionDerivatives<S: Simd> {
+    /// The unit direction inside.
+    pub(super) inside: Vec3x16<S>,
+    /// How it changes with the x and the y of the unit direction outside.
+    pub(super) by_x: Vec3x16<S>,
+    pub(super) by_y: Vec3x16<S>,
+    /// How far, in the outside z, the refraction is complete; not below 0 where it is.
     pub(super) margin: f32x16<S>,
 }
 
@@ -59,6 +77,47 @@ impl SimdWindshield {
         // A NaN is not above the limit.
         let margin = unit.z.simd_ge(full_z).select(unit.z - full_z, splat(-1.0));
         Refracted { direction: Vec3x16 { x, y, z }, margin }
+    }
+
+    /// The refraction around unit directions outside.
+    ///
+    /// With `x = sin φ` outside and `x′ = sin h(φ, θ)` inside, `∂x′/∂x = cos h ∂h/∂φ / cos φ`, and likewise for the
+    /// other three; z′ follows from the unit length.
+    #[inline(always)]
+    pub(super) fn expand<S: Simd>(&self, simd: S, unit: Vec3x16<S>) -> RefractionDerivatives<S> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let one = splat(1.0);
+        let cosine = |sine: f32x16<S>| (one - sine * sine).max(splat(1e-12)).sqrt();
+        let phi = asin(simd, unit.x);
+        let theta = asin(simd, unit.y);
+        let horizontal = self.horizontal.with_slopes(simd, phi, theta);
+        let vertical = self.vertical.with_slopes(simd, phi, theta);
+        let x = sin(simd, horizontal.value);
+        let y = sin(simd, vertical.value);
+        let z = (one - x * x - y * y).max(splat(1e-12)).sqrt();
+        let per_cos_x = one / cosine(unit.x);
+        let per_cos_y = one / cosine(unit.y);
+        let cos_x = cosine(x);
+        let cos_y = cosine(y);
+        let per_z = one / z;
+        let column = |of_x: f32x16<S>, of_y: f32x16<S>| Vec3x16 {
+            x: of_x,
+            y: of_y,
+            z: -(x.mul_add(of_x, y * of_y) * per_z),
+        };
+        let [_, full_z] = Windshield::FADES_Z;
+        RefractionDerivatives {
+            inside: Vec3x16 { x, y, z },
+            by_x: column(
+                cos_x * horizontal.by_phi * per_cos_x,
+                cos_y * vertical.by_phi * per_cos_x,
+            ),
+            by_y: column(
+                cos_x * horizontal.by_theta * per_cos_y,
+                cos_y * vertical.by_theta * per_cos_y,
+            ),
+            margin: unit.z - splat(full_z as f32),
+        }
     }
 
     /// Unit directions outside, of directions of any length inside.
@@ -125,6 +184,27 @@ impl Polynomial2 {
                 of_phi = of_phi.mul_add(phi, f32x16::splat(simd, coefficient));
             }
             sum = sum.mul_add(theta, of_phi);
+        }
+        sum
+    }
+
+    /// By Horner's scheme in both angles, of the polynomial and of its derivatives.
+    #[inline(always)]
+    fn with_slopes<S: Simd>(&self, simd: S, phi: f32x16<S>, theta: f32x16<S>) -> ValueAndSlopes<S> {
+        let zero = f32x16::splat(simd, 0.0);
+        let mut sum = ValueAndSlopes { value: zero, by_phi: zero, by_theta: zero };
+        for row in self.0.iter().rev() {
+            let mut of_phi = zero;
+            let mut of_phi_rise = zero;
+            for &coefficient in row {
+                of_phi_rise = of_phi_rise.mul_add(phi, of_phi);
+                of_phi = of_phi.mul_add(phi, f32x16::splat(simd, coefficient));
+            }
+            sum = ValueAndSlopes {
+                by_theta: sum.by_theta.mul_add(theta, sum.value),
+                value: sum.value.mul_add(theta, of_phi),
+                by_phi: sum.by_phi.mul_add(theta, of_phi_rise),
+            };
         }
         sum
     }

@@ -209,11 +209,15 @@ impl<'a> ChunkProjection<'a> {
         frame: &Frame<'_>,
     ) -> Self {
         match non_pinhole {
-            Some(NonPinholeView { unscented, lens }) => {
-                Self::Unscented(UnscentedChunkView::new(view, chunk, unscented, lens.as_ref()))
-            }
+            Some(NonPinholeView { unscented, lens }) => Self::Unscented(UnscentedChunkView::new(
+                view,
+                chunk,
+                frame.profile,
+                unscented,
+                lens.as_ref(),
+            )),
             None => Self::Pinhole {
-                chunk_view: ChunkView::new(view, chunk),
+                chunk_view: ChunkView::new(view, chunk, frame.profile),
                 frustum: Frustum::new(view, chunk, frame.profile),
             },
         }

@@ -51,7 +51,7 @@ pub(super) fn project_block<S: Simd>(
     let scale = Vec3x16::load(simd, columns, column::SCALE);
     let v0 = jacobian_row(simd, view, 0, slope_x, inverse_z, axes).times(scale);
     let v1 = jacobian_row(simd, view, 1, slope_y, inverse_z, axes).times(scale);
-    let ellipse = Ellipse::from_root(simd, v0, v1, cutoffs.blur_px2);
+    let ellipse = Ellipse::from_root(simd, v0, v1, &view.filter);
 
     // Test against the image; compute colours only if some Gaussian passed.
     let projected = ProjectedBlock { mean_x, mean_y, depth_m: z, log2_opacity, ellipse, in_range };

@@ -12,7 +12,7 @@ use fearless_simd::{f32x16, mask32x16, prelude::*};
 use crate::constants::{EXTENT_SLACK_PX, MAX_SIGMA_PX};
 use crate::cpu::lanes::Vec3x16;
 use crate::cpu::math::log2;
-use crate::layout::{Cutoffs, Splat};
+use crate::layout::{Cutoffs, PixelFilter, Splat};
 use wildcity_scene::chunk::LANES;
 
 /// `√(log2(e)/2)`: what turns standard deviations into the unit of [`Splat::factor`], as
@@ -28,8 +28,11 @@ pub(super) struct Ellipse<S: Simd> {
     sigma_x: f32x16<S>,
     /// Standard deviation along y, in pixels.
     sigma_y: f32x16<S>,
-    /// Determinant before the blur as a share of the one after.
-    det_share: f32x16<S>,
+    /// Determinant before the blur as a share of the one after the blur of native pixels.
+    blur_share: f32x16<S>,
+    /// Of an image below its native size: determinant after the blur of native pixels as a share of the one
+    /// after the whole filter.
+    shrink_share: Option<f32x16<S>>,
 }
 
 impl<S: Simd> Ellipse<S> {
@@ -40,20 +43,18 @@ impl<S: Simd> Ellipse<S> {
     /// needles, for which `ac - b²` cancels to nothing. The determinant is of fourth order in the size, so
     /// that a splat wider than [`MAX_SIGMA_PX`] is computed in a unit larger than the pixel.
     #[inline(always)]
-    pub(super) fn from_root(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, blur_px2: f32) -> Self {
+    pub(super) fn from_root(simd: S, v0: Vec3x16<S>, v1: Vec3x16<S>, filter: &PixelFilter) -> Self {
         let splat = |value: f32| f32x16::splat(simd, value);
         let widest = v0.max_abs().max(v1.max_abs()).max(splat(1e-30));
         let units_per_px = (splat(MAX_SIGMA_PX) / widest).min(splat(1.0));
         let px_per_unit = splat(1.0) / units_per_px;
         let v0 = v0.scale(units_per_px);
         let v1 = v1.scale(units_per_px);
-        let blur = splat(blur_px2) * units_per_px * units_per_px;
 
         let minors = v0.cross(v1);
         let moments =
             Moments { xx: v0.dot(v0), yy: v1.dot(v1), xy: v0.dot(v1), det: minors.dot(minors) };
-        let log2_unit = splat(LOG2_UNIT) * units_per_px;
-        let ellipse = Self::from_moments(moments, blur, log2_unit);
+        let ellipse = Self::from_moments(simd, moments, filter, units_per_px);
         Self {
             sigma_x: ellipse.sigma_x * px_per_unit,
             sigma_y: ellipse.sigma_y * px_per_unit,
@@ -61,18 +62,48 @@ impl<S: Simd> Ellipse<S> {
         }
     }
 
-    /// From the covariance before the blur. The blur is in the moments' unit of area; `log2_unit` is
-    /// [`LOG2_UNIT`] times the moments' unit of length per pixel.
+    /// From the covariance before the blur, whose unit of length is a pixel divided by `units_per_px`.
     ///
     /// With `Σ′ = [a b; b c]` the exponent's form is
     /// `q(dx, dy) = (dx, dy) Σ′⁻¹ (dx, dy)ᵀ = (c dx - b dy)²/(c det) + dy²/c`, and so
     /// `l0 = √c/√det`, `l1 = -b/(√c √det)` and `l2 = 1/√c`, each times `log2_unit`.
+    /// An image below its native size is filtered by another variance along each axis ([`PixelFilter`]). Native
+    /// images have their own branch, since another order of the sums would change their bytes.
     #[inline(always)]
-    pub(super) fn from_moments(moments: Moments<S>, blur: f32x16<S>, log2_unit: f32x16<S>) -> Self {
+    pub(super) fn from_moments(
+        simd: S,
+        moments: Moments<S>,
+        filter: &PixelFilter,
+        units_per_px: f32x16<S>,
+    ) -> Self {
         let Moments { xx, yy, xy, det: det_before } = moments;
-        let det = blur.mul_add(xx + yy + blur, det_before);
-        let sigma_x = (xx + blur).sqrt();
-        let sigma_y = (yy + blur).sqrt();
+        let log2_unit = f32x16::splat(simd, LOG2_UNIT) * units_per_px;
+        // A variance in the moments' unit of area.
+        let area = |px2: f64| f32x16::splat(simd, px2 as f32) * units_per_px * units_per_px;
+        let blur_x = area(filter.total_px2.x);
+        let sigma_x;
+        let sigma_y;
+        let det;
+        let blur_share;
+        let shrink_share;
+        if filter.is_shrunk() {
+            // det(C + diag(u, v)) = det C + u C_yy + v C_xx + u v, a sum of positives, too.
+            let det_with =
+                |x: f32x16<S>, y: f32x16<S>| x.mul_add(yy + y, y.mul_add(xx, det_before));
+            let blur_y = area(filter.total_px2.y);
+            let det_native = det_with(area(filter.native_px2.x), area(filter.native_px2.y));
+            det = det_with(blur_x, blur_y);
+            sigma_x = (xx + blur_x).sqrt();
+            sigma_y = (yy + blur_y).sqrt();
+            blur_share = det_before / det_native;
+            shrink_share = Some(det_native / det);
+        } else {
+            det = blur_x.mul_add(xx + yy + blur_x, det_before);
+            sigma_x = (xx + blur_x).sqrt();
+            sigma_y = (yy + blur_x).sqrt();
+            blur_share = det_before / det;
+            shrink_share = None;
+        }
         let l2 = log2_unit / sigma_y;
         let root_det = det.sqrt();
         Self {
@@ -81,7 +112,8 @@ impl<S: Simd> Ellipse<S> {
             l2,
             sigma_x,
             sigma_y,
-            det_share: det_before / det,
+            blur_share,
+            shrink_share,
         }
     }
 }
@@ -119,8 +151,12 @@ impl<S: Simd> ProjectedBlock<S> {
         let Self { mean_x, mean_y, depth_m, mut log2_opacity, ellipse, in_range } = self;
         if cutoffs.antialiased {
             // Yu et al. 2024 (Mip-Splatting): √(det before / det after), with gsplat's floor of 0.005.
-            let ratio = ellipse.det_share.max(splat(0.005 * 0.005));
+            let ratio = ellipse.blur_share.max(splat(0.005 * 0.005));
             log2_opacity = splat(0.5).mul_add(log2(simd, ratio), log2_opacity);
+        }
+        if let Some(ratio) = ellipse.shrink_share {
+            let power = splat(PixelFilter::SHRINK_POWER as f32);
+            log2_opacity = power.mul_add(log2(simd, ratio), log2_opacity);
         }
 
         // The box where alpha reaches the cut: u² + v² = log2(opacity) - log2(alpha_cut), and along x and y
@@ -181,6 +217,22 @@ impl SplatBlock {
         rgb.x.store_array(&mut self.red);
         rgb.y.store_array(&mut self.green);
         rgb.z.store_array(&mut self.blue);
+    }
+
+    /// Takes the visible splats of another block of the same Gaussians into their lanes.
+    pub(super) fn merge(&mut self, other: &Self) {
+        for i in (0..LANES).filter(|i| other.visible >> i & 1 == 1) {
+            self.mean_x[i] = other.mean_x[i];
+            self.mean_y[i] = other.mean_y[i];
+            self.l0[i] = other.l0[i];
+            self.l1[i] = other.l1[i];
+            self.l2[i] = other.l2[i];
+            self.log2_opacity[i] = other.log2_opacity[i];
+            self.depth_m[i] = other.depth_m[i];
+            self.extent_x[i] = other.extent_x[i];
+            self.extent_y[i] = other.extent_y[i];
+        }
+        self.visible |= other.visible;
     }
 
     #[inline(always)]

@@ -1,5 +1,6 @@
 //! Projection by every camera that is not a static pinhole: six points of each Gaussian
-//! ([`crate::unscented`] explains the method).
+//! ([`crate::unscented`] explains the method), or the camera's expansion around its centre where the two differ by
+//! less than a bound ([`crate::expansion`]).
 //!
 //! Where [`LensProjection`] describes the camera, 16 Gaussians are projected at a time in f32. Those with a
 //! point beyond the lens' field, or with a point for which the search found no row, are projected one by one
@@ -14,12 +15,13 @@ use super::splat_block::{Ellipse, LOG2_UNIT, Moments, ProjectedBlock, SplatBlock
 use crate::View;
 use crate::constants::EXTENT_SLACK_PX;
 use crate::cpu::lanes::Vec3x16;
-use crate::cpu::lens::{ExposedPixels, LensPixels, LensProjection};
-use crate::layout::Cutoffs;
+use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensPixels, LensProjection, Remainder};
+use crate::expansion::ExpansionBound;
+use crate::layout::{Cutoffs, Filtered, PixelFilter};
 use crate::unscented::{CullBound, Footprint, UnscentedView};
-use wildcity_scene::Chunk;
 use wildcity_scene::chunk::{LANES, Lanes, column};
 use wildcity_scene::geometry::camera::WIDEST_RAD;
+use wildcity_scene::{Chunk, RenderProfile};
 
 /// One chunk in a view that is not a static pinhole.
 #[derive(Clone, Copy)]
@@ -35,6 +37,8 @@ pub(super) struct UnscentedChunkView<'a> {
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     camera_m: [f32; 3],
     size_px: [f32; 2],
+    /// What is added to screen covariances.
+    filter: PixelFilter,
     /// Whether depth is the distance from the camera, and not z.
     depth_is_distance: bool,
 }
@@ -44,6 +48,7 @@ impl<'a> UnscentedChunkView<'a> {
     pub(super) fn new(
         view: &View,
         chunk: &Chunk,
+        profile: &RenderProfile,
         unscented: &'a UnscentedView<'a>,
         lens: Option<&'a LensProjection>,
     ) -> Self {
@@ -60,6 +65,7 @@ impl<'a> UnscentedChunkView<'a> {
             camera_from_chunk: [0, 1, 2].map(row),
             camera_m: camera_m.as_vec3().to_array(),
             size_px: view.camera.size_px().as_vec2().to_array(),
+            filter: PixelFilter::new(profile, &view.camera),
             depth_is_distance: view.camera.depth_is_distance(),
         }
     }
@@ -103,9 +109,9 @@ pub(super) fn project_block<S: Simd>(
     Some(splats)
 }
 
-/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
-/// and a bit for each other Gaussian that may be seen. `toward_m` receives the vectors from the camera to the
-/// centres, in world axes.
+/// Projects those Gaussians of a block whose points are within the lens' field: by the expansion around their
+/// centres where that suffices, and by six points elsewhere. Returns their splats, and a bit for each other
+/// Gaussian that may be seen. `toward_m` receives the vectors from the camera to the centres, in world axes.
 #[inline(always)]
 fn project_lanes<S: Simd>(
     simd: S,
@@ -126,17 +132,21 @@ fn project_lanes<S: Simd>(
     let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
     let at_end_m = [x, y, z];
 
-    // Cull what is too faint, and what surely misses the image.
+    // Cull what is too faint, and what surely misses the image, before the lens is applied.
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
-    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::SCALE);
-    let in_range = log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut))
-        & !surely_unseen(simd, center, x.max(y).max(z), view.unscented.cull_bound());
+    let scale = Vec3x16::load(simd, columns, column::SCALE);
+    let bound = view.unscented.cull_bound();
+    let sigma_m = scale.x.max(scale.y).max(scale.z);
+    let angles = CenterAngles::new(simd, center, sigma_m, bound);
+    let in_range =
+        log2_opacity.simd_ge(splat(cutoffs.log2_alpha_cut)) & !angles.surely_unseen(simd, bound);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
 
     // When each centre is exposed, and where the camera is then.
-    let ExposedPixels { pixels: center_px, remaining } = lens.project(simd, center, splat(0.0));
+    let exposed = lens.project(simd, center, splat(0.0), in_range);
+    let ExposedPixels { pixels: center_px, remaining } = exposed;
     let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     if let Some(shutter) = lens.shutter() {
         toward = toward.plus(shutter.translation_world(simd, remaining));
@@ -147,39 +157,144 @@ fn project_lanes<S: Simd>(
     // decides for the others.
     let depth_m = depth(simd, at_end_m, view, lens, center, remaining);
     let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
+    let found = center_px.margin.simd_ge(splat(0.0));
     let is_depth = match lens.shutter() {
         None => splat(0.0).simd_ge(splat(0.0)),
-        Some(_) => center_px.margin.simd_ge(splat(0.0)),
+        Some(_) => found,
     };
-    let in_range = in_range & (in_depth | !is_depth);
+    // Too far outside of the lens' field, or so far beside the image that no point of it lands there.
+    let then_m = lens.at_exposure(simd, center, remaining);
+    let least_z = splat(bound.max_center_cos as f32) * then_m.dot(then_m).sqrt();
+    let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view);
+    let in_range = in_range & (in_depth | !is_depth) & !(found & too_far);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
 
-    // The six points: ±√3 standard deviations along each own axis.
+    // The own axes times their standard deviations.
     let axes = rotation_columns(simd, columns);
-    let [right, down, forward] =
-        view.camera_from_chunk.map(|[x, y, z, _]| [x as f32, y as f32, z as f32]);
-    let right = Vec3x16::splat(simd, right);
-    let down = Vec3x16::splat(simd, down);
-    let forward = Vec3x16::splat(simd, forward);
-    let mut margin = center_px.margin;
+    let gaussians = CenteredBlock {
+        center,
+        then_m,
+        axes_m: [axes[0].scale(scale.x), axes[1].scale(scale.y), axes[2].scale(scale.z)],
+        exposed,
+        depth_m,
+        log2_opacity,
+        in_range,
+    };
+    let (mut splats, left) = expand(simd, &gaussians, view, lens, cutoffs);
+    if left.all_false() {
+        return (splats, 0);
+    }
+    let gaussians = CenteredBlock { in_range: left, ..gaussians };
+    let (of_points, remaining) = project_six_points(simd, &gaussians, view, lens, cutoffs);
+    splats.merge(&of_points);
+    (splats, remaining)
+}
+
+/// Sixteen Gaussians whose centres have been projected.
+struct CenteredBlock<S: Simd> {
+    /// Centres in the camera's frame at the end of the exposure, in metres.
+    center: Vec3x16<S>,
+    /// Centres in the camera's frame at the moments of their exposure, in metres.
+    then_m: Vec3x16<S>,
+    /// Own axes times their standard deviations, in the chunk's axes, in metres.
+    axes_m: [Vec3x16<S>; 3],
+    /// The centres' images.
+    exposed: ExposedPixels<S>,
+    depth_m: f32x16<S>,
+    log2_opacity: f32x16<S>,
+    /// Which may be seen.
+    in_range: mask32x16<S>,
+}
+
+/// The rows of camera_from_chunk's rotation.
+#[inline(always)]
+fn rotation_rows<S: Simd>(simd: S, view: &UnscentedChunkView<'_>) -> [Vec3x16<S>; 3] {
+    view.camera_from_chunk.map(|[x, y, z, _]| Vec3x16::splat(simd, [x as f32, y as f32, z as f32]))
+}
+
+/// The splats of those Gaussians for which the expansion is close enough to six points, and the others that may
+/// be seen.
+#[inline(always)]
+fn expand<S: Simd>(
+    simd: S,
+    gaussians: &CenteredBlock<S>,
+    view: &UnscentedChunkView<'_>,
+    lens: &LensProjection,
+    cutoffs: &Cutoffs,
+) -> (SplatBlock, mask32x16<S>) {
+    let CenteredBlock { then_m, axes_m, ref exposed, depth_m, log2_opacity, in_range, .. } =
+        *gaussians;
+    let none = (SplatBlock::default(), in_range);
+    let Some(bound) = view.unscented.expansion_bound() else { return none };
+    let Some(mut expansion) = lens.expand(simd, then_m, exposed) else { return none };
+    expansion.in_frame(rotation_rows(simd, view));
+    let ExpandedAxes { columns, mean_shift, remainder } = expansion.axes(simd, axes_m);
+    let pixels = exposed.pixels;
+    let close = in_range
+        & pixels.margin.simd_ge(f32x16::splat(simd, 0.0))
+        & is_close(simd, &remainder, bound);
+    if close.all_false() {
+        return none;
+    }
+    let moments = moments_of_root(simd, columns.map(|column| [column.x, column.y]));
+    let projected = ProjectedBlock {
+        mean_x: pixels.x_px + mean_shift.x,
+        mean_y: pixels.y_px + mean_shift.y,
+        depth_m,
+        log2_opacity,
+        ellipse: Ellipse::from_moments(simd, moments, &view.filter, f32x16::splat(simd, 1.0)),
+        in_range: close,
+    };
+    (projected.clip(simd, view.size_px, cutoffs), in_range & !close)
+}
+
+/// Where the expansion differs from six points by less than the bound.
+#[inline(always)]
+fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) -> mask32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let Remainder { square, longest, shutter_px, room } = *remainder;
+    let cube = longest * longest * longest;
+    let error_px =
+        splat(bound.second_px).mul_add(square, splat(bound.third_px).mul_add(cube, shutter_px));
+    // The points lie √3 standard deviations from the centre; the rest is a margin.
+    let within = room.simd_ge(splat(2.5) * longest);
+    within & error_px.simd_le(splat(bound.max_error_px))
+}
+
+/// Projects those Gaussians of a block that have all six points within the lens' field. Returns their splats,
+/// and a bit for each other Gaussian that may be seen.
+#[inline(always)]
+fn project_six_points<S: Simd>(
+    simd: S,
+    gaussians: &CenteredBlock<S>,
+    view: &UnscentedChunkView<'_>,
+    lens: &LensProjection,
+    cutoffs: &Cutoffs,
+) -> (SplatBlock, u64) {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range, .. } =
+        *gaussians;
+
+    // The six points: ±√3 standard deviations along each own axis.
+    let [right, down, forward] = rotation_rows(simd, view);
+    let mut margin = exposed.pixels.margin;
     let mut pairs = [[splat(0.0); 4]; 3];
     let mut mean_x = splat(0.0);
     let mut mean_y = splat(0.0);
-    for axis in 0..3 {
-        let distance = [x, y, z][axis] * splat(3.0_f32.sqrt());
-        let offset = axes[axis].scale(distance);
+    for (axis_m, pair) in axes_m.into_iter().zip(&mut pairs) {
+        let offset = axis_m.scale(splat(3.0_f32.sqrt()));
         let offset = Vec3x16 { x: right.dot(offset), y: down.dot(offset), z: forward.dot(offset) };
         let plus = center.plus(offset);
         let minus = center.minus(offset);
         // Each search begins with the moment at which the centre is exposed.
-        let LensPixels { x_px: ax, y_px: ay, margin: a } =
-            lens.project(simd, plus, remaining).pixels;
-        let LensPixels { x_px: bx, y_px: by, margin: b } =
-            lens.project(simd, minus, remaining).pixels;
+        let LensPixels { x_px: ax, y_px: ay, margin: a, .. } =
+            lens.project(simd, plus, exposed.remaining, in_range).pixels;
+        let LensPixels { x_px: bx, y_px: by, margin: b, .. } =
+            lens.project(simd, minus, exposed.remaining, in_range).pixels;
         margin = margin.min(a).min(b);
-        pairs[axis] = [ax, ay, bx, by];
+        *pair = [ax, ay, bx, by];
         mean_x += ax + bx;
         mean_y += ay + by;
     }
@@ -197,7 +312,20 @@ fn project_lanes<S: Simd>(
             [(ax - mean_x + (bx - mean_x)) * half, (ay - mean_y + (by - mean_y)) * half];
     }
 
-    // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
+    let moments = moments_of_root(simd, root);
+    let ellipse = Ellipse::from_moments(simd, moments, &view.filter, splat(1.0));
+
+    let inside = in_range & margin.simd_ge(splat(0.0));
+    let projected =
+        ProjectedBlock { mean_x, mean_y, depth_m, log2_opacity, ellipse, in_range: inside };
+    let splats = projected.clip(simd, view.size_px, cutoffs);
+    (splats, in_range.to_bitmask() & !inside.to_bitmask())
+}
+
+/// The covariance of a root with six columns, and its determinant as the sum of the squares of the 15 minors.
+#[inline(always)]
+fn moments_of_root<S: Simd>(simd: S, root: [[f32x16<S>; 2]; 6]) -> Moments<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
     let [mut xx, mut yy, mut xy, mut det] = [splat(0.0); 4];
     for (i, [x, y]) in root.into_iter().enumerate() {
         xx = x.mul_add(x, xx);
@@ -208,55 +336,99 @@ fn project_lanes<S: Simd>(
             det = minor.mul_add(minor, det);
         }
     }
-    let moments = Moments { xx, yy, xy, det };
-    let ellipse = Ellipse::from_moments(moments, splat(cutoffs.blur_px2), splat(LOG2_UNIT));
-
-    let inside = in_range & margin.simd_ge(splat(0.0));
-    let projected =
-        ProjectedBlock { mean_x, mean_y, depth_m, log2_opacity, ellipse, in_range: inside };
-    let splats = projected.clip(simd, view.size_px, cutoffs);
-    (splats, in_range.to_bitmask() & !inside.to_bitmask())
+    Moments { xx, yy, xy, det }
 }
 
-/// Which Gaussians certainly miss the image: the test of [`CullBound`] in f32. Its bounds of the angles are
-/// widened by the errors of the approximations here.
-#[inline(always)]
-fn surely_unseen<S: Simd>(
-    simd: S,
-    center_m: Vec3x16<S>,
-    sigma_m: f32x16<S>,
-    bound: &CullBound,
-) -> mask32x16<S> {
-    let splat = |value: f64| f32x16::splat(simd, value as f32);
-    let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
-    let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
+/// Angles of 16 centres and their points, in radians, for the tests of [`CullBound`]. They are widened by the errors of the
+/// approximations here.
+struct CenterAngles<S: Simd> {
+    /// Least angle off the axis of the centres during the exposure.
+    least: f32x16<S>,
+    /// Largest angle off the axis of the centres and their points during the exposure.
+    most: f32x16<S>,
+    /// Largest angle between a centre and one of its points.
+    spread: f32x16<S>,
+    /// By how much the shutter changes that angle, if both are exposed at different moments.
+    motion: f32x16<S>,
+    /// Not close to the camera, where these bounds do not hold.
+    far: mask32x16<S>,
+    /// No point comes near the axis' other end, where the lens is not continued.
+    continued: mask32x16<S>,
+}
 
-    // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
-    // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
-    let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
-    let steep = t.simd_gt(splat(1.0));
-    let low = steep.select(splat(1.0) / t, t);
-    let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
-    let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+impl<S: Simd> CenterAngles<S> {
+    #[inline(always)]
+    fn new(simd: S, center_m: Vec3x16<S>, sigma_m: f32x16<S>, bound: &CullBound) -> Self {
+        let splat = |value: f64| f32x16::splat(simd, value as f32);
+        let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
+        let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
 
-    // Below s = 1/2, asin s is at most s π/3.
-    let third_turn = splat(std::f64::consts::FRAC_PI_3);
-    let translation = splat(bound.translation_m) / distance_m;
-    let slack_rad = translation.mul_add(third_turn, splat(0.01 + bound.rotation_rad));
-    let least_rad = half + half - slack_rad;
-    let most_rad = half + half + slack_rad;
-    let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.translation_m));
-    let spread_rad = share.mul_add(third_turn, splat(bound.windshield_rad));
+        // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
+        // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
+        let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
+        let steep = t.simd_gt(splat(1.0));
+        let low = steep.select(splat(1.0) / t, t);
+        let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
+        let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
+        let off_axis = half + half;
 
-    // Out: the distance from the image is more than any splat reaches, and no point comes near the axis'
-    // other end, where the lens is not continued.
-    let reach_px = spread_rad.mul_add(splat(bound.reach_px_per_rad), splat(bound.blur_px));
-    let out_px =
-        (least_rad - splat(bound.windshield_rad + bound.image_rad)) * splat(bound.least_px_per_rad);
-    let out = out_px.simd_gt(reach_px) & (most_rad + spread_rad).simd_lt(splat(WIDEST_RAD));
-    // Close to the camera the bounds above do not hold, and nothing is decided.
-    let far = translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5));
-    far & (out | least_rad.simd_gt(splat(bound.max_center_rad)))
+        // Below s = 1/2, asin s is at most s π/3.
+        let third_turn = splat(std::f64::consts::FRAC_PI_3);
+        let translation = splat(bound.translation_m) / distance_m;
+        let motion = translation.mul_add(third_turn, splat(bound.rotation_rad));
+        let slack = motion + splat(0.01);
+        let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.translation_m));
+        let spread = share * third_turn;
+        let most = off_axis + slack + spread + splat(bound.windshield_rad);
+        Self {
+            least: off_axis - slack,
+            most,
+            spread,
+            motion,
+            far: translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5)),
+            continued: most.simd_lt(splat(WIDEST_RAD)),
+        }
+    }
+
+    /// Which Gaussians certainly miss the image: the test of [`CullBound`].
+    #[inline(always)]
+    fn surely_unseen(&self, simd: S, bound: &CullBound) -> mask32x16<S> {
+        let splat = |value: f64| f32x16::splat(simd, value as f32);
+        let reach_px = self.reach_px(simd, self.spread + splat(bound.windshield_rad), bound);
+        let off_rad = self.least - splat(bound.windshield_rad + bound.image_rad);
+        let out = (off_rad * splat(bound.least_px_per_rad)).simd_gt(reach_px);
+        self.far & (self.continued & out | self.least.simd_gt(splat(bound.max_center_rad)))
+    }
+
+    /// Which Gaussians miss the image, given the images of their centres: none of their points lands farther from there
+    /// than the most pixels per radian allow. A windshield changes the angle between two rays by less than half of it.
+    #[inline(always)]
+    fn beside(
+        &self,
+        simd: S,
+        center_px: LensPixels<S>,
+        view: &UnscentedChunkView<'_>,
+    ) -> mask32x16<S> {
+        let bound = view.unscented.cull_bound();
+        let widened = f32x16::splat(simd, if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 });
+        let reach_px = self.reach_px(simd, (self.spread + self.motion) * widened, bound);
+        let [width, height] = view.size_px.map(|side| f32x16::splat(simd, side));
+        let beyond = |at: f32x16<S>, side: f32x16<S>| (-at).max(at - side);
+        let off_px = beyond(center_px.x_px, width).max(beyond(center_px.y_px, height));
+        self.far & self.continued & off_px.simd_gt(reach_px)
+    }
+
+    /// How far splats reach from the images of their centres, in pixels, if their points spread by some angles.
+    #[inline(always)]
+    fn reach_px(&self, simd: S, spread_rad: f32x16<S>, bound: &CullBound) -> f32x16<S> {
+        let splat = |value: f64| f32x16::splat(simd, value as f32);
+        let mut px_per_rad = splat(f64::INFINITY);
+        for cone in bound.reaches.iter().rev() {
+            let within = self.most.simd_le(splat(cone.rad));
+            px_per_rad = within.select(splat(cone.px_per_rad), px_per_rad);
+        }
+        spread_rad.mul_add(px_per_rad, splat(bound.blur_px))
+    }
 }
 
 #[inline(always)]
@@ -326,7 +498,6 @@ fn project_one(
         view.unscented.project(mean_m, axes_m)?;
 
     // The covariance, and its determinant as the sum of the squares of the root's 15 minors.
-    let blur = f64::from(cutoffs.blur_px2);
     let mut xx = 0.0;
     let mut yy = 0.0;
     let mut xy = 0.0;
@@ -340,16 +511,20 @@ fn project_one(
             det_before += minor * minor;
         }
     }
-    let det = det_before + blur * (xx + yy + blur);
+    let Filtered { xx, yy, det, blur_share, shrink_share } =
+        view.filter.rounded().filtered(xx, yy, det_before);
     if cutoffs.antialiased {
-        log2_opacity += 0.5 * (det_before / det).max(0.005 * 0.005).log2();
+        log2_opacity += 0.5 * blur_share.max(0.005 * 0.005).log2();
+    }
+    if view.filter.is_shrunk() {
+        log2_opacity += PixelFilter::SHRINK_POWER * shrink_share.log2();
     }
 
     // The box where alpha reaches the cut, against the image's pixel centres.
     let power = log2_opacity - log2_cut;
     let unit = f64::from(LOG2_UNIT);
-    let sigma_x = (xx + blur).sqrt();
-    let sigma_y = (yy + blur).sqrt();
+    let sigma_x = xx.sqrt();
+    let sigma_y = yy.sqrt();
     let extent_px =
         power.max(0.0).sqrt() / unit * DVec2::new(sigma_x, sigma_y) + f64::from(EXTENT_SLACK_PX);
     let on_image = power >= 0.0

@@ -14,7 +14,7 @@ use crate::gpu::plan::Counts;
 use crate::gpu::project::ProjectWork;
 use crate::gpu::read_back::{MappedFrame, ReadBack};
 use crate::gpu::resolve::Outputs;
-use crate::layout::{Cutoffs, Splat};
+use crate::layout::Splat;
 use crate::stage::{Stage, StageOutputs, TileLists};
 use crate::{Frame, RenderError};
 
@@ -65,7 +65,7 @@ impl Chain {
                 Source::Gaussians(&work)
             }
         };
-        let mut parameters = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
+        let mut parameters = GpuFrame::new(frame.views, frame.profile);
         let mut read_back = ReadBack::new(&self.device);
         read_back.reserve_head(&self.device);
         loop {

@@ -31,7 +31,6 @@ use super::scan::Scan;
 use super::sort::Sort;
 use crate::actor_views::ActorViews;
 use crate::constants::TILE_PX;
-use crate::layout::Cutoffs;
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
 
@@ -260,7 +259,7 @@ impl Chain {
         let planes = outputs.planes;
         self.lenses.upload(&self.device, frame, actors);
         self.rasterize.upload_background(&self.device, frame, &outputs.appearances)?;
-        let parameters = GpuFrame::new(frame.views, &Cutoffs::new(frame.profile));
+        let parameters = GpuFrame::new(frame.views, frame.profile);
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, parameters.tiles);
         let mut read_back = self.read_backs.take().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, parameters.tiles, tiles_per_page);

@@ -102,7 +102,16 @@ pub struct FieldCone {
     /// Beyond [`FieldCone::image_rad`], the distance from the principal point grows by at least this many
     /// pixels per radian.
     pub least_px_per_rad: f64,
-    /// Upper bound within [`WIDEST_RAD`] of the pixels between two projected rays per radian between them.
+    /// Bounds of the scale within cones around the axis, from the narrowest to [`WIDEST_RAD`].
+    pub scales: [ScaleWithin; FieldCone::SCALES],
+}
+
+/// A bound of a camera's scale within a cone around its axis.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ScaleWithin {
+    /// The cone's angle, in radians off the axis.
+    pub rad: f64,
+    /// Upper bound of the pixels between two projected rays of the cone per radian between them.
     pub most_px_per_rad: f64,
 }
 
@@ -110,6 +119,14 @@ impl FieldCone {
     /// Number of angles off the axis and of azimuths at which the projection is sampled.
     const STEPS: u32 = 64;
     const AZIMUTHS: u32 = 16;
+
+    /// Number of cones in [`FieldCone::scales`].
+    pub const SCALES: usize = 5;
+
+    /// How much wider than the image these cones are, in radians, except for the last. Most Gaussians that are culled lie
+    /// little beside the image, where a pinhole of 100° has 3 times the scale that it has on its axis; at the end of its
+    /// continuation it has 17 times that scale.
+    const WIDER_RAD: [f64; Self::SCALES - 1] = [0.05, 0.15, 0.35, 0.7];
 
     /// Bounds of a camera from a thousand samples of its projection, with a margin of a fifth for what lies
     /// between samples.
@@ -125,35 +142,42 @@ impl FieldCone {
                 camera.project_extrapolated(DVec3::new(x * sin, y * sin, cos)) - axis_px
             })
         };
-        let mut cone =
-            Self { image_rad: WIDEST_RAD, least_px_per_rad: f64::INFINITY, most_px_per_rad: 0.0 };
+        let mut image_rad = WIDEST_RAD;
+        let mut least_px_per_rad = f64::INFINITY;
+        // The largest scale up to each step.
+        let mut most_px_per_rad = vec![0.0];
         let mut before: Vec<DVec2> = ring(0).collect();
         let mut covered = false;
         for step in 1..=Self::STEPS {
             let here: Vec<DVec2> = ring(step).collect();
             let across_rad = turn_rad * (f64::from(step) * step_rad).sin();
+            let mut most: f64 = most_px_per_rad[step as usize - 1];
             for (k, (at, inner)) in here.iter().zip(&before).enumerate() {
                 let beside = here[(k + 1) % here.len()];
                 let across = at.distance(beside) / across_rad;
-                cone.most_px_per_rad =
-                    cone.most_px_per_rad.max(at.distance(*inner) / step_rad).max(across);
+                most = most.max(at.distance(*inner) / step_rad).max(across);
                 if covered {
                     let outwards = (at.length() - inner.length()) / step_rad;
-                    cone.least_px_per_rad = cone.least_px_per_rad.min(outwards);
+                    least_px_per_rad = least_px_per_rad.min(outwards);
                 }
             }
+            most_px_per_rad.push(most);
             if !covered && here.iter().all(|at| at.length() >= corner_px) {
                 covered = true;
-                cone.image_rad = f64::from(step) * step_rad;
+                image_rad = f64::from(step) * step_rad;
             }
             before = here;
         }
-        cone.most_px_per_rad *= 1.2;
-        cone.least_px_per_rad = if cone.least_px_per_rad.is_finite() {
-            (0.8 * cone.least_px_per_rad).max(0.0)
-        } else {
-            0.0
+        let scales = std::array::from_fn(|k| {
+            let wanted_rad = Self::WIDER_RAD.get(k).map_or(WIDEST_RAD, |wider| image_rad + wider);
+            let rad = wanted_rad.min(WIDEST_RAD);
+            let step = ((rad / step_rad).ceil() as usize).min(Self::STEPS as usize);
+            ScaleWithin { rad, most_px_per_rad: 1.2 * most_px_per_rad[step] }
+        });
+        let least_px_per_rad = match least_px_per_rad.is_finite() {
+            true => (0.8 * least_px_per_rad).max(0.0),
+            false => 0.0,
         };
-        cone
+        Self { image_rad, least_px_per_rad, scales }
     }
 }

@@ -8,6 +8,7 @@
 //! {"reference": "forward", "horizontal": [..], "vertical": [..]}
 //! ```
 
+use glam::DVec2;
 use serde::{Deserialize, Serialize};
 
 use super::{
@@ -28,6 +29,8 @@ pub struct Intrinsics {
     pub lens: Option<LensFields>,
     /// The windshield before the lens.
     pub windshield: Option<WindshieldFields>,
+    /// Width and height in native pixels; `None` for an image of native size.
+    pub native_size_px: Option<[f64; 2]>,
 }
 
 /// JSON of a lens.
@@ -97,7 +100,8 @@ impl Intrinsics {
         let pinhole = Pinhole { fx: focal("fx", 0)?, fy: focal("fy", 1)?, cx, cy };
         let windshield = self.windshield.as_ref().map(WindshieldFields::windshield).transpose()?;
         let [width_px, height_px] = self.size_px;
-        Ok(Camera { width_px, height_px, pinhole, lens, windshield })
+        let native_size_px = self.native_size_px.map(DVec2::from_array);
+        Ok(Camera { width_px, height_px, pinhole, lens, windshield, native_size_px })
     }
 
     /// The intrinsics of a camera.
@@ -109,6 +113,7 @@ impl Intrinsics {
             center_px: [cx, cy],
             lens: LensFields::of(&camera.lens),
             windshield: camera.windshield.as_ref().map(WindshieldFields::of),
+            native_size_px: camera.native_size_px.map(|size_px| size_px.to_array()),
         }
     }
 }

@@ -32,7 +32,7 @@ pub mod windshield;
 
 use glam::{DVec2, DVec3};
 
-pub use field::{FieldCone, FieldMask};
+pub use field::{FieldCone, FieldMask, ScaleWithin};
 pub use fisheye::Fisheye;
 pub use ftheta::{FTheta, FThetaReference};
 pub use monotone::MonotonePolynomial;
@@ -79,6 +79,10 @@ pub struct Camera {
     pub lens: Lens,
     /// The windshield before the lens.
     pub windshield: Option<Windshield>,
+    /// The image's width and height in pixels of the native image, that is, at the size at which the camera
+    /// takes images and twins are trained; `None` if that is its own size. An image below its native size is
+    /// rendered as the native image shrunk ([`Camera::native_scale`]).
+    pub native_size_px: Option<DVec2>,
 }
 
 /// How a lens maps the angle off its axis to the image.
@@ -166,7 +170,8 @@ impl Camera {
 
     /// A pinhole camera, not checked.
     pub fn from_pinhole(width_px: u32, height_px: u32, pinhole: Pinhole) -> Self {
-        Self { width_px, height_px, pinhole, lens: Lens::Pinhole, windshield: None }
+        let lens = Lens::Pinhole;
+        Self { width_px, height_px, pinhole, lens, windshield: None, native_size_px: None }
     }
 
     /// A pinhole camera from untrusted input, all in pixels.
@@ -198,6 +203,13 @@ impl Camera {
         }
         if let Some(windshield) = &self.windshield {
             windshield.check(self.corner_rad())?;
+        }
+        for value in self.native_size_px.map_or([1.0; 2], |size| size.to_array()) {
+            let in_range = value > 0.0 && value <= f64::from(Self::MAX_SIDE_PX);
+            if !in_range {
+                let must = "a side is above 0 and at most 16384 pixels";
+                return Err(CameraError::Intrinsic { field: "native_size", value, must });
+            }
         }
         if self.lens != Lens::Pinhole {
             // Sample the centres of a grid of 16 x 16 parts of the image.
@@ -312,7 +324,15 @@ impl Camera {
         DVec2::new(f64::from(self.width_px), f64::from(self.height_px))
     }
 
-    /// The camera with the same field of view and an image of another size, in pixels.
+    /// Sides of the image as shares of those of the native image, at most 1: an image that is larger than the
+    /// native one is rendered like a native one.
+    pub fn native_scale(&self) -> DVec2 {
+        let native_px = self.native_size_px.unwrap_or(self.size_px());
+        (self.size_px() / native_px).min(DVec2::ONE)
+    }
+
+    /// The camera with the same field of view and an image of another size, in pixels. The native size stays
+    /// what it was.
     ///
     /// # Errors
     /// The size or the scaled intrinsics are out of range.
@@ -327,7 +347,9 @@ impl Camera {
             *ftheta = ftheta.scaled(scale);
             (pinhole.fx, pinhole.fy) = ftheta.focal_px().into();
         }
-        let scaled = Self { width_px, height_px, pinhole, lens, ..*self };
+        let mut scaled = Self { width_px, height_px, pinhole, lens, ..*self };
+        let native_px = self.native_size_px.unwrap_or(self.size_px());
+        scaled.native_size_px = (native_px != scaled.size_px()).then_some(native_px);
         scaled.check()?;
         Ok(scaled)
     }
@@ -352,6 +374,8 @@ impl Camera {
         let mut cropped = Self { width_px, height_px, ..*self };
         cropped.pinhole.cx -= left as f64;
         cropped.pinhole.cy -= top as f64;
+        cropped.native_size_px =
+            self.native_size_px.map(|native_px| native_px * (cropped.size_px() / self.size_px()));
         cropped.check()?;
         Ok(cropped)
     }

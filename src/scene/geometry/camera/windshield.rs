@@ -18,6 +18,7 @@ pub struct Windshield {
     reference: WindshieldReference,
     horizontal: Bivariate,
     vertical: Bivariate,
+    most_rad: f64,
 }
 
 /// The direction of the reference polynomials.
@@ -60,7 +61,29 @@ impl Windshield {
 
     /// A windshield with coefficients in the order of [`Bivariate`].
     pub fn new(reference: WindshieldReference, horizontal: Bivariate, vertical: Bivariate) -> Self {
-        Self { reference, horizontal, vertical }
+        let mut windshield = Self { reference, horizontal, vertical, most_rad: 0.0 };
+        windshield.most_rad = windshield.sampled_most_rad();
+        windshield
+    }
+
+    /// A bound of the angle by which a ray is refracted, in radians: the largest of a thousand samples, and a
+    /// fifth more for what lies between them.
+    pub fn most_rad(&self) -> f64 {
+        self.most_rad
+    }
+
+    fn sampled_most_rad(&self) -> f64 {
+        let widest_rad = Self::FADES_Z[0].acos();
+        let by = |ring: u32, azimuth: u32| {
+            let (sin, cos) = (widest_rad * f64::from(ring) / 31.0).sin_cos();
+            let (y, x) = (std::f64::consts::TAU * f64::from(azimuth) / 32.0).sin_cos();
+            let ray = DVec3::new(x * sin, y * sin, cos);
+            let to = self.turned(angles(ray));
+            let (x, y) = (to.x.sin(), to.y.sin());
+            DVec3::new(x, y, (1.0 - x * x - y * y).max(0.0).sqrt()).angle_between(ray)
+        };
+        let samples = (0..32).flat_map(|ring| (0..32).map(move |azimuth| by(ring, azimuth)));
+        1.2 * samples.fold(0.0, f64::max)
     }
 
     /// The direction of the polynomials.

@@ -1,0 +1,73 @@
+//! Parts of a frame: the views that are rendered together, so that what lies between the stages stays small.
+
+use rayon::prelude::*;
+
+use super::background::Background;
+use crate::layout::Frustum;
+use crate::unscented::UnscentedView;
+use crate::{Frame, View, limits};
+use wildcity_scene::chunk::{CLUSTER, Cluster};
+
+/// Some of a frame's views, which are rendered together.
+#[derive(Clone, Copy)]
+pub(super) struct FramePart<'a> {
+    /// The frame with these views only.
+    pub(super) frame: Frame<'a>,
+    /// One per view of the part, or none.
+    pub(super) backgrounds: &'a [Background],
+    /// Index of the part's first view in the whole frame.
+    pub(super) first_view: usize,
+}
+
+impl FramePart<'_> {
+    /// The same in two parts.
+    pub(super) fn halves(&self) -> [Self; 2] {
+        let middle = self.frame.views.len() / 2;
+        let (first, second) = self.frame.views.split_at(middle);
+        let (behind_first, behind_second) = match self.backgrounds.is_empty() {
+            true => (self.backgrounds, self.backgrounds),
+            false => self.backgrounds.split_at(middle),
+        };
+        let part = |views, backgrounds, first_view| Self {
+            frame: Frame { views, ..self.frame },
+            backgrounds,
+            first_view,
+        };
+        [
+            part(first, behind_first, self.first_view),
+            part(second, behind_second, self.first_view + middle),
+        ]
+    }
+
+    /// A bound of its splats: all Gaussians of actors and of the clusters that its views may see. Small scenes are not
+    /// looked at, but have a bound below [`limits::FRAME_SPLATS`].
+    pub(super) fn max_splats(&self) -> usize {
+        let Frame { scene, views, .. } = self.frame;
+        let all = scene.gaussians() * views.len();
+        if all <= limits::FRAME_SPLATS {
+            return all;
+        }
+        let of_actors: usize = scene.placed.iter().map(|placed| placed.chunk.len()).sum();
+        let of_twin: usize = views.par_iter().map(|view| self.visible_gaussians(view)).sum();
+        of_twin + of_actors * views.len()
+    }
+
+    /// Gaussians of the twin's clusters that a view may see.
+    fn visible_gaussians(&self, view: &View) -> usize {
+        let Frame { scene, profile, .. } = self.frame;
+        let unscented = UnscentedView::new(view, profile);
+        let mut clusters = 0;
+        for chunk in &scene.chunks {
+            let frustum = Frustum::new(view, chunk, profile);
+            let may_see = |cluster: &&Cluster| {
+                let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
+                match &unscented {
+                    Some(unscented) => unscented.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
+                    None => frustum.may_see(min_m, max_m, sigma_m),
+                }
+            };
+            clusters += chunk.clusters().iter().filter(may_see).count();
+        }
+        clusters * CLUSTER
+    }
+}
