@@ -68,7 +68,8 @@ Examples:
 #[derive(Debug, Subcommand)]
 enum Command {
     Demo(demo::Demo),
-    Serve(serve::Serve),
+    // It has the most options.
+    Serve(Box<serve::Serve>),
     View(view::View),
     Import(import::Import),
     Inspect(inspect::Inspect),
