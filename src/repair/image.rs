@@ -79,9 +79,10 @@ impl<'a> View<'a> {
             let Some(image) = image else { continue };
             let is_equal = image.width == width && image.height == height;
             if !is_equal || image.rgb8.len() != 3 * pixels {
-                let (w, h, bytes) = (image.width, image.height, image.rgb8.len());
+                let Image { width: w, height: h, rgb8 } = image;
                 let message = format!(
-                    "{w} x {h} px in {bytes} bytes; {width} x {height} px in {} bytes are needed",
+                    "{w} x {h} px in {} bytes; {width} x {height} px in {} bytes are needed",
+                    rgb8.len(),
                     3 * pixels
                 );
                 return Err(RepairError::Input { field: field.to_owned(), message });

@@ -48,15 +48,15 @@ impl Selection {
             }
         }
         if self.above < self.below {
-            let (above, below) = (self.above, self.below);
+            let Selection { above, below, .. } = self;
             return Err(format!(
                 "above: {above:?} is less than below ({below:?}); give at least {below:?}"
             ));
         }
         if self.at_least > self.below {
-            let (least, below) = (self.at_least, self.below);
+            let Selection { at_least, below, .. } = self;
             return Err(format!(
-                "at_least: {least:?} is more than below ({below:?}); nothing would be repaired"
+                "at_least: {at_least:?} is more than below ({below:?}); nothing would be repaired"
             ));
         }
         Ok(())

@@ -73,13 +73,14 @@ pub(crate) fn image_shape(layout: Layout, channels: i64, [height, width]: [i64; 
     }
 }
 
-/// What is wrong with a shape of the graph, if anything. -1 agrees with every size. A shape of rank 0 may be
-/// one that the graph does not declare, so the probe run decides.
+/// What is wrong with a shape of the graph, if anything. -1 in the graph agrees with every size; -1 in the
+/// manifest does not agree with a size of the graph, since images have many. A shape of rank 0 may be one that
+/// the graph does not declare, so the probe run decides.
 fn wrong_shape(graph: &[i64], manifest: &[i64]) -> Option<String> {
     if graph.is_empty() {
         return None;
     }
-    let agrees = |(a, b): (&i64, &i64)| *a == -1 || *b == -1 || a == b;
+    let agrees = |(a, b): (&i64, &i64)| *a == -1 || a == b;
     let is_equal = graph.len() == manifest.len() && graph.iter().zip(manifest).all(agrees);
     (!is_equal).then(|| {
         format!(

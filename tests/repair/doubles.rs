@@ -1,13 +1,14 @@
 //! Graphs that stand in for models: each does one thing.
 
 use crate::protobuf::{
-    BOOL, Dim, F16, F32, Graph, I64, floats, graph_attribute, int, ints, node, port, tensor,
+    BOOL, Dim, F16, F32, Graph, I64, Message, floats, graph_attribute, int, ints, node, port,
+    tensor,
 };
 
 const IMAGE: [Dim; 4] = [Some(1), Some(3), None, None];
 
 /// One input, one output, both RGB in f32.
-fn rgb(nodes: Vec<crate::protobuf::Message>, constants: Vec<crate::protobuf::Message>) -> Vec<u8> {
+fn rgb(nodes: Vec<Message>, constants: Vec<Message>) -> Vec<u8> {
     let inputs = vec![port("image", F32, &IMAGE)];
     let outputs = vec![port("repaired", F32, &[Some(1), None, None, None])];
     Graph { nodes, constants, inputs, outputs }.onnx()
@@ -80,6 +81,24 @@ pub(crate) fn global() -> Vec<u8> {
 
 /// Adds 1e-9 a trillion times, in a loop that looks at the image: it never ends.
 pub(crate) fn endless() -> Vec<u8> {
+    let trips = tensor("trips", I64, &[], &1_000_000_000_000_u64.to_le_bytes());
+    add_in_a_loop(Vec::new(), vec![trips])
+}
+
+/// The same if a value is 0.9 or more; else the image itself.
+pub(crate) fn endless_if_bright() -> Vec<u8> {
+    let nodes = vec![
+        node("ReduceMax", &["image"], &["max"], &[int("keepdims", 0)]),
+        node("Div", &["max", "limit"], &["ratio"], &[]),
+        node("Floor", &["ratio"], &["is_bright"], &[]),
+        node("Mul", &["is_bright", "many"], &["count"], &[]),
+        node("Cast", &["count"], &["trips"], &[int("to", I64)]),
+    ];
+    add_in_a_loop(nodes, vec![floats("limit", &[], &[0.9]), floats("many", &[], &[1e12])])
+}
+
+/// A loop with as many iterations as `trips` says.
+fn add_in_a_loop(mut nodes: Vec<Message>, mut constants: Vec<Message>) -> Vec<u8> {
     let body = Graph {
         nodes: vec![
             node("Identity", &["go_on"], &["go_on_out"], &[]),
@@ -94,9 +113,9 @@ pub(crate) fn endless() -> Vec<u8> {
         outputs: vec![port("go_on_out", BOOL, &[]), port("sum_out", F32, &IMAGE)],
     };
     let body = graph_attribute("body", &body.message());
-    let trips = tensor("trips", I64, &[], &1_000_000_000_000_u64.to_le_bytes());
-    let go = tensor("go", BOOL, &[], &[1]);
-    rgb(vec![node("Loop", &["trips", "go", "image"], &["repaired"], &[body])], vec![trips, go])
+    nodes.push(node("Loop", &["trips", "go", "image"], &["repaired"], &[body]));
+    constants.push(tensor("go", BOOL, &[], &[1]));
+    rgb(nodes, constants)
 }
 
 /// The signature of Difix: `image` and `reference` in f16, -1 to 1. The reference works on all pixels, as

@@ -119,6 +119,26 @@ fn a_model_that_never_ends_is_stopped_at_its_time_limit() {
 }
 
 #[test]
+fn a_stopped_run_leaves_the_model_as_it_was_until_there_were_ten() {
+    let changes = json!({
+        "timeout_ms": 300, "inputs": [{"name": "image", "role": "rgb", "range": [0, 0.9]}],
+        "outputs": [{"name": "repaired", "role": "rgb", "range": [0, 0.9]}],
+    });
+    let model = Folder::new(&doubles::endless_if_bright(), changes).load().unwrap();
+    let dark = picture(40, 30);
+    let bright = Image { width: 1, height: 1, rgb8: vec![255; 3] };
+    for _ in 1..10 {
+        assert_eq!(model.repair(&View::new(&dark)).unwrap().image, dark);
+        let error = model.repair(&View::new(&bright)).unwrap_err();
+        assert_eq!(error, RepairError::TimedOut { limit_ms: 300 });
+    }
+    for image in [&bright, &dark] {
+        let error = model.repair(&View::new(image)).unwrap_err();
+        assert!(matches!(error, RepairError::Withdrawn { .. }), "{error}");
+    }
+}
+
+#[test]
 fn a_file_that_is_no_graph_is_refused() {
     let error = Folder::new(b"no graph", json!({})).load().unwrap_err();
     assert!(matches!(error, RepairError::Graph { .. }), "{error}");

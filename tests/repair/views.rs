@@ -33,29 +33,29 @@ fn ranges_layouts_and_roles_of_the_output_mean_what_the_manifest_says() {
         let model = Folder::new(&onnx, changes).load().unwrap();
         model.repair(&View::new(&image)).unwrap().image.rgb8
     };
-    // 0.5 more of a range of 1 is 127.5 more of 255, clamped.
-    let half = repaired(doubles::arithmetic("Add", 0.5), json!({}));
-    assert_eq!(half, [128, 138, 148, 228, 255, 255]);
+    // 0.4 more of a range of 1 is 102 more of 255, clamped.
+    let more = repaired(doubles::arithmetic("Add", 0.4), json!({}));
+    assert_eq!(more, [102, 112, 122, 202, 255, 255]);
     // Of a range of 2 it is half of that.
     let wide = json!({
         "inputs": [{"name": "image", "role": "rgb", "range": [-1, 1]}],
         "outputs": [{"name": "repaired", "role": "rgb", "range": [-1, 1]}],
     });
-    assert_eq!(repaired(doubles::arithmetic("Add", 0.5), wide), [64, 74, 84, 164, 255, 255]);
+    assert_eq!(repaired(doubles::arithmetic("Add", 0.4), wide), [51, 61, 71, 151, 251, 255]);
     // A residual of the image itself doubles it.
     let residual =
         json!({"merge": "residual", "outputs": [{"name": "repaired", "role": "residual"}]});
     assert_eq!(repaired(doubles::identity(), residual), [0, 20, 40, 200, 255, 255]);
     let residual = json!({"merge": "residual"});
-    assert_eq!(repaired(doubles::arithmetic("Mul", 0.5), residual), [0, 5, 10, 50, 100, 128]);
+    assert_eq!(repaired(doubles::arithmetic("Mul", 0.4), residual), [0, 4, 8, 40, 80, 102]);
 }
 
 #[test]
 fn outside_the_mask_the_image_is_black() {
     let image = Image { width: 2, height: 1, rgb8: vec![9; 6] };
-    let model = Folder::new(&doubles::arithmetic("Add", 0.5), json!({})).load().unwrap();
+    let model = Folder::new(&doubles::arithmetic("Add", 0.4), json!({})).load().unwrap();
     let view = View { mask: Some(&[1.0, 0.0]), ..View::new(&image) };
-    assert_eq!(model.repair(&view).unwrap().image.rgb8, [137, 137, 137, 0, 0, 0]);
+    assert_eq!(model.repair(&view).unwrap().image.rgb8, [111, 111, 111, 0, 0, 0]);
 }
 
 #[test]
