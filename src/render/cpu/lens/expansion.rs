@@ -305,12 +305,7 @@ impl LensProjection {
 
 /// Rows that take displacements of points with slopes x, y at a depth of 1/`inverse` to (a, b, c).
 #[inline(always)]
-fn slope_rows<S: Simd>(
-    simd: S,
-    x: f32x16<S>,
-    y: f32x16<S>,
-    inverse: f32x16<S>,
-) -> [Vec3x16<S>; 3] {
+fn slope_rows<S: Simd>(simd: S, x: f32x16<S>, y: f32x16<S>, inverse: f32x16<S>) -> [Vec3x16<S>; 3] {
     let zero = f32x16::splat(simd, 0.0);
     [
         Vec3x16 { x: inverse, y: zero, z: -(x * inverse) },
