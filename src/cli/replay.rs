@@ -110,7 +110,7 @@ impl Replay {
 }
 
 fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> {
-    let RecordedEpisode { header, frames, versions, end } = recording;
+    let RecordedEpisode { header, frames, versions, end, .. } = recording;
     let cameras: Vec<_> = header.rig.cameras.iter().map(|camera| &*camera.name).collect();
     let images: usize = frames.iter().map(|frame| frame.images.len()).sum();
     writeln!(out, "session     {}, seed {}", header.session, header.seed)?;
