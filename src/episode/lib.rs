@@ -31,5 +31,5 @@ pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list};
+pub use listing::{Listed, list, text};
 pub use outcome::result;

@@ -210,8 +210,9 @@ impl Connection {
                 let session = session.ok_or(NO_SESSION)?;
                 self.slot = None;
                 tracing::info!(session = session.name(), "closed");
+                let episode = session.episode_name();
                 let summary = session.close(Outcome::Completed).await;
-                Ok(Answer::Text(convert::closed(seq, &summary)?.into()))
+                Ok(Answer::Text(convert::closed(seq, &summary, episode)?.into()))
             }
         }
     }

@@ -148,6 +148,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UnsupportedProtocol { .. } => at(Code::UnsupportedProtocol, "protocols"),
         Fault::SessionState(_) | Fault::Replaced => plain(Code::SessionState),
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
+        // The list of codes is closed, and episodes are named by their sessions.
+        Fault::UnknownEpisode { .. } => at(Code::UnknownSession, "episode"),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {

@@ -182,6 +182,11 @@ impl Session {
         self.deadline
     }
 
+    /// Name of the current episode's record; `None` before its first frame.
+    pub fn episode_name(&self) -> Option<String> {
+        self.recorder.as_ref().map(|_| format!("{}-{}", self.name, self.episode_number))
+    }
+
     /// The current episode.
     pub fn episode(&self) -> &Episode {
         &self.episode
