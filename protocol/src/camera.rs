@@ -53,19 +53,24 @@ pub enum FthetaReference {
     PixelToAngle,
 }
 
-/// Colour correction of a camera: `matrix * rgb + offset`, on linear red, green and blue from 0 to 1.
+/// Colour correction of a camera: `matrix * rgb + offset`, on the red, green and blue that the scene stores, from 0
+/// to 1. They are display-referred, as in the training photographs, and not proportional to light.
 /// Requests give the matrix, or a gain per channel instead; answers have the matrix.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(transform = crate::message::matrix_or_gain))]
 pub struct Exposure {
     /// The matrix, row by row.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(inner(inner(range(min = -100.0, max = 100.0)))))]
     pub matrix: Option<[[f64; 3]; 3]>,
     /// Gain of red, green and blue, instead of the matrix.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(inner(range(min = -100.0, max = 100.0))))]
     pub gain: Option<[f64; 3]>,
     /// Added to each channel after the matrix or gain.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schemars(inner(range(min = -100.0, max = 100.0))))]
     pub offset: [f64; 3],
 }
 
@@ -76,8 +81,10 @@ pub struct Windshield {
     /// Which rays the polynomials map to which.
     pub reference: WindshieldReference,
     /// Coefficients of the polynomial for the angle to the right.
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 21)))]
     pub horizontal: Vec<f64>,
     /// Coefficients of the polynomial for the angle downwards.
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 21)))]
     pub vertical: Vec<f64>,
 }
 
@@ -99,6 +106,7 @@ pub struct Shutter {
     /// The order in which rows or columns are exposed.
     pub direction: ShutterDirection,
     /// Time from the exposure of the first row (or column) to that of the last, in microseconds.
+    #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 100_000)))]
     pub duration_us: i64,
 }
 

@@ -1,41 +1,11 @@
-//! Parsing of requests with errors that name the mistake: fields that accept one of two forms, and fields
-//! that do not exist.
+//! Deserialization of fields that accept one of two forms.
 
 use std::fmt;
 
 use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDeserializer};
 use serde::{Deserialize, Deserializer};
-use serde_json::Value;
 
 use crate::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
-
-/// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
-///
-/// Answers may gain fields, so the types that requests share with answers ignore unknown ones. `understood`
-/// is the parsed request written as JSON again: a field that is missing there was ignored.
-pub fn unknown_field(sent: &Value, understood: &Value) -> Option<String> {
-    match (sent, understood) {
-        (Value::Object(sent), Value::Object(understood)) => {
-            sent.iter().find_map(|(name, value)| match understood.get(name) {
-                Some(same) => unknown_field(value, same).map(|path| join(name, &path)),
-                // An option that is `null` is left out when it is written again.
-                None if value.is_null() => None,
-                None => Some(name.clone()),
-            })
-        }
-        (Value::Array(sent), Value::Array(understood)) => {
-            sent.iter().zip(understood).enumerate().find_map(|(index, (value, same))| {
-                unknown_field(value, same).map(|path| join(&format!("[{index}]"), &path))
-            })
-        }
-        _ => None,
-    }
-}
-
-fn join(outer: &str, inner: &str) -> String {
-    let dot = if inner.starts_with('[') { "" } else { "." };
-    format!("{outer}{dot}{inner}")
-}
 
 /// Decided by the fields that are present. Serde's own `untagged` tries one variant after the other, and
 /// cannot say what was wrong with each.

@@ -3,7 +3,7 @@
 //! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server, matched by
 //! `seq`. Binary frames are [observations](observation). [`http`] has the bodies of HTTP requests and answers
 //! for uploads, pushes and versions. `protocol/README.md` describes the protocol; the JSON schemas beside it
-//! are generated from these types.
+//! are generated from these types, and [`decode`] compares what clients send with them.
 //!
 //! ```
 //! use wildcity_protocol::message::{Pose, Request};
@@ -23,14 +23,13 @@
 //! ```
 
 pub mod camera;
+pub mod decode;
 mod deserialize;
 pub mod error;
 pub mod http;
 pub mod limits;
 pub mod message;
 pub mod observation;
-
-pub use deserialize::unknown_field;
 
 /// Name of the WebSocket subprotocol. It is also the only protocol version so far.
 pub const PROTOCOL: &str = "wildcity.v1";

@@ -24,7 +24,10 @@ const EDGE_SHARE: f64 = 0.01;
 const ROWS: usize = 64;
 
 /// Writes unit normals `[height, width, 3]` in the axes of the camera at the end of its exposure (x right, y
-/// down, z forward), towards the camera; 0 where a pixel or all its neighbours have no depth.
+/// down, z forward), towards the camera; 0 where a pixel has no depth.
+///
+/// A pixel without a neighbour to compare with, in its row or in its column, does not show how its surface is
+/// inclined in that direction. The surface is then taken as facing the camera there.
 ///
 /// `depth_m` is `[height, width]`, 0 where there is no surface.
 pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
@@ -43,12 +46,17 @@ pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
                     |other: &Option<Vec<Option<Point>>>| other.as_ref().and_then(|o| o[x]);
                 let left = x.checked_sub(1).and_then(|x| here[x]);
                 let right = here.get(x + 1).copied().flatten();
-                let normal_here = here[x].and_then(|point| {
-                    let across = tangent(left, point, right)?;
-                    let down = tangent(column_of(&above), point, column_of(&below))?;
-                    let facing = down.cross(across).try_normalize()?;
+                let normal_here = here[x].map(|point| {
+                    let across = tangent(left, point, right);
+                    let down = tangent(column_of(&above), point, column_of(&below));
+                    let of_plane = match (across, down) {
+                        (Some(across), Some(down)) => down.cross(across).try_normalize(),
+                        (Some(one), None) | (None, Some(one)) => perpendicular(point.ray, one),
+                        (None, None) => None,
+                    };
+                    let facing = of_plane.unwrap_or_else(|| -point.ray.normalize_or_zero());
                     // Of the two normals, the one that points towards the camera.
-                    Some(if facing.dot(point.ray) > 0.0 { -facing } else { facing })
+                    if facing.dot(point.ray) > 0.0 { -facing } else { facing }
                 });
                 normal.copy_from_slice(&normal_here.unwrap_or_default().as_vec3().to_array());
             }
@@ -95,6 +103,13 @@ fn points(view: &View, depth_m: &[f32], row: usize) -> Vec<Option<Point>> {
         Some(Point { at_m, ray, inverse_depth: 1.0 / depth_m })
     };
     depth_m[row * width..][..width].iter().enumerate().map(point).collect()
+}
+
+/// The unit vector perpendicular to a vector along the surface that is closest to the ray's line. `None` if the
+/// surface is along the ray.
+fn perpendicular(ray: DVec3, along: DVec3) -> Option<DVec3> {
+    let along = along.try_normalize()?;
+    (ray - along * ray.dot(along)).try_normalize()
 }
 
 /// A vector along the surface: from one neighbour to the other, or between the pixel and the neighbour that

@@ -262,9 +262,17 @@ impl ProfileOverrides {
             let Value::Object(mut fields) = whole else {
                 return Err(bad("the profile is no object".to_owned()));
             };
-            fields.insert(field.clone(), value.clone());
+            let was = fields.insert(field.clone(), value.clone());
             let whole = serde_json::from_value(Value::Object(fields));
-            changed = whole.map_err(|e| bad(e.to_string()))?;
+            changed = whole.map_err(|_| {
+                bad(match was {
+                    _ if !RenderProfile::KEYS.contains(&field.as_str()) => {
+                        "there is no such field".to_owned()
+                    }
+                    Some(Value::Bool(_)) => format!("{value} is not true or false"),
+                    _ => format!("{value} is not a number"),
+                })
+            })?;
         }
         changed.check()?;
         Ok(changed)

@@ -179,7 +179,8 @@ impl Grant {
             return Ok(());
         }
         let needs = role.name();
-        Err(Fault::Forbidden { reason: format!("its role is {}, not {needs}", self.role.name()) })
+        let reason = format!("its role is {}, not {needs}", self.role.name());
+        Err(Fault::Forbidden { field: "authorization", reason })
     }
 
     /// Requires access to a twin.
@@ -190,7 +191,10 @@ impl Grant {
         if self.allows_twin(twin) {
             return Ok(());
         }
-        Err(Fault::Forbidden { reason: format!("it does not include twin {twin:?}") })
+        Err(Fault::Forbidden {
+            field: "twin",
+            reason: format!("it does not include twin {twin:?}"),
+        })
     }
 
     /// Whether the token may use the twin. Lists of twins leave out those that it may not use.

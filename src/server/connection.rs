@@ -1,8 +1,8 @@
 //! One agent, in lock step: read a request, answer it.
 //!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
-//! repeats one that was refused. A request that was carried out is never carried out again: if its
-//! number is repeated, the stored answer is sent again.
+//! repeats one that was refused since the last one that was carried out. A request that was carried out is
+//! never carried out again: if its number is repeated, the stored answer is sent again.
 
 use std::future::pending;
 use std::sync::Arc;
@@ -14,6 +14,7 @@ use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptio
 use crate::auth::Grant;
 use crate::convert::{self, Command, Parsed};
 use crate::fault::Fault;
+use crate::inbox::Inbox;
 use crate::limits;
 use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
 use crate::socket::{Disconnect, Incoming, Socket};
@@ -22,9 +23,9 @@ use crate::state::ServerState;
 /// Serves a client until the connection ends. An open session is parked then.
 pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Grant>) {
     let hello_deadline = Instant::now() + state.limits.hello;
+    let mut inbox = Inbox::new(socket);
     let mut connection = Connection {
         state,
-        socket,
         grant,
         hello_deadline,
         hello_done: false,
@@ -32,13 +33,12 @@ pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Gr
         last: None,
         slot: None,
     };
-    let reason = connection.run().await;
-    connection.end(reason).await;
+    let reason = connection.run(&mut inbox).await;
+    connection.end(inbox.socket, reason).await;
 }
 
 struct Connection {
     state: Arc<ServerState>,
-    socket: Socket,
     grant: Arc<Grant>,
     /// Time by which `hello` must have arrived; other messages before it do not extend it.
     hello_deadline: Instant,
@@ -50,16 +50,28 @@ struct Connection {
     slot: Option<SlotGuard>,
 }
 
+/// A request that was refused.
+struct Refusal {
+    /// Its number, if that could be read.
+    seq: Option<u64>,
+    fault: Fault,
+}
+
 const NO_SESSION: Fault = Fault::SessionState("no session is open; send open or resume");
 
 impl Connection {
     /// Answers requests until the connection ends; returns why it did.
-    async fn run(&mut self) -> Disconnect {
+    async fn run(&mut self, inbox: &mut Inbox) -> Disconnect {
         loop {
-            let handled = match self.next_request().await {
-                Ok(text) => self.handle(&text).await,
+            let handled = match self.next_request(inbox).await {
+                Ok(text) => match inbox.during(self.handle(&text)).await {
+                    Ok(answer) => self.send(&mut inbox.socket, &answer).await,
+                    Err(Refusal { seq, fault }) => {
+                        self.refuse(&mut inbox.socket, seq, &fault).await
+                    }
+                },
                 Err(Disconnect::Fault(fault)) if !fault.is_fatal() => {
-                    self.refuse(None, &fault).await
+                    self.refuse(&mut inbox.socket, None, &fault).await
                 }
                 Err(reason) => Err(reason),
             };
@@ -69,7 +81,7 @@ impl Connection {
         }
     }
 
-    async fn next_request(&mut self) -> Result<String, Disconnect> {
+    async fn next_request(&mut self, inbox: &mut Inbox) -> Result<String, Disconnect> {
         let idle = self.state.limits.idle;
         let awaited = if self.hello_done { "request" } else { "hello" };
         let mut deadline =
@@ -82,7 +94,7 @@ impl Connection {
                 }
             };
             let fault = tokio::select! {
-                incoming = self.socket.receive() => match incoming? {
+                incoming = inbox.next() => match incoming? {
                     Incoming::Text(text) => return Ok(text),
                     Incoming::Alive => {
                         if self.hello_done {
@@ -99,8 +111,8 @@ impl Connection {
         }
     }
 
-    /// Answers one request.
-    async fn handle(&mut self, text: &str) -> Result<(), Disconnect> {
+    /// Carries out one request, or finds the answer that it had.
+    async fn handle(&mut self, text: &str) -> Result<Answer, Refusal> {
         let parsed = if text.len() <= limits::INLINE_REQUEST_BYTES {
             convert::parse(text)
         } else {
@@ -110,61 +122,64 @@ impl Connection {
         };
         let (seq, command) = match parsed {
             Parsed::Numbered { seq, command } => (seq, command),
-            Parsed::Unnumbered(fault) => return self.refuse(None, &fault).await,
+            Parsed::Unnumbered(fault) => return Err(Refusal { seq: None, fault }),
         };
 
         // A repeated request gets the stored answer.
         if let Some(last) = &self.last
             && last.seq == seq
         {
-            let answer = last.answer.clone();
-            return self.send(&answer).await;
+            return Ok(last.answer.clone());
         }
-        if let Err(fault) = self.check_order(seq) {
-            return self.refuse(Some(seq), &fault).await;
-        }
+        let refusal = |fault| Refusal { seq: Some(seq), fault };
+        self.check_order(seq).map_err(refusal)?;
 
         // Carries the request out.
         self.answered_seq = Some(seq);
         if let Some(slot) = &mut self.slot {
             slot.answered_seq = seq;
         }
-        let is_resume = matches!(command, Ok(Command::Resume { .. }));
-        let carried_out = match command {
-            Ok(command) => self.carry_out(seq, command).await,
-            Err(fault) => Err(fault),
-        };
-        let answer = match carried_out {
-            Ok(answer) => answer,
-            Err(fault) => return self.refuse(Some(seq), &fault).await,
-        };
+        let command = command.map_err(refusal)?;
+        // `resume` itself sets the numbers: they continue those of the session.
+        let is_resume = matches!(command, Command::Resume { .. });
+        let answer = self.carry_out(seq, command).await.map_err(refusal)?;
 
         // Stores the answer in the slot too, where it survives the connection.
         if let Some(slot) = &self.slot {
             slot.update_view();
         }
-        if is_resume {
-            // From here on, request numbers continue those of the session.
-            self.last = self.slot.as_ref().and_then(|slot| slot.last.clone());
-            self.answered_seq = self.slot.as_ref().map(|slot| slot.answered_seq);
-        } else {
+        if !is_resume {
             self.last = Some(AnsweredRequest { seq, answer: answer.clone() });
             if let Some(slot) = &mut self.slot {
                 slot.last = self.last.clone();
                 slot.answered_seq = seq;
             }
         }
-        self.send(&answer).await
+        Ok(answer)
     }
 
+    /// Accepts the numbers after the last request that was carried out, up to the one after the last answer: all
+    /// those between them were refused, and can be used again.
     fn check_order(&self, seq: u64) -> Result<(), Fault> {
-        let expected = match self.answered_seq {
-            None if seq == 0 => return Ok(()),
-            None => "the first request of a connection is 0".to_owned(),
-            Some(last) if seq == last || Some(seq) == last.checked_add(1) => return Ok(()),
-            Some(last) => format!("{last} was the last: repeat it, or go on with the next"),
+        let expected = match (&self.last, self.answered_seq) {
+            (None, None) if seq == 0 => return Ok(()),
+            (None, None) => "the first request of a connection is 0".to_owned(),
+            (last, answered) => {
+                let first = last.as_ref().map_or(0, |last| last.seq.saturating_add(1));
+                let next = answered.map_or(first, |answered| answered.saturating_add(1));
+                if (first..=next).contains(&seq) {
+                    return Ok(());
+                }
+                let repeated = last.as_ref().map(|last| last.seq);
+                let repeated =
+                    repeated.map_or(String::new(), |last| format!(", or repeat request {last}"));
+                match first == next {
+                    true => format!("the next request is {next}{repeated}"),
+                    false => format!("go on with {first} to {next}{repeated}"),
+                }
+            }
         };
-        Err(Fault::SeqOutOfOrder { seq, expected })
+        Err(Fault::SeqOutOfOrder { field: "seq", seq, expected })
     }
 
     async fn carry_out(&mut self, seq: u64, command: Command) -> Result<Answer, Fault> {
@@ -209,10 +224,15 @@ impl Connection {
                 let session = self.slot.as_mut().and_then(|slot| slot.session.take());
                 let session = session.ok_or(NO_SESSION)?;
                 self.slot = None;
-                tracing::info!(session = session.name(), "closed");
+                let name = session.name().to_owned();
+                tracing::info!(session = name, "closed");
                 let episode = session.episode_name();
                 let summary = session.close(Outcome::Completed).await;
-                Ok(Answer::Text(convert::closed(seq, &summary, episode)?.into()))
+                let answer = Answer::Text(convert::closed(seq, &summary, episode)?.into());
+                let last = AnsweredRequest { seq, answer: answer.clone() };
+                let owner = &self.grant.name;
+                self.state.sessions.remember_closed(name, owner, last, &summary);
+                Ok(answer)
             }
         }
     }
@@ -250,17 +270,32 @@ impl Connection {
         Ok(Answer::Text(text.into()))
     }
 
+    /// Continues a session, or the numbers of one whose `close` was carried out: its answer may have been lost.
     async fn resume(&mut self, seq: u64, name: &str, last_seq: u64) -> Result<Answer, Fault> {
         let max_wait = self.state.limits.step;
-        let slot = self.state.sessions.resume(name, &self.grant.name, max_wait).await?;
-        if last_seq > slot.answered_seq {
-            let expected = format!("{} is the session's last answer", slot.answered_seq);
-            return Err(Fault::SeqOutOfOrder { seq: last_seq, expected });
+        let check = |answered_seq: u64| {
+            if last_seq > answered_seq {
+                let expected = format!("{answered_seq} is the session's last answer");
+                return Err(Fault::SeqOutOfOrder { field: "last_seq", seq: last_seq, expected });
+            }
+            Ok(())
+        };
+        if let Some(closed) = self.state.sessions.closed(name, &self.grant.name) {
+            check(closed.last.seq)?;
+            let text = convert::resumed(seq, name, closed.last.seq, closed.steps, closed.time_us)?;
+            self.answered_seq = Some(closed.last.seq);
+            self.last = Some(closed.last);
+            return Ok(Answer::Text(text.into()));
         }
+        let slot = self.state.sessions.resume(name, &self.grant.name, max_wait).await?;
+        check(slot.answered_seq)?;
         let carried_out = slot.last.as_ref().map_or(slot.answered_seq, |last| last.seq);
         let session = slot.session.as_ref().ok_or(NO_SESSION)?;
-        let text = convert::resumed(seq, carried_out, session)?;
+        let episode = session.episode();
+        let text = convert::resumed(seq, name, carried_out, episode.step(), episode.time_us())?;
         tracing::info!(session = session.name(), "resumed");
+        self.last = slot.last.clone();
+        self.answered_seq = Some(slot.answered_seq);
         self.slot = Some(slot);
         Ok(Answer::Text(text.into()))
     }
@@ -274,26 +309,30 @@ impl Connection {
         Ok(Answer::Observation(Arc::new(frame)))
     }
 
-    async fn send(&mut self, answer: &Answer) -> Result<(), Disconnect> {
+    async fn send(&self, socket: &mut Socket, answer: &Answer) -> Result<(), Disconnect> {
         match answer {
-            Answer::Text(text) => self.socket.send_text(text).await,
+            Answer::Text(text) => socket.send_text(text).await,
             Answer::Observation(frame) => {
                 let bytes = frame.buffer.bytes();
                 self.state.metrics.observation_bytes.inc_by(bytes.len() as u64);
-                self.socket.send_binary(bytes).await
+                socket.send_binary(bytes).await
             }
         }
     }
 
-    async fn refuse(&mut self, seq: Option<u64>, fault: &Fault) -> Result<(), Disconnect> {
+    async fn refuse(
+        &self,
+        socket: &mut Socket,
+        seq: Option<u64>,
+        fault: &Fault,
+    ) -> Result<(), Disconnect> {
         tracing::debug!(seq, "refused: {fault}");
         self.state.metrics.refused(&convert::code(fault).0);
-        self.socket.send_text(&convert::refused(seq, fault)).await
+        socket.send_text(&convert::refused(seq, fault)).await
     }
 
     /// Parks the session, sends the reason to the client if that is possible, and closes the socket.
-    async fn end(mut self, reason: Disconnect) {
-        let can_send = !matches!(reason, Disconnect::SendTimedOut);
+    async fn end(mut self, mut socket: Socket, reason: Disconnect) {
         let outcome = match &reason {
             Disconnect::PeerLeft | Disconnect::Fault(Fault::Replaced) => Outcome::AgentLost,
             Disconnect::SendTimedOut | Disconnect::Fault(Fault::TimedOut(_)) => {
@@ -307,13 +346,15 @@ impl Connection {
             tracing::info!(?reason, "the connection of a session ended");
             slot.outcome = outcome;
         }
-        if let Disconnect::Fault(fault) = &reason
-            && self.refuse(None, fault).await.is_err()
-        {
-            return;
-        }
-        if can_send {
-            self.socket.close().await;
+        match &reason {
+            Disconnect::Fault(fault) => {
+                if self.refuse(&mut socket, None, fault).await.is_ok() {
+                    socket.close(Some(convert::close_status(fault))).await;
+                }
+            }
+            Disconnect::PeerLeft => socket.close(None).await,
+            // A part of a message was sent: nothing can follow it.
+            Disconnect::SendTimedOut => {}
         }
     }
 }

@@ -38,9 +38,14 @@ pub(crate) enum Fault {
     /// The bytes are not WebSocket.
     #[error("not WebSocket: {0}")]
     BrokenFrame(String),
+    /// A text message, or the reason of a Close frame, is not UTF-8.
+    #[error("not UTF-8: a text message has to be")]
+    NotUtf8,
     /// The request's number is neither the next one nor a repeated one.
-    #[error("seq is {seq}; {expected}")]
+    #[error("{field} is {seq}; {expected}")]
     SeqOutOfOrder {
+        /// `seq` or `last_seq`.
+        field: &'static str,
         /// The number given.
         seq: u64,
         /// The numbers accepted.
@@ -96,9 +101,9 @@ pub(crate) enum Fault {
         /// What is wrong with it.
         cause: PoseError,
     },
-    /// NaN or infinity, which JSON cannot express.
-    #[error("{field} is not finite; poses and actions need finite numbers")]
-    NotFinite {
+    /// NaN or infinity in a pose, which JSON cannot express.
+    #[error("{field} is not finite; a pose needs finite numbers")]
+    PoseNotFinite {
         /// The number, as `pose.xyz[0]`.
         field: String,
     },
@@ -146,8 +151,47 @@ pub(crate) enum Fault {
     /// The token's role or twins do not allow the request.
     #[error("this token may not do that: {reason}")]
     Forbidden {
+        /// The field or header that decides it.
+        field: &'static str,
         /// What it lacks.
         reason: String,
+    },
+    /// A web page of another machine sent the request.
+    #[error("pages from {origin} are refused; only those of this machine are accepted")]
+    ForbiddenOrigin {
+        /// The header `Origin`.
+        origin: String,
+    },
+    /// The address of sessions was requested without an upgrade.
+    #[error("this address is a WebSocket: send an upgrade (RFC 6455)")]
+    NoUpgrade,
+    /// A header of the WebSocket handshake is wrong.
+    #[error("the header {header} {must}")]
+    Handshake {
+        /// The header.
+        header: &'static str,
+        /// What must hold.
+        must: &'static str,
+    },
+    /// The handshake does not offer the protocol's name.
+    #[error("offer the subprotocol {protocol} in the header sec-websocket-protocol")]
+    NoSubprotocol {
+        /// The name.
+        protocol: &'static str,
+    },
+    /// There is no route of this path.
+    #[error("there is no {path}; protocol/README.md lists the routes")]
+    NoRoute {
+        /// The path.
+        path: String,
+    },
+    /// The route does not have this method.
+    #[error("{path} has no method {method}; protocol/README.md lists the routes")]
+    NoMethod {
+        /// The method.
+        method: String,
+        /// The path.
+        path: String,
     },
     /// There is no upload of this id.
     #[error(
@@ -156,6 +200,8 @@ pub(crate) enum Fault {
     UnknownUpload {
         /// The id asked for.
         id: String,
+        /// The field of a body that has it, if one does.
+        field: Option<String>,
     },
     /// The bytes do not continue the upload.
     #[error("the upload has {held} bytes, Upload-Offset is {given}: go on from {held}")]
@@ -204,7 +250,7 @@ pub(crate) enum Fault {
         cause: io::Error,
     },
     /// The server stops.
-    #[error("the server is shutting down; resume or start again when it is back")]
+    #[error("the server is shutting down, and its sessions end: open a new one when it is back")]
     ShuttingDown,
     /// The session refused.
     #[error(transparent)]
@@ -230,6 +276,7 @@ impl Fault {
             self,
             Self::MessageTooLarge { .. }
                 | Self::BrokenFrame(_)
+                | Self::NotUtf8
                 | Self::TimedOut(_)
                 | Self::Replaced
                 | Self::ShuttingDown

@@ -12,6 +12,7 @@
 //! spool          uploads on disk
 //! metrics        counters for Prometheus
 //! socket         WebSocket messages, with a time-out on every wait
+//! inbox          what a client sends while its last request is carried out
 //! connection     one agent, in lock step: read a request, answer it
 //! sessions       the sessions of the server: connected, or waiting to be resumed
 //! fault          why a request is refused
@@ -27,6 +28,7 @@ mod connection;
 mod convert;
 mod fault;
 mod idle_deadline;
+mod inbox;
 pub mod limits;
 mod listen;
 mod metrics;

@@ -24,6 +24,9 @@ pub const SPARE_CONNECTIONS: usize = 64;
 /// Bytes of pongs and of the close frame that a client has not read; each has at most 129 bytes.
 pub const PONGS_BYTES: usize = 4 << 10;
 
+/// Messages of a client that are read while its last request is carried out. They have at most 2 MiB together.
+pub const EARLY_MESSAGES: usize = 64;
+
 /// How long the last bytes of a refused client are read and discarded, so that it can read the reason.
 pub const LINGER: Duration = Duration::from_secs(2);
 

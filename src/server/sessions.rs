@@ -9,7 +9,7 @@ use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{Observation, Outcome, Session};
+use wildcity_session::{EpisodeSummary, Observation, Outcome, Session};
 use wildcity_twin::residency::Viewpoint;
 
 use crate::fault::Fault;
@@ -22,6 +22,20 @@ pub(crate) struct SessionRegistry {
     limit: usize,
     resume_grace: Duration,
     entries: Mutex<BTreeMap<String, Entry>>,
+    /// Sessions that were closed a short while ago, by name: the answer to `close` may be asked for again.
+    closed: Mutex<BTreeMap<String, ClosedSession>>,
+}
+
+/// A session that its client closed.
+#[derive(Clone)]
+pub(crate) struct ClosedSession {
+    owner: String,
+    since: Instant,
+    /// The request `close`, and its answer.
+    pub(crate) last: AnsweredRequest,
+    /// Steps and simulated time of the last episode.
+    pub(crate) steps: u64,
+    pub(crate) time_us: i64,
 }
 
 struct Entry {
@@ -104,7 +118,7 @@ pub(crate) struct SlotGuard {
 
 impl SessionRegistry {
     pub(crate) fn new(limit: usize, resume_grace: Duration) -> Arc<Self> {
-        Arc::new(Self { limit, resume_grace, entries: Mutex::default() })
+        Arc::new(Self { limit, resume_grace, entries: Mutex::default(), closed: Mutex::default() })
     }
 
     /// Adds an empty slot under a new name; `owner` is the name of the client's token.
@@ -132,7 +146,33 @@ impl SessionRegistry {
         };
         entries.insert(name.clone(), entry);
         drop(entries);
+        self.closed.lock().remove(&name);
         Ok(self.guard(name, release, guard))
+    }
+
+    /// Keeps the answer to `close` for a client that did not get it, as long as a session waits for `resume`.
+    pub(crate) fn remember_closed(
+        &self,
+        name: String,
+        owner: &str,
+        last: AnsweredRequest,
+        summary: &EpisodeSummary,
+    ) {
+        let mut closed = self.closed.lock();
+        if closed.len() >= self.limit {
+            let oldest = closed.iter().min_by_key(|(_, session)| session.since);
+            if let Some(name) = oldest.map(|(name, _)| name.clone()) {
+                closed.remove(&name);
+            }
+        }
+        let EpisodeSummary { steps, time_us, .. } = *summary;
+        let owner = owner.to_owned();
+        closed.insert(name, ClosedSession { owner, since: Instant::now(), last, steps, time_us });
+    }
+
+    /// The closed session of that name and owner.
+    pub(crate) fn closed(&self, name: &str, owner: &str) -> Option<ClosedSession> {
+        self.closed.lock().get(name).filter(|session| session.owner == owner).cloned()
     }
 
     /// Takes over the slot of a session, even if its old connection still holds it: after a network
@@ -219,6 +259,10 @@ impl SessionRegistry {
             let expired =
                 |parked: Parked| now.saturating_duration_since(parked.since) >= self.resume_grace;
             self.end_parked(|parked| expired(parked).then_some(parked.outcome)).await;
+            let is_new = |session: &ClosedSession| {
+                now.saturating_duration_since(session.since) < self.resume_grace
+            };
+            self.closed.lock().retain(|_, session| is_new(session));
         }
     }
 

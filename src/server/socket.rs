@@ -19,6 +19,16 @@ use crate::limits;
 pub(crate) struct Socket {
     stream: WebSocketStream<TcpStream>,
     send_timeout: Duration,
+    /// Whether the client has sent its Close frame, after which it reads nothing.
+    peer_closed: bool,
+}
+
+/// The content of a Close frame (RFC 6455, section 7.4).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct CloseStatus {
+    pub(crate) code: u16,
+    /// At most 123 bytes.
+    pub(crate) reason: String,
 }
 
 /// A message that arrived.
@@ -58,7 +68,7 @@ impl Socket {
             .max_write_buffer_size(limits::PONGS_BYTES);
         let stream =
             WebSocketStream::from_partially_read(stream, read_ahead, Role::Server, Some(config));
-        Self { stream: stream.await, send_timeout }
+        Self { stream: stream.await, send_timeout, peer_closed: false }
     }
 
     /// Waits for the next message. Dropping the future loses no request.
@@ -67,15 +77,14 @@ impl Socket {
             Some(Ok(Message::Text(text))) => Ok(Incoming::Text(text.as_str().to_owned())),
             Some(Ok(Message::Binary(_))) => Err(Disconnect::Fault(Fault::UnexpectedBinary)),
             // The pong is sent before more is read: a client that pings and never reads is not alive.
-            Some(Ok(Message::Ping(_))) => {
-                match timeout(self.send_timeout, self.stream.flush()).await {
-                    Ok(Ok(())) => Ok(Incoming::Alive),
-                    Ok(Err(_)) => Err(Disconnect::PeerLeft),
-                    Err(_) => Err(Disconnect::SendTimedOut),
-                }
-            }
+            Some(Ok(Message::Ping(_))) => self.flush().await.map(|()| Incoming::Alive),
             Some(Ok(Message::Pong(_) | Message::Frame(_))) => Ok(Incoming::Alive),
-            None | Some(Ok(Message::Close(_))) => Err(Disconnect::PeerLeft),
+            // tungstenite has prepared the Close frame that answers it (RFC 6455, section 5.5.1).
+            Some(Ok(Message::Close(_))) => {
+                self.peer_closed = true;
+                self.flush().await.and(Err(Disconnect::PeerLeft))
+            }
+            None => Err(Disconnect::PeerLeft),
             Some(Err(error)) => Err(match error {
                 Error::Capacity(CapacityError::MessageTooLong { size, max_size }) => {
                     Disconnect::Fault(Fault::MessageTooLarge { bytes: size, limit: max_size })
@@ -84,11 +93,22 @@ impl Socket {
                 Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => {
                     Disconnect::PeerLeft
                 }
-                Error::Protocol(_) | Error::Utf8(_) | Error::Capacity(_) => {
+                Error::Utf8(_) => Disconnect::Fault(Fault::NotUtf8),
+                Error::Protocol(_) | Error::Capacity(_) => {
                     Disconnect::Fault(Fault::BrokenFrame(error.to_string()))
                 }
                 _ => Disconnect::PeerLeft,
             }),
+        }
+    }
+
+    /// Sends what tungstenite has prepared: pongs, and the answer to a Close frame.
+    async fn flush(&mut self) -> Result<(), Disconnect> {
+        match timeout(self.send_timeout, self.stream.flush()).await {
+            // After the answer to a Close frame there is nothing more to send.
+            Ok(Ok(()) | Err(Error::ConnectionClosed)) => Ok(()),
+            Ok(Err(_)) => Err(Disconnect::PeerLeft),
+            Err(_) => Err(Disconnect::SendTimedOut),
         }
     }
 
@@ -105,6 +125,9 @@ impl Socket {
     /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes into
     /// its own buffer first. After an error the connection cannot be used.
     async fn send(&mut self, first_byte: u8, payload: &[u8]) -> Result<(), Disconnect> {
+        if self.peer_closed {
+            return Err(Disconnect::PeerLeft);
+        }
         let send = async {
             // A pong may still be in the library's buffer; it must be sent whole before this frame begins.
             self.stream.flush().await.map_err(io::Error::other)?;
@@ -124,11 +147,17 @@ impl Socket {
         }
     }
 
-    /// Closes the connection, and reads for a while what the client still sends: closing a socket with
-    /// unread bytes resets the connection, and the client would never see the last answer.
-    pub(crate) async fn close(mut self) {
+    /// Closes the connection, with a Close frame of this status unless the client has closed it already.
+    ///
+    /// What the client still sends is read for a while: closing a socket with unread bytes resets the connection,
+    /// and the client would never see the last answer. Its own Close frame is among these bytes.
+    pub(crate) async fn close(mut self, status: Option<CloseStatus>) {
         let closing = async {
-            self.stream.close(None).await.map_err(io::Error::other)?;
+            if let Some(CloseStatus { code, reason }) = status {
+                let payload = [&code.to_be_bytes(), reason.as_bytes()].concat();
+                // Sending fails if the client has left, or has sent its own Close frame.
+                let _ = self.send(FINAL_CLOSE, &payload).await;
+            }
             let mut stream = self.stream.into_inner();
             stream.shutdown().await?;
             let mut discarded = vec![0; 64 << 10];
@@ -143,6 +172,7 @@ impl Socket {
 /// First bytes of frames that are whole messages (RFC 6455, section 5.2).
 const FINAL_TEXT: u8 = 0x81;
 const FINAL_BINARY: u8 = 0x82;
+const FINAL_CLOSE: u8 = 0x88;
 
 /// The header of an unmasked frame (RFC 6455, section 5.2): the length takes 7, 16 or 64 bits.
 fn frame_header(first_byte: u8, len: usize) -> Vec<u8> {

@@ -8,6 +8,7 @@ use wildcity_sim::EgoError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
+use crate::options::Start;
 use crate::record::error::RecordError;
 
 /// Why a request was refused. The session is then as it was before the request.
@@ -48,6 +49,14 @@ pub enum SessionError {
         /// The name.
         name: String,
     },
+    /// An option of one camera is outside its limits.
+    #[error("{field} is {must}")]
+    CameraOption {
+        /// The field of the request, as on the wire: it names the camera.
+        field: String,
+        /// The value, and what is accepted.
+        must: String,
+    },
     /// The twin has no trajectory of this name.
     #[error("the twin has no trajectory {name:?}; it has {}", joined_or_none(known))]
     UnknownTrajectory {
@@ -73,6 +82,8 @@ pub enum SessionError {
     /// The images of one answer have too many pixels.
     #[error("the answer has {pixels} pixels; at most {limit} fit: request fewer or smaller images")]
     AnswerTooLarge {
+        /// The field of the request that asks for them, as on the wire.
+        field: &'static str,
         /// Pixels of all images together.
         pixels: u64,
         /// The most that fit.
@@ -120,6 +131,24 @@ pub enum SessionError {
         /// What the operating system says.
         reason: String,
     },
+}
+
+impl SessionError {
+    /// The error of a `reset`, which has no `warm_up_us`: a start that is too early for the session's warm-up is
+    /// the fault of the start.
+    pub(crate) fn of_reset(self, start: Option<&Start>) -> Self {
+        match (self, start) {
+            (Self::OutOfRange { field: "warm_up_us", must }, Some(start)) => {
+                let field = match start {
+                    Start::Pose(_) => "start.pose",
+                    Start::Station { .. } => "start.station_m",
+                };
+                let must = format!("too early for the session's warm_up_us, which is {must}");
+                Self::OutOfRange { field, must }
+            }
+            (error, _) => error,
+        }
+    }
 }
 
 impl From<ResidencyError> for SessionError {

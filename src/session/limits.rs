@@ -153,6 +153,9 @@ const _: () = {
     assert!(LOAD_ATTEMPTS as u128 * attempt_ms + between_ms < STEP_TIMEOUT.as_millis());
 };
 
-// The largest answer of a session fits a message.
-const _: () =
-    assert!(ANSWER_PIXELS * PIXEL_BYTES + OBSERVATION_HEADER_BYTES <= OBSERVATION_BYTES as u64);
+// The largest answer of a session fits a message, with normals (12 bytes) at half of the pixels.
+const _: () = {
+    let room_bytes = OBSERVATION_BYTES as u64 - OBSERVATION_HEADER_BYTES;
+    assert!(ANSWER_PIXELS * PIXEL_BYTES <= room_bytes);
+    assert!(ANSWER_PIXELS / 2 * (PIXEL_BYTES + 12) <= room_bytes);
+};

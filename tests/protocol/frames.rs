@@ -1,8 +1,11 @@
 //! Small observations and an encoder of their binary layout, independent of the server's.
 
 use serde_json::{Map, Value, json};
+use wildcity_protocol::camera::{Windshield, WindshieldReference};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
-use wildcity_protocol::observation::{Ego, Image, ObservationMetadata, Residency, Stage, Timings};
+use wildcity_protocol::observation::{
+    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+};
 
 use super::messages::{front, rear};
 
@@ -31,6 +34,22 @@ pub(crate) struct Recipe {
     pub(crate) depth: bool,
     /// Number of earlier frames of each camera.
     pub(crate) history: u64,
+    pub(crate) normals: bool,
+    /// Whether the images come with their trust, and the first camera is behind a windshield.
+    pub(crate) trust_and_windshield: bool,
+}
+
+impl Recipe {
+    /// Raw images of one pose and two cameras.
+    pub(crate) const RAW: Self = Self {
+        encoding: Encoding::Raw,
+        poses: 1,
+        cameras: 2,
+        depth: true,
+        history: 0,
+        normals: false,
+        trust_and_windshield: false,
+    };
 }
 
 /// Colour of a pixel. JPEG is lossy, so its pixels are grey and change slowly.
@@ -42,9 +61,21 @@ pub(crate) fn color(recipe: Recipe, image: u64, x: u64, y: u64) -> [u8; 3] {
     channels.map(|channel| u8::try_from(channel).unwrap())
 }
 
-/// Depth of a pixel, in metres; a third, so that it is not a round number in f32.
+/// Depth of a pixel, in metres; a third, so that it is not a round number in f32. 0 where nothing is seen.
 pub(crate) fn depth_m(image: u64, x: u64, y: u64) -> f32 {
-    (1 + x + 10 * y + 100 * image) as f32 / 3.0
+    match opacity(x, y) > 0.0 {
+        true => (1 + x + 10 * y + 100 * image) as f32 / 3.0,
+        false => 0.0,
+    }
+}
+
+/// Normal of a pixel; 0 where there is no depth.
+pub(crate) fn normal(x: u64, y: u64) -> [f32; 3] {
+    match (opacity(x, y) > 0.0, x % 2) {
+        (false, _) => [0.0; 3],
+        (true, 0) => [0.0, 0.0, -1.0],
+        (true, _) => [0.6, 0.0, -0.8],
+    }
 }
 
 /// Opacity of a pixel.
@@ -68,7 +99,14 @@ impl Frame {
         ];
         let mut images = Vec::new();
         let mut hashes = blake3::Hasher::new();
-        let cameras = [front(), rear()];
+        let mut cameras = [front(), rear()];
+        if recipe.trust_and_windshield {
+            cameras[0].windshield = Some(Windshield {
+                reference: WindshieldReference::Forward,
+                horizontal: vec![0.0, 1.0, 0.0],
+                vertical: vec![0.015625, 0.0, 1.0],
+            });
+        }
         for pose in 0..recipe.poses {
             for (index, camera) in cameras[..recipe.cameras].iter().enumerate() {
                 let number = images.len() as u64;
@@ -80,6 +118,13 @@ impl Frame {
                 tensors.push(color_tensor(recipe, &stem, camera, pixels));
                 if recipe.depth {
                     tensors.extend(depth_and_opacity(number, &stem, camera));
+                }
+                if recipe.normals {
+                    let grid =
+                        (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+                    let normals: Vec<f32> = grid.flat_map(|(x, y)| normal(x, y)).collect();
+                    let shape = vec![camera.height, camera.width, 3];
+                    tensors.push(f32_tensor(&format!("{stem}/normals"), shape, &normals));
                 }
                 let tensor = format!("{stem}/rgb");
                 let hash = hash.to_hex().to_string();
@@ -230,7 +275,13 @@ fn image(
         shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
         hash,
-        trust: None,
+        trust: recipe.trust_and_windshield.then_some(Trust {
+            value: 0.5,
+            distance_m: 3.25,
+            angle_rad: 0.0625,
+            low_coverage: 0.03125,
+            outside: 0.125,
+        }),
     }
 }
 

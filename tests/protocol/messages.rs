@@ -2,9 +2,10 @@
 
 use serde_json::{Value, json};
 use wildcity_protocol::camera::{Exposure, Lens, Shutter, ShutterDirection};
+use wildcity_protocol::decode::decode;
 use wildcity_protocol::error::Code;
 use wildcity_protocol::message::*;
-use wildcity_protocol::{PROTOCOL, unknown_field};
+use wildcity_protocol::{PROTOCOL, http};
 
 use super::{check_json, read};
 
@@ -67,21 +68,43 @@ pub(crate) fn add_unknown_fields(value: &mut Value) {
     }
 }
 
+/// The server reads every golden request, and no request with a field more.
 #[test]
-fn unknown_fields_of_requests_are_found_at_any_depth() {
+fn golden_requests_are_decoded_strictly() {
+    for (name, request) in requests() {
+        let text = String::from_utf8(read(&format!("vectors/requests/{name}.json"))).unwrap();
+        assert_eq!(decode::<Request>(&text).as_ref(), Ok(&request), "{name}");
+    }
     let file = read("vectors/requests/open.json");
-    let understood: Value = serde_json::from_slice(&file).unwrap();
     for (pointer, path) in [
         ("", "speed"),
         ("/outputs", "outputs.speed"),
         ("/rig/cameras/1", "rig.cameras[1].speed"),
         ("/rig/cameras/0/camera_to_rig", "rig.cameras[0].camera_to_rig.speed"),
     ] {
-        let mut sent = understood.clone();
+        let mut sent: Value = serde_json::from_slice(&file).unwrap();
         sent.pointer_mut(pointer).unwrap()["speed"] = 3.into();
-        assert_eq!(unknown_field(&sent, &understood).as_deref(), Some(path));
+        let refused = decode::<Request>(&sent.to_string()).unwrap_err();
+        assert_eq!((refused.seq, refused.mistake.field.as_deref()), (Some(1), Some(path)));
     }
-    assert_eq!(unknown_field(&understood, &understood), None);
+}
+
+/// Every schema of what clients send can be read.
+#[test]
+fn every_inbound_schema_has_shapes() {
+    let digest = format!("blake3:{}", blake3::hash(b"x"));
+    let upload = json!({ "name": "a", "size": 1e3, "digest": digest });
+    assert_eq!(decode::<http::NewUpload>(&upload.to_string()).unwrap().size, 1000);
+    assert_eq!(decode::<http::Rollback>(r#"{"version": 3}"#).unwrap().version, 3);
+    let push = r#"{"files": [{"upload": "x"}], "cells": "all", "golden": {"min_psnr_db": 20}}"#;
+    assert_eq!(decode::<http::NewPush>(push).unwrap().files.len(), 1);
+    let listed = push.replace("\"all\"", "[[0, 0], [1, -1.0]]");
+    assert!(matches!(
+        decode::<http::NewPush>(&listed).unwrap().cells,
+        Some(http::CellSelection::Listed(cells)) if cells == [[0, 0], [1, -1]]
+    ));
+    let wrong = decode::<http::NewPush>(&push.replace("\"all\"", "\"some\"")).unwrap_err();
+    assert_eq!(wrong.mistake.field.as_deref(), Some("cells"));
 }
 
 fn pose(xyz: [f64; 3], q: [f64; 4]) -> Pose {
@@ -291,7 +314,9 @@ fn answers() -> Vec<(&'static str, Answer)> {
     let fatal = Answer::Error {
         seq: None,
         code: Code::ShuttingDown,
-        message: "the server is shutting down; resume elsewhere".into(),
+        message:
+            "the server is shutting down, and its sessions end: open a new one when it is back"
+                .into(),
         field: None,
         fatal: true,
     };

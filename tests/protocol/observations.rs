@@ -8,14 +8,18 @@ use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
 /// The golden frames: name, `seq` of the request vector that the frame answers, recipe.
-fn golden() -> [(&'static str, u64, Recipe); 5] {
-    let raw = Recipe { encoding: Encoding::Raw, poses: 1, cameras: 2, depth: true, history: 0 };
+fn golden() -> [(&'static str, u64, Recipe); 8] {
+    let raw = Recipe::RAW;
     [
         ("raw", 3, raw),
         ("png", 3, Recipe { encoding: Encoding::Png, depth: false, ..raw }),
         ("jpeg", 3, Recipe { encoding: Encoding::Jpeg, cameras: 1, ..raw }),
         ("bundle", 3, Recipe { cameras: 1, depth: false, history: 2, ..raw }),
         ("two_poses", 5, Recipe { poses: 2, cameras: 1, depth: false, ..raw }),
+        ("normals", 3, Recipe { cameras: 1, normals: true, ..raw }),
+        ("trust", 3, Recipe { depth: false, trust_and_windshield: true, ..raw }),
+        // Between two decisions.
+        ("no_images", 3, Recipe { cameras: 0, ..raw }),
     ]
 }
 
@@ -125,6 +129,8 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
     let rgb = image.rgb().unwrap();
     let depth_m = image.depth_m();
     let opacity = image.opacity();
+    let normals = image.normals();
+    assert_eq!(normals.is_some(), recipe.normals);
     assert_eq!(depth_m.is_some(), recipe.depth);
     assert_eq!(opacity.is_some(), recipe.depth);
     for (pixel, rgb) in rgb.chunks_exact(3).enumerate() {
@@ -136,8 +142,14 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
         if let Some(depth_m) = &depth_m {
             assert_eq!(depth_m[pixel], frames::depth_m(number, x, y));
         }
+        if let (Some(depth_m), Some(opacity)) = (&depth_m, &opacity) {
+            assert_eq!(depth_m[pixel] == 0.0, opacity[pixel] == 0.0, "pixel ({x}, {y})");
+        }
         if let Some(opacity) = &opacity {
             assert_eq!(opacity[pixel], frames::opacity(x, y));
+        }
+        if let Some(normals) = &normals {
+            assert_eq!(normals[3 * pixel..][..3], frames::normal(x, y));
         }
     }
     assert_eq!(rgb.len(), 4 * 3 * 3);
@@ -166,7 +178,10 @@ fn expected(frame: &Frame, recipe: Recipe) -> Value {
                 let depth_m = recipe.depth.then(|| frames::depth_m(image, x, y));
                 let opacity = recipe.depth.then(|| frames::opacity(x, y));
                 let rgb = frames::color(recipe, image, x, y);
-                json!({"x": x, "y": y, "rgb": rgb, "depth_m": depth_m, "opacity": opacity})
+                let normal = recipe.normals.then(|| frames::normal(x, y));
+                json!({
+                    "x": x, "y": y, "rgb": rgb, "depth_m": depth_m, "opacity": opacity, "normal": normal,
+                })
             });
             json!({"shape": [3, 4, 3], "pixels": pixels})
         })

@@ -89,7 +89,9 @@ async fn a_token_may_only_use_its_twins() {
         ("POST /v1/twins/test/pushes", r#"{"files": [{"upload": "x"}]}"#),
         ("GET /v1/twins/test/pushes/x", ""),
     ] {
-        ask(&server, request, Some(ELSEWHERE), body).await.refused(403, "forbidden");
+        let refused = ask(&server, request, Some(ELSEWHERE), body).await;
+        refused.refused(403, "forbidden");
+        assert_eq!(refused.body["field"], "twin");
     }
 }
 
@@ -121,7 +123,9 @@ async fn sessions_need_the_role_drive_and_belong_to_their_token() {
 
     let mut elsewhere = upgrade(&server, Some(ELSEWHERE)).await.ok().unwrap();
     assert_eq!(elsewhere.hello().await["twins"], json!([]));
-    crate::support::refused(&elsewhere.try_open(json!({})).await, "forbidden");
+    let refused = elsewhere.try_open(json!({})).await;
+    crate::support::refused(&refused, "forbidden");
+    assert_eq!((&refused["field"], &refused["fatal"]), (&json!("twin"), &json!(false)));
     let resume = json!({ "type": "resume", "session": "mine", "last_seq": 2 });
     crate::support::refused(&elsewhere.ask(resume).await, "unknown_session");
     driver.step(2.0).await;

@@ -109,6 +109,43 @@ fn an_edge_belongs_to_neither_side() {
     assert!(on_one > 14_000 && slopes < 70, "{slopes} of {on_one}");
 }
 
+/// Every pixel with a depth has a unit normal towards the camera, also one that has no neighbour, or none in its
+/// row or its column.
+#[test]
+fn lone_pixels_face_the_camera() {
+    let speck = |x_m: f64, y_m: f64| GaussianSpec {
+        mean_m: DVec3::new(x_m, y_m, 4.0),
+        sigma_m: DVec3::splat(1e-4),
+        // Above the smallest opacity that is drawn in the middle of a splat only.
+        opacity: 0.006,
+        ..GaussianSpec::default()
+    };
+    let view = forward_view([40, 30], 30.0);
+    let at = |column: f64, row: f64| {
+        let camera = view.camera.pinhole;
+        speck(
+            (column + 0.5 - camera.cx) * 4.0 / camera.fx,
+            (row + 0.5 - camera.cy) * 4.0 / camera.fy,
+        )
+    };
+    let alone = at(5.0, 5.0);
+    let row = [at(10.0, 20.0), at(11.0, 20.0), at(12.0, 20.0)];
+    let column = [at(30.0, 8.0), at(30.0, 9.0), at(30.0, 10.0)];
+    let scene = scene_of(&[&[alone], &row[..], &column[..]].concat());
+    for backend in [&cpu() as &dyn Backend, &Reference] {
+        let drawn = draw(backend, &scene, view);
+        let covered: Vec<usize> =
+            (0..drawn.depth_m.len()).filter(|&pixel| drawn.depth_m[pixel] > 0.0).collect();
+        assert!(covered.len() >= 7, "{covered:?}");
+        for pixel in covered {
+            let [x, y, z] = [0, 1, 2].map(|k| f64::from(drawn.normals[3 * pixel + k]));
+            let normal = DVec3::new(x, y, z);
+            assert!((normal.length() - 1.0).abs() < 1e-6, "{pixel}: {normal}");
+            assert!(normal.z < -0.8, "{pixel}: {normal}");
+        }
+    }
+}
+
 #[test]
 fn pixels_without_depth_have_no_normal() {
     let ball = scene_of(&[GaussianSpec::default()]);

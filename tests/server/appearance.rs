@@ -99,7 +99,7 @@ async fn what_is_no_appearance_is_refused_by_its_field() {
         (json!({ "overlay": "hood.png" }), "rig.cameras[0].overlay"),
         (json!({ "exposure": {} }), "rig.cameras[0].exposure"),
         (json!({ "exposure": both }), "rig.cameras[0].exposure"),
-        (json!({ "exposure": { "gain": [1, 1, 1e9] } }), "rig.cameras[0].exposure"),
+        (json!({ "exposure": { "gain": [1, 1, 1e9] } }), "rig.cameras[0].exposure.gain"),
     ] {
         let mut agent = server.agent().await;
         let answer = agent.try_open(json!({ "rig": front(more) })).await;
@@ -114,7 +114,7 @@ async fn what_is_no_appearance_is_refused_by_its_field() {
     rig["cameras"][1]["name"] = "rear".into();
     let answer = server.agent().await.try_open(json!({ "rig": rig })).await;
     refused(&answer, "out_of_range");
-    assert_eq!(answer["field"], "rig.cameras");
+    assert_eq!(answer["field"], "rig.cameras[1].overlay");
     assert!(answer["message"].as_str().unwrap().contains("24576000 pixels"), "{answer}");
     server.still_serves().await;
 }

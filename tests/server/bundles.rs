@@ -204,7 +204,7 @@ async fn periods_that_do_not_fit_the_steps_are_refused() {
         (
             json!({ "outputs": { "period_us": { "front": 150_000 } } }),
             "out_of_range",
-            "outputs.period_us",
+            "outputs.period_us.front",
             "whole steps of 100000",
         ),
         (

@@ -176,7 +176,7 @@ async fn what_does_not_move_this_ego_is_refused() {
         (
             json!({ "pose": pose(1.0), "trajectory": circle(5.0, 0.1, 2) }),
             "invalid_request",
-            "pose",
+            "trajectory",
         ),
     ] {
         let mut request = json!({ "type": "step" });

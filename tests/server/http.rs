@@ -28,6 +28,99 @@ const UPGRADE: &str = "GET /v1/session HTTP/1.1\nHost: localhost\nConnection: ke
                        Upgrade: websocket\nSec-WebSocket-Version: 13\n\
                        Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n";
 
+/// The status, and the JSON of a refusal.
+async fn refusal(server: &TestServer, text: &str) -> (u16, serde_json::Value) {
+    let (status, answer) = request(server, text).await;
+    let body = answer.split("\r\n\r\n").nth(1).expect("a body");
+    let body = serde_json::from_str(body).unwrap_or_else(|_| panic!("no JSON: {answer}"));
+    assert!(answer.contains("content-type: application/json"), "{answer}");
+    (status, body)
+}
+
+/// Every refusal is JSON with a code: of the handshake, of a wrong route, of a body that is too large.
+#[tokio::test]
+async fn refusals_are_json_with_a_code_and_a_field() {
+    let server = TestServer::start().await;
+    let subprotocol = "Sec-WebSocket-Protocol: wildcity.v1\n";
+    let get = |path: &str| format!("GET {path} HTTP/1.1\nHost: localhost\n\n");
+    let upgrade = |from: &str, to: &str| format!("{UPGRADE}{subprotocol}\n").replace(from, to);
+    let large = "POST /v1/uploads HTTP/1.1\nHost: localhost\nContent-Length: 2000000\n\n";
+    for (text, status, code, field) in [
+        (get("/v1/session"), 426, "invalid_request", Some("upgrade")),
+        (upgrade("Upgrade: websocket", "Upgrade: h2c"), 426, "invalid_request", Some("upgrade")),
+        (
+            upgrade("Version: 13", "Version: 8"),
+            400,
+            "invalid_request",
+            Some("sec-websocket-version"),
+        ),
+        (
+            upgrade("dGhlIHNhbXBsZSBub25jZQ==", "x"),
+            400,
+            "invalid_request",
+            Some("sec-websocket-key"),
+        ),
+        (upgrade("wildcity.v1", "v2"), 400, "unsupported_protocol", Some("sec-websocket-protocol")),
+        (
+            upgrade(subprotocol, &format!("{subprotocol}Origin: https://example.org\n")),
+            403,
+            "forbidden",
+            Some("origin"),
+        ),
+        (get("/nothing"), 404, "invalid_request", None),
+        (get("/v1/sessions/a"), 404, "invalid_request", None),
+        (get("/v1/session").replace("GET", "POST"), 405, "invalid_request", None),
+        (get("/v1/twins/nope"), 404, "unknown_twin", Some("twin")),
+        (large.to_owned(), 413, "message_too_large", None),
+    ] {
+        let (found, body) = refusal(&server, &text).await;
+        assert_eq!((found, &body["code"]), (status, &code.into()), "{text}: {body}");
+        assert_eq!(body["field"].as_str(), field, "{text}: {body}");
+        let message = body["message"].as_str().unwrap();
+        // The server has no tokens.
+        assert!(!message.contains("token") && !message.is_empty(), "{message}");
+    }
+    // What a client of another version of WebSocket has to know (RFC 6455, section 4.4).
+    let (_, answer) = request(&server, &upgrade("Version: 13", "Version: 8")).await;
+    assert!(answer.contains("sec-websocket-version: 13"), "{answer}");
+
+    // Bodies follow the same rules as requests over the socket.
+    let digest = "blake3:c161acb4065fb456ded857fcc01f61847e2aa4e55872dbe090bc93d1b438bb3d";
+    for (body, code, field) in [
+        ("[]".to_owned(), "invalid_request", None),
+        ("{".to_owned(), "malformed_json", None),
+        (
+            format!(r#"{{"name":"a","size":null,"digest":"{digest}"}}"#),
+            "invalid_request",
+            Some("size"),
+        ),
+        (format!(r#"{{"name":"a","size":-1,"digest":"{digest}"}}"#), "out_of_range", Some("size")),
+        (
+            format!(r#"{{"name":"a","size":1.5,"digest":"{digest}"}}"#),
+            "invalid_request",
+            Some("size"),
+        ),
+        (
+            format!(r#"{{"name":"a","name":"b","size":1,"digest":"{digest}"}}"#),
+            "invalid_request",
+            Some("name"),
+        ),
+        (format!(r#"{{"size":1,"digest":"{digest}"}}"#), "invalid_request", Some("name")),
+        (
+            format!(r#"{{"name":"a","size":1,"digest":"{digest}","more":1}}"#),
+            "invalid_request",
+            Some("more"),
+        ),
+    ] {
+        let length = body.len();
+        let text = format!(
+            "POST /v1/uploads HTTP/1.1\nHost: localhost\nContent-Length: {length}\n\n{body}"
+        );
+        let (_, answer) = refusal(&server, &text).await;
+        assert_eq!((&answer["code"], answer["field"].as_str()), (&code.into(), field), "{answer}");
+    }
+}
+
 async fn upgrade(server: &TestServer, more: &str) -> u16 {
     request(server, &format!("{UPGRADE}{more}\n")).await.0
 }

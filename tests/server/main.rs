@@ -8,10 +8,12 @@ mod root;
 mod support;
 
 mod appearance;
+mod bad_requests;
 mod bundles;
 mod ego;
 mod http;
 mod leases;
+mod mutations;
 mod observation;
 mod page;
 mod profile;
@@ -20,3 +22,4 @@ mod refused;
 mod replay;
 mod resume;
 mod shutdown;
+mod socket;

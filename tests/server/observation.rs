@@ -106,6 +106,57 @@ async fn raw_pixels_and_maps_are_the_renderers() {
     assert_eq!(seen.meta["timings"]["stages_ms"], json!([{ "name": "paint", "ms": 0.5 }]));
 }
 
+/// The header takes what it holds, and at most 7 spaces; the tensors begin at a multiple of 8.
+#[tokio::test]
+async fn the_header_has_the_size_of_its_contents() {
+    let server = TestServer::start().await;
+    let mut agent = server.agent().await;
+    agent.open(json!({ "outputs": { "encoding": "raw" }, "decision_us": 200_000 })).await;
+    for (step, images, at_most) in [(1, 0, 3072), (2, 2, 6144)] {
+        let seen = agent.step(f64::from(step)).await;
+        assert_eq!(seen.meta["images"].as_array().unwrap().len(), images);
+        let length = u64::from_le_bytes(seen.bytes[..8].try_into().unwrap()) as usize;
+        let header = &seen.bytes[8..8 + length];
+        let spaces = header.iter().rev().take_while(|&&byte| byte == b' ').count();
+        assert!(length % 8 == 0 && spaces < 8, "{length} bytes with {spaces} spaces");
+        assert!(seen.bytes.len() < at_most, "{} bytes", seen.bytes.len());
+        if images == 0 {
+            assert_eq!(seen.bytes.len(), 8 + length + 4 * 16 * 12);
+            assert_eq!(seen.frame_hash(), blake3::hash(&[]).to_hex().as_str());
+        }
+    }
+}
+
+/// With normals, an answer has half of the pixels.
+#[tokio::test]
+async fn normals_halve_the_pixels_of_an_answer() {
+    let server = TestServer::start().await;
+    let mut agent = Agent::connect(server.address()).await;
+    let most = agent.hello().await["limits"]["answer_pixels"].as_u64().unwrap();
+    // 8 x 6 and 5 x 4 px: the sizes of the images make up the number of pixels exactly, or one row more.
+    let width = 16_384;
+    for (normals, pixels) in [(true, most / 2), (false, most)] {
+        for more in [0, 1] {
+            let height = pixels / width + more;
+            let outputs = json!({
+                "cameras": ["front"], "normals": normals, "depth": true, "opacity": true,
+                "images": { "front": { "size": [width, height] } },
+            });
+            let answer = agent.try_open(json!({ "outputs": outputs })).await;
+            if more == 1 {
+                crate::support::refused(&answer, "answer_too_large");
+                assert!(
+                    answer["message"].as_str().unwrap().contains(&pixels.to_string()),
+                    "{answer}"
+                );
+            } else {
+                assert_eq!(answer["type"], "opened", "{answer}");
+                agent.ask(json!({ "type": "close" })).await;
+            }
+        }
+    }
+}
+
 #[tokio::test]
 async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
     let server = TestServer::start().await;
@@ -140,10 +191,13 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
     assert!((share - 25.0 * std::f64::consts::PI / 144.0).abs() < 0.05, "{share}");
     // What does not lie within the image is refused.
     let mut agent = server.agent().await;
-    for part in [json!({ "front": { "crop": [0, 0, 9, 6] } }), json!({ "top": {} })] {
+    for (part, code, field) in [
+        (json!({ "front": { "crop": [0, 0, 9, 6] } }), "out_of_range", "outputs.images.front.crop"),
+        (json!({ "top": {} }), "unknown_camera", "outputs.images.top"),
+    ] {
         let answer = agent.try_open(json!({ "outputs": { "images": part } })).await;
-        crate::support::refused(&answer, "out_of_range");
-        assert_eq!(answer["field"], "outputs.images");
+        crate::support::refused(&answer, code);
+        assert_eq!(answer["field"], field);
     }
     server.still_serves().await;
 }

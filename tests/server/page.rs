@@ -69,6 +69,77 @@ fn limits_are_those_of_the_configuration() {
     assert_eq!(pixels, Some(wildcity_session::limits::ANSWER_PIXELS.to_string()));
 }
 
+/// The ranges and counts in the schema of requests are those of the program.
+#[test]
+fn ranges_of_the_schema_are_those_of_the_program() {
+    use wildcity_session::limits as session;
+    use wildcity_sim::limits as sim;
+    let text = std::fs::read_to_string(crate::root::root().join("protocol/schema/request.json"));
+    let schema: serde_json::Value = serde_json::from_str(&text.unwrap()).unwrap();
+    let request = |name: &str| {
+        let variants = schema["oneOf"].as_array().unwrap().iter();
+        let variant = variants.clone().find(|v| v["properties"]["type"]["const"] == name);
+        variant.unwrap_or_else(|| panic!("no request {name}"))["properties"].clone()
+    };
+    let definition = |name: &str| schema["$defs"][name]["properties"].clone();
+    let side = f64::from(wildcity_scene::geometry::Camera::MAX_SIDE_PX);
+    let shutter_us = wildcity_scene::geometry::camera::Shutter::MAX_US as f64;
+    let cameras = wildcity_scene::Rig::MAX_CAMERAS as f64;
+    let most_us = session::BUNDLE_PERIOD_US as f64;
+    let dt_us = [session::DT_MIN_US as f64, session::DT_MAX_US as f64];
+    let range = ["minimum", "maximum"];
+    let items = ["minItems", "maxItems"];
+    for (field, keywords, limits) in [
+        (&request("open")["dt_us"], range, dt_us),
+        (&request("open")["decision_us"], range, [dt_us[0], most_us]),
+        (&request("open")["warm_up_us"], range, [0.0, session::WARM_UP_US as f64]),
+        (&request("observe")["poses"], items, [1.0, session::OBSERVE_POSES as f64]),
+        (&request("prefetch")["poses"], items, [1.0, session::PREFETCH_POSES as f64]),
+        (&request("step")["trajectory"], items, [1.0, sim::PATH_POSES as f64]),
+        (&definition("TimedPose")["time_us"], range, [1.0, sim::PATH_US as f64]),
+        (
+            &definition("Action")["acceleration"],
+            range,
+            [-sim::EGO_ACCELERATION_M_S2, sim::EGO_ACCELERATION_M_S2],
+        ),
+        (
+            &definition("Action")["curvature"],
+            range,
+            [-sim::EGO_CURVATURE_1_M, sim::EGO_CURVATURE_1_M],
+        ),
+        (&definition("Dynamics")["speed"], range, [-sim::EGO_REVERSE_M_S, sim::EGO_SPEED_M_S]),
+        (&definition("Outputs")["frames"], range, [1.0, session::BUNDLE_FRAMES as f64]),
+        (&definition("Rig")["cameras"], items, [1.0, cameras]),
+        (&definition("RigCamera")["width"], range, [1.0, side]),
+        (&definition("Shutter")["duration_us"], range, [1.0, shutter_us]),
+    ] {
+        let found = keywords.map(|keyword| field[keyword].as_f64());
+        assert_eq!(found, limits.map(Some), "{field}");
+    }
+    // Names: the pattern accepts what the program accepts.
+    let pattern = request("open")["twin"]["pattern"].clone();
+    assert_eq!(pattern, "^[a-z0-9_-][a-z0-9._-]{0,63}$");
+    for (name, is_name) in
+        [("a", true), (".a", false), ("-", true), ("a.b_c-9", true), ("A", false)]
+    {
+        assert_eq!(wildcity_scene::rig::is_name(name), is_name, "{name}");
+    }
+    assert_eq!(wildcity_scene::rig::MAX_NAME_BYTES, 64);
+}
+
+/// The page lists the cameras of every preset, in their order.
+#[test]
+fn presets_have_the_cameras_of_the_page() {
+    let page = page();
+    for preset in wildcity_scene::Rig::preset_names() {
+        let rig = wildcity_scene::Rig::preset(preset).unwrap();
+        let names: Vec<_> = rig.cameras.iter().map(|camera| format!("`{}`", camera.name)).collect();
+        let row = format!("| {} |", names.join(", "));
+        let line = page.lines().find(|line| line.starts_with(&format!("| `{preset}`")));
+        assert!(line.is_some_and(|line| line.ends_with(&row)), "{preset}: {line:?}, not {row}");
+    }
+}
+
 fn page() -> String {
     std::fs::read_to_string(crate::root::root().join("protocol/README.md")).unwrap()
 }

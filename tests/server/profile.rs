@@ -49,15 +49,15 @@ async fn a_session_gets_its_own_profile_before_the_servers_and_the_twins() {
 async fn a_profile_that_cannot_be_had_is_refused_by_its_field() {
     let server = TestServer::start().await;
     let mut agent = server.agent().await;
-    for profile in [
-        json!({ "tau_px": -1.0 }),
-        json!({ "fov": 90 }),
-        json!({ "antialiased": "yes" }),
-        json!({ "near": 2.0, "far": 1.0 }),
+    for (profile, code, field) in [
+        (json!({ "tau_px": -1.0 }), "out_of_range", "profile.tau_px"),
+        (json!({ "fov": 90 }), "invalid_request", "profile.fov"),
+        (json!({ "antialiased": "yes" }), "invalid_request", "profile.antialiased"),
+        (json!({ "near": 2.0, "far": 1.0 }), "out_of_range", "profile.far"),
     ] {
         let answer = agent.try_open(json!({ "profile": profile.clone() })).await;
-        refused(&answer, "out_of_range");
-        assert_eq!(answer["field"], "profile", "{profile}: {answer}");
+        refused(&answer, code);
+        assert_eq!(answer["field"], field, "{profile}: {answer}");
     }
     refused(&agent.try_open(json!({ "profile": 7 })).await, "invalid_request");
     agent.open(json!({})).await;
@@ -108,7 +108,7 @@ async fn a_sky_that_cannot_be_baked_as_finely_is_refused_when_it_is_opened() {
         |sky_error: f64| json!({ "twin": "creased", "profile": { "sky_error": sky_error } });
     let answer = agent.try_open(asked(1e-4)).await;
     refused(&answer, "out_of_range");
-    assert_eq!(answer["field"], "profile", "{answer}");
+    assert_eq!(answer["field"], "profile.sky_error", "{answer}");
     let message = answer["message"].as_str().unwrap();
     assert!(message.contains("sky_error is 0.0001: set sky_error to 0.000"), "{message}");
     // The message names what works: a larger error, or 0.

@@ -31,7 +31,7 @@ async fn what_is_not_a_request() {
         ("{}", "invalid_request"),
         ("{\"type\":\"fly\",\"seq\":2}", "invalid_request"),
         ("{\"type\":\"close\"}", "invalid_request"),
-        ("{\"type\":\"close\",\"seq\":-1}", "invalid_request"),
+        ("{\"type\":\"close\",\"seq\":-1}", "out_of_range"),
         ("{\"type\":\"close\",\"seq\":2,\"now\":true}", "invalid_request"),
         (
             "{\"type\":\"step\",\"seq\":2,\"pose\":{\"xyz\":[0,0],\"q\":[1,0,0,0]}}",
@@ -65,21 +65,28 @@ async fn mistakes_are_named_by_their_path() {
     let good = camera(r#","fy":8"#);
     let rig = |camera: String| format!(r#""rig":{{"name":"r","cameras":[{good},{camera}]}}"#);
     for (fields, field, reason) in [
-        (rig(good.replace("\"cx\":4,", "")), "rig.cameras[1]", "missing field `cx`"),
-        (rig(camera(r#","fy":8,"lens":{"model":"ftheta"}"#)), "rig.cameras[1].lens", "reference"),
-        (rig(good.replace("\"width\":8", "\"width\":-1")), "rig.cameras[1].width", "-1"),
-        (rig(good.replace("\"width\":8", "\"width\":1e9")), "rig.cameras[1].width", "floating"),
-        (rig(camera(r#","fy":8,"fov":90"#)), "rig.cameras[1].fov", "no field"),
-        (r#""rig":7"#.to_owned(), "rig", "preset"),
+        (rig(good.replace("\"cx\":4,", "")), "rig.cameras[1].cx", "missing"),
+        (
+            rig(camera(r#","fy":8,"lens":{"model":"ftheta"}"#)),
+            "rig.cameras[1].lens.reference",
+            "missing",
+        ),
+        (rig(good.replace("\"width\":8", "\"width\":8.5")), "rig.cameras[1].width", "an integer"),
+        (
+            rig(camera(r#","fy":8,"fov":90"#)),
+            "rig.cameras[1].fov",
+            "no such field; there is camera_to_rig, cx",
+        ),
+        (r#""rig":7"#.to_owned(), "rig", "a string or an object, found a number"),
         (
             r#""start":{"pose":{"xyz":[0,0],"q":[1,0,0,0]}}"#.to_owned(),
             "start.pose.xyz",
-            "length 2",
+            "3 values, found 2",
         ),
-        (r#""start":{"trajectory":3}"#.to_owned(), "start.trajectory", "integer `3`"),
-        (r#""start":{"station_m":3}"#.to_owned(), "start", "either pose"),
-        (r#""outputs":{"deep":true}"#.to_owned(), "outputs.deep", "no field"),
-        (r#""dt_us":"x""#.to_owned(), "dt_us", "string"),
+        (r#""start":{"trajectory":3}"#.to_owned(), "start.trajectory", "a string, found a number"),
+        (r#""start":{}"#.to_owned(), "start", "exactly one of pose, trajectory"),
+        (r#""outputs":{"deep":true}"#.to_owned(), "outputs.deep", "no such field"),
+        (r#""dt_us":"x""#.to_owned(), "dt_us", "an integer, found a string"),
     ] {
         agent.send_text(&format!(r#"{{"type":"open","seq":1,"twin":"test",{fields}}}"#)).await;
         let answer = answer(&mut agent).await;
@@ -182,7 +189,7 @@ async fn sessions_that_cannot_be_opened() {
         ),
         (
             json!({ "outputs": { "cameras": ["rear", "rear"] } }),
-            "out_of_range",
+            "invalid_name",
             "outputs.cameras[1]",
         ),
         (json!({ "outputs": { "cameras": [] } }), "out_of_range", "outputs.cameras"),
@@ -201,7 +208,7 @@ async fn sessions_that_cannot_be_opened() {
         (one(json!({ "width": 0 })), "camera_invalid", "rig.cameras[1].width"),
         (one(json!({ "height": 1_000_000_000 })), "camera_invalid", "rig.cameras[1].height"),
         (one(json!({ "fx": -1.0 })), "camera_invalid", "rig.cameras[1].fx"),
-        (one(json!({ "fy": null })), "camera_invalid", "rig.cameras[1].fy"),
+        (one(json!({ "fy": null })), "out_of_range", "rig.cameras[1].fy"),
         (
             one(json!({ "lens": { "model": "fisheye", "k": [-1e9, 0, 0, 0] } })),
             "camera_invalid",
@@ -214,7 +221,7 @@ async fn sessions_that_cannot_be_opened() {
             "camera_invalid",
             "rig.cameras[1].shutter.duration_us",
         ),
-        (one(json!({ "name": "other" })), "invalid_name", "rig.cameras"),
+        (one(json!({ "name": "other" })), "invalid_name", "rig.cameras[1].name"),
         (rig(vec![]), "out_of_range", "rig.cameras"),
         (rig(vec![camera(json!({})); 17]), "out_of_range", "rig.cameras"),
     ] {

@@ -105,6 +105,68 @@ async fn numbers_go_on_after_a_refused_request() {
     }
 }
 
+/// Two refused requests, a lost connection: the number after `last_seq` is valid, and so are those that the
+/// refused requests had, and the next one.
+#[tokio::test]
+async fn last_seq_is_the_number_that_the_server_counts_by() {
+    let server = TestServer::start().await;
+    for next in [4, 5, 6] {
+        let name = format!("n{next}");
+        let mut agent = server.driver(&name).await;
+        agent.step(1.0).await;
+        assert_eq!(agent.step(2.0).await.meta["seq"], 3);
+        for seq in [4, 5] {
+            assert_eq!(agent.seq, seq);
+            refused(&agent.ask(json!({ "type": "observe", "poses": [] })).await, "out_of_range");
+        }
+        drop(agent);
+        let (mut agent, resumed) = resume(&server, &name, 5).await;
+        assert_eq!(resumed["last_seq"], 3, "{resumed}");
+        for wrong in [2, 7] {
+            agent.seq = wrong;
+            refused(
+                &agent.ask(json!({ "type": "step", "pose": pose(3.0) })).await,
+                "seq_out_of_order",
+            );
+        }
+        agent.seq = next;
+        let seen = agent.step(3.0).await;
+        assert_eq!((&seen.meta["step"], &seen.meta["seq"]), (&json!(3), &json!(next)));
+        assert_eq!(agent.step(4.0).await.meta["step"], 4);
+    }
+}
+
+/// A client that did not get the answer to `close` resumes and repeats it, as with any other request.
+#[tokio::test]
+async fn a_lost_answer_to_close_can_be_repeated() {
+    let resume_grace = Duration::from_millis(600);
+    let server = TestServer::with(Limits { resume_grace, ..Limits::default() }).await;
+    let mut agent = server.driver("a").await;
+    agent.step(1.0).await;
+    let closed = agent.ask(json!({ "type": "close" })).await;
+    let seq = agent.seq - 1;
+    drop(agent);
+    assert_eq!(server.running.sessions(), 0);
+    for _ in 0..2 {
+        let (mut agent, resumed) = resume(&server, "a", seq - 1).await;
+        let found = [&resumed["type"], &resumed["last_seq"], &resumed["step"], &resumed["time_us"]];
+        assert_eq!(found, [&json!("resumed"), &json!(seq), &json!(1), &json!(100_000)]);
+        agent.seq = seq;
+        assert_eq!(agent.ask(json!({ "type": "close" })).await, closed);
+        // The connection goes on with the next number.
+        refused(&agent.ask(json!({ "type": "close" })).await, "session_state");
+        agent.open(json!({ "session": "b" })).await;
+        agent.ask(json!({ "type": "close" })).await;
+    }
+    // Not for ever, and not after the name is used again.
+    let mut again = server.driver("a").await;
+    refused(&resume(&server, "a", 9).await.1, "seq_out_of_order");
+    let Reply::Text(told) = again.receive().await else { panic!("no notification") };
+    refused(&told, "session_state");
+    tokio::time::sleep(2 * resume_grace).await;
+    refused(&resume(&server, "b", 1).await.1, "unknown_session");
+}
+
 /// After a network failure the client reconnects before the server notices the failure.
 #[tokio::test]
 async fn resuming_takes_over_from_a_dead_connection() {
@@ -127,11 +189,12 @@ async fn what_cannot_be_resumed() {
     refused(&resume(&server, "no-such", 0).await.1, "unknown_session");
     refused(&resume(&server, "../x", 0).await.1, "invalid_name");
     let agent = server.driver("a").await;
-    refused(&resume(&server, "a", agent.seq + 5).await.1, "seq_out_of_order");
+    let answer = resume(&server, "a", agent.seq + 5).await.1;
+    refused(&answer, "seq_out_of_order");
+    assert_eq!(answer["field"], "last_seq");
     agent.closed_after_takeover().await;
     let (mut agent, _) = resume(&server, "a", 1).await;
-    agent.ask(json!({ "type": "close" })).await;
-    refused(&resume(&server, "a", 2).await.1, "unknown_session");
+    assert_eq!(agent.step(1.0).await.meta["step"], 1);
     server.still_serves().await;
 }
 

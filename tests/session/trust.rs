@@ -71,6 +71,27 @@ fn far_from_the_recorded_drive_the_trust_is_zero() {
     assert_eq!(pair.coverage.trust(&on_it, &view, &empty).value, 0.0);
 }
 
+/// A level camera with a small image, whose few followed samples are all above the horizon; and one that looks up.
+#[test]
+fn a_level_camera_far_from_the_twin_is_outside() {
+    let pair = pair();
+    let on_it = pair.street.trajectory.at_station(30.0);
+    let off_it = Pose { position_m: on_it.position_m + DVec3::new(1_000.0, 0.0, 0.0), ..on_it };
+    let mut rig = small_rig();
+    for mounted in &mut rig.cameras {
+        mounted.camera = mounted.camera.scaled(96, 60).unwrap();
+    }
+    let tilt_up = Pose { rotation: DQuat::from_rotation_y(-1.2), ..Pose::IDENTITY };
+    for (world_from_rig, expected) in [(on_it, 0.0), (off_it, 1.0)] {
+        for pose in [world_from_rig, world_from_rig * tilt_up] {
+            let view = View::of_rig(&rig.cameras, pose)[0];
+            let clear = vec![1.0; view.camera.pixels()];
+            let Trust { outside, .. } = pair.coverage.trust(&pose, &view, &clear);
+            assert_eq!(outside, expected, "{pose:?}");
+        }
+    }
+}
+
 impl Pair {
     fn measure(&self, offset_m: f64, yaw_rad: f64) -> Measured {
         let mut all = Vec::new();

@@ -152,7 +152,7 @@ def with_unknown_fields(value: Any) -> Any:
     return {**fields, "since_next_year": [1, "x"]}
 
 
-@pytest.mark.parametrize("name", ["raw", "png", "jpeg", "two_poses", "bundle"])
+@pytest.mark.parametrize("name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "trust", "no_images"])
 def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
     observation = Observation(frame(f"observations/{name}.bin"))
@@ -192,12 +192,13 @@ def check_image(
     for pixel in expected["pixels"]:
         at = pixel["y"], pixel["x"]
         assert np.abs(image[at].astype(int) - pixel["rgb"]).max() <= tolerance
-        for name, maps in (("depth_m", view.depth), ("opacity", view.opacity)):
+        maps_by_name = (("depth_m", view.depth), ("opacity", view.opacity), ("normal", view.normals))
+        for name, maps in maps_by_name:
             if pixel[name] is None:
                 assert camera not in maps
             else:
                 assert maps[camera].dtype == np.float32
-                assert maps[camera][at] == np.float32(pixel[name])
+                assert np.array_equal(maps[camera][at], np.float32(pixel[name]))
 
 
 def test_frames_of_a_camera_are_in_the_order_they_were_taken() -> None:
@@ -333,12 +334,42 @@ def test_vectors_obey_the_schemas() -> None:
             with pytest.raises(jsonschema.ValidationError):
                 jsonschema.validate(message, schema)
     schema = json.loads((PROTOCOL / "schema/observation.json").read_text())
-    for name in ("raw", "png", "jpeg", "two_poses"):
+    for name in ("raw", "png", "jpeg", "two_poses", "normals", "trust", "no_images"):
         metadata = vector(f"observations/{name}.expected.json")["observation"]
         jsonschema.validate(metadata, schema)
         del metadata["frame_hash"]
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(metadata, schema)
+
+
+MOVE = {"type": "step", "seq": 3}
+HERE_JSON = {"xyz": [0.0, 0.0, 0.0], "q": [1.0, 0.0, 0.0, 0.0]}
+ACTION = {"acceleration": 0.0, "curvature": 0.0}
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {**MOVE},
+        {**MOVE, "pose": HERE_JSON, "action": ACTION},
+        {**MOVE, "trajectory": []},
+        {**MOVE, "trajectory": [{"time_us": 0, "pose": HERE_JSON}]},
+        {**MOVE, "action": {"acceleration": 9.9, "curvature": 0.0}},
+        {"type": "observe", "seq": 3, "poses": []},
+        {"type": "observe", "seq": 3, "poses": [HERE_JSON] * 17},
+        {"type": "open", "seq": 1, "twin": "../etc"},
+        {"type": "open", "seq": 1, "twin": "a", "session": "A b"},
+        {"type": "open", "seq": 1, "twin": "a", "dt_us": 999},
+        {"type": "open", "seq": 1, "twin": "a", "outputs": {"quality": 0}},
+        {"type": "open", "seq": 1, "twin": "a", "outputs": {"frames": 17}},
+        {"type": "open", "seq": 1, "twin": "a", "rig": {"name": "r", "cameras": []}},
+    ],
+    ids=str,
+)
+def test_the_schema_has_ranges_and_exactly_one_of(request_: dict[str, Any]) -> None:
+    schema = json.loads((PROTOCOL / "schema/request.json").read_text())
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(request_, schema)
 
 
 def plain(value: Any) -> Any:

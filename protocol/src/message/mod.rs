@@ -1,9 +1,8 @@
 //! Control messages: JSON text frames.
 //!
 //! The client sends a [`Request`], the server replies with an [`Answer`] or an
-//! [observation](crate::observation). Unknown fields of requests are mistakes: the types that only requests
-//! use refuse them, and [`crate::unknown_field`] finds them in the types that requests share with answers.
-//! Unknown fields of answers are ignored, because answers may gain fields.
+//! [observation](crate::observation). Unknown fields of requests are mistakes: [`crate::decode`] refuses them
+//! at any depth. Unknown fields of answers are ignored, because answers may gain fields.
 
 mod answer;
 mod open;
@@ -17,3 +16,25 @@ pub use open::{
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, TimedPose};
+
+/// What names are, as a regular expression.
+#[cfg(feature = "schema")]
+pub(crate) const NAME_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
+
+/// Says in the schema of a step that it has exactly one movement.
+#[cfg(feature = "schema")]
+pub(crate) fn one_movement(schema: &mut schemars::Schema) {
+    exactly_one_of(schema, &["pose", "trajectory", "action"]);
+}
+
+/// Says in the schema of an exposure that it has either a matrix or a gain.
+#[cfg(feature = "schema")]
+pub(crate) fn matrix_or_gain(schema: &mut schemars::Schema) {
+    exactly_one_of(schema, &["matrix", "gain"]);
+}
+
+#[cfg(feature = "schema")]
+fn exactly_one_of(schema: &mut schemars::Schema, fields: &[&str]) {
+    let one_of = fields.iter().map(|field| serde_json::json!({ "required": [field] }));
+    schema.insert("oneOf".to_owned(), one_of.collect::<Vec<_>>().into());
+}

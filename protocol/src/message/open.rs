@@ -15,6 +15,7 @@ pub struct Dynamics {
     pub model: DynamicsModel,
     /// Speed at the start of an episode, in m/s.
     #[serde(default)]
+    #[cfg_attr(feature = "schema", schemars(range(min = -10.0, max = 60.0)))]
     pub speed: f64,
     /// Whether a car that brakes beyond standstill drives backwards. If false, it stands still.
     #[serde(default)]
@@ -43,12 +44,14 @@ pub struct Open {
     /// Number of this request.
     pub seq: u64,
     /// Name of the twin.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
     pub twin: String,
     /// Version of the twin. If absent, the latest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub version: Option<u64>,
     /// Name for the session. If absent, the server chooses one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
     pub session: Option<String>,
     /// Seed of the first episode.
     #[serde(default)]
@@ -71,17 +74,21 @@ pub struct Open {
     pub dynamics: Option<DynamicsChoice>,
     /// Simulated time of a step, in microseconds. If absent, the server's default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 10_000_000)))]
     pub dt_us: Option<i64>,
     /// How long an answer may take, in milliseconds. If absent, the server's limit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 1)))]
     pub deadline_ms: Option<u64>,
     /// Time between two decisions of the agent, in simulated microseconds: a whole number of steps. Only
     /// observations at decisions have images. If absent, every observation has images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 10_000_000)))]
     pub decision_us: Option<i64>,
     /// Length of the recorded drive before the start, in microseconds. Its poses are the ego's history, and
     /// its frames are in the first bundle. If absent, 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0, max = 20_000_000)))]
     pub warm_up_us: Option<i64>,
 }
 
@@ -134,6 +141,7 @@ pub enum Start {
         trajectory: String,
         /// Distance from the start of the trajectory, in metres.
         #[serde(default)]
+        #[cfg_attr(feature = "schema", schemars(range(min = 0.0)))]
         station_m: f64,
     },
 }
@@ -166,8 +174,10 @@ pub enum DynamicsChoice {
 #[serde(deny_unknown_fields)]
 pub struct Rig {
     /// Name.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
     pub name: String,
     /// The cameras, in the order of the images in observations.
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
     pub cameras: Vec<RigCamera>,
 }
 
@@ -176,20 +186,27 @@ pub struct Rig {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct RigCamera {
     /// Name.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
     pub name: String,
     /// Image width.
+    #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 16_384)))]
     pub width: u64,
     /// Image height.
+    #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 16_384)))]
     pub height: u64,
     /// Focal length along x. Answers always have it; requests may omit it for an f-theta lens.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.001, max = 1e6)))]
     pub fx: Option<f64>,
     /// Focal length along y. Answers always have it; requests may omit it for an f-theta lens.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.001, max = 1e6)))]
     pub fy: Option<f64>,
     /// Principal point, x, from the image's left edge.
+    #[cfg_attr(feature = "schema", schemars(range(min = -1e6, max = 1e6)))]
     pub cx: f64,
     /// Principal point, y, from the image's top edge.
+    #[cfg_attr(feature = "schema", schemars(range(min = -1e6, max = 1e6)))]
     pub cy: f64,
     /// The lens model. If absent, a pinhole.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -218,6 +235,7 @@ pub struct RigCamera {
 pub struct Outputs {
     /// Names of the cameras to render, in this order. If absent, all.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
     pub cameras: Option<Vec<String>>,
     /// Crops and sizes of images that differ from the rig's, by camera name. The cameras of `opened`
     /// describe the images as sent.
@@ -227,6 +245,7 @@ pub struct Outputs {
     pub encoding: Encoding,
     /// JPEG quality, 1 to 100. Other encodings ignore it.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 100)))]
     pub quality: Option<u8>,
     /// Whether to add `depth`, f32 `[height, width]`: expected camera z, or distance for wide lenses, in
     /// metres.
@@ -238,6 +257,7 @@ pub struct Outputs {
     pub normals: Option<bool>,
     /// Number of last frames of each camera that an observation holds. If absent, 1.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 16)))]
     pub frames: Option<u64>,
     /// Whether to add a confidence to each image. If absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]

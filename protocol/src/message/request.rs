@@ -27,6 +27,7 @@ pub enum Request {
     Open(Box<Open>),
     /// Moves the ego, advances the time by `dt_us` and renders. Exactly one of `pose`, `trajectory` and
     /// `action` is given. Answer: an observation.
+    #[cfg_attr(feature = "schema", schemars(transform = super::one_movement))]
     Step {
         /// Number of this request.
         seq: u64,
@@ -35,6 +36,7 @@ pub enum Request {
         pose: Option<Pose>,
         /// Planned poses of the ego, 1 to 64 in order of time, up to the end of the step or later.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 64)))]
         trajectory: Option<Vec<TimedPose>>,
         /// Acceleration and curvature of the ego. Only with kinematic or dynamic dynamics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -49,6 +51,7 @@ pub enum Request {
         /// Number of this request.
         seq: u64,
         /// Poses of the rig, `world_from_rig`: 1 to `limits.observe_poses`.
+        #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
         poses: Vec<Pose>,
     },
     /// Announces where the ego may go next, so that the server loads what is visible from there. Answer:
@@ -58,6 +61,7 @@ pub enum Request {
         seq: u64,
         /// Poses of the rig, `world_from_rig`, in driving order. The straight lines between them count too.
         /// They replace the poses of the previous `prefetch`.
+        #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
         poses: Vec<Pose>,
     },
     /// Starts a new episode in the same session. Answer: an observation.
@@ -89,6 +93,7 @@ pub enum Request {
         /// Number of this request on the new connection.
         seq: u64,
         /// Name of the session.
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: String,
         /// Number of the last answer that the client received.
         last_seq: u64,
@@ -101,6 +106,7 @@ pub enum Request {
 #[serde(deny_unknown_fields)]
 pub struct TimedPose {
     /// Time since the start of the step, in microseconds: above 0, and above that of the previous pose.
+    #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 60_000_000)))]
     pub time_us: i64,
     /// Pose of the rig at that time, in the rig frame at the start of the step.
     pub pose: Pose,
@@ -112,8 +118,10 @@ pub struct TimedPose {
 #[serde(deny_unknown_fields)]
 pub struct Action {
     /// Longitudinal acceleration, in m/s², -9.8 to 9.8.
+    #[cfg_attr(feature = "schema", schemars(range(min = -9.8, max = 9.8)))]
     pub acceleration: f64,
     /// Curvature of the rear axle's path, positive to the left, in 1/m, -0.2 to 0.2.
+    #[cfg_attr(feature = "schema", schemars(range(min = -0.2, max = 0.2)))]
     pub curvature: f64,
 }
 
@@ -124,6 +132,6 @@ pub struct Action {
 pub struct ClientInfo {
     /// Name of the program or library.
     pub name: String,
-    /// Version of the twin.
+    /// Its version.
     pub version: String,
 }

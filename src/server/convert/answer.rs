@@ -102,15 +102,14 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
 }
 
 /// The answer to `resume`.
-pub(crate) fn resumed(seq: u64, last_seq: u64, session: &Session) -> Result<String, Fault> {
-    let episode = session.episode();
-    text(&Answer::Resumed {
-        seq,
-        session: session.name().to_owned(),
-        last_seq,
-        step: episode.step(),
-        time_us: episode.time_us(),
-    })
+pub(crate) fn resumed(
+    seq: u64,
+    session: &str,
+    last_seq: u64,
+    step: u64,
+    time_us: i64,
+) -> Result<String, Fault> {
+    text(&Answer::Resumed { seq, session: session.to_owned(), last_seq, step, time_us })
 }
 
 /// The answer to `prefetch`.
@@ -182,7 +181,11 @@ fn twin_info(twin: &TwinSummary) -> TwinInfo {
 
 fn profile(session: &Session) -> Result<serde_json::Map<String, serde_json::Value>, Fault> {
     match serde_json::to_value(session.profile()) {
-        Ok(serde_json::Value::Object(profile)) => Ok(profile),
+        Ok(serde_json::Value::Object(mut profile)) => {
+            // What is not set is left out, so that a client can send the profile back.
+            profile.retain(|_, value| !value.is_null());
+            Ok(profile)
+        }
         other => Err(Fault::Internal(format!("the profile is not an object: {other:?}"))),
     }
 }

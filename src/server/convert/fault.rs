@@ -11,6 +11,7 @@ use wildcity_protocol::message::Answer;
 use wildcity_push::PushError;
 use wildcity_render::RenderError;
 use wildcity_scene::geometry::PoseError;
+use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::RigError;
 use wildcity_session::SessionError;
 use wildcity_sim::EgoError;
@@ -19,6 +20,7 @@ use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
 use crate::fault::{Fault, is_full};
+use crate::socket::CloseStatus;
 
 /// A fault on the wire.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,7 +36,28 @@ pub(crate) struct WireCode(pub(crate) String);
 
 /// The HTTP status of a fault.
 pub(crate) fn http_status(fault: &Fault) -> StatusCode {
-    status_of(wire_fault(fault).code)
+    match fault {
+        // HTTP has a status of its own for these; the code is `invalid_request`.
+        Fault::NoUpgrade => StatusCode::UPGRADE_REQUIRED,
+        Fault::NoRoute { .. } => StatusCode::NOT_FOUND,
+        Fault::NoMethod { .. } => StatusCode::METHOD_NOT_ALLOWED,
+        fault => status_of(wire_fault(fault).code),
+    }
+}
+
+/// The Close frame after a fault that ends the connection (RFC 6455, section 7.4.1).
+pub(crate) fn close_status(fault: &Fault) -> CloseStatus {
+    let code = match fault {
+        Fault::ShuttingDown => 1001,
+        Fault::BrokenFrame(_) => 1002,
+        Fault::NotUtf8 => 1007,
+        Fault::MessageTooLarge { .. } => 1009,
+        Fault::Busy { .. } => 1013,
+        Fault::Internal(_) => 1011,
+        // Another connection has the session, or the client was silent: the policy of this server.
+        _ => 1008,
+    };
+    CloseStatus { code, reason: self::code(fault).0 }
 }
 
 /// The text of a fault's code.
@@ -137,16 +160,19 @@ fn at(code: Code, field: &str) -> WireFault {
 /// The code and the field of a fault.
 pub(super) fn wire_fault(fault: &Fault) -> WireFault {
     match fault {
-        Fault::MalformedJson(_) | Fault::BrokenFrame(_) => plain(Code::MalformedJson),
+        Fault::MalformedJson(_) | Fault::BrokenFrame(_) | Fault::NotUtf8 => {
+            plain(Code::MalformedJson)
+        }
         Fault::InvalidRequest { field, .. } => {
             WireFault { code: Code::InvalidRequest, field: field.clone() }
         }
         Fault::UnexpectedBinary => plain(Code::UnexpectedBinary),
         Fault::MessageTooLarge { .. } => plain(Code::MessageTooLarge),
-        Fault::SeqOutOfOrder { .. } => at(Code::SeqOutOfOrder, "seq"),
+        Fault::SeqOutOfOrder { field, .. } => at(Code::SeqOutOfOrder, field),
         Fault::WrongOrder(_) => at(Code::WrongOrder, "type"),
         Fault::UnsupportedProtocol { .. } => at(Code::UnsupportedProtocol, "protocols"),
-        Fault::SessionState(_) | Fault::Replaced => plain(Code::SessionState),
+        Fault::SessionState(_) => at(Code::SessionState, "type"),
+        Fault::Replaced => plain(Code::SessionState),
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
         // The list of codes is closed, and episodes are named by their sessions.
         Fault::UnknownEpisode { .. } => at(Code::UnknownSession, "episode"),
@@ -159,11 +185,7 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
             };
             at(code, &format!("{field}.{}", cause.field()))
         }
-        Fault::NotFinite { field } => {
-            // The protocol's list of codes is fixed, and has no code for an invalid number of an action.
-            let is_action = field.starts_with("action");
-            at(if is_action { Code::OutOfRange } else { Code::PoseNotFinite }, field)
-        }
+        Fault::PoseNotFinite { field } => at(Code::PoseNotFinite, field),
         Fault::Camera { field, cause } => {
             at(Code::CameraInvalid, &format!("{field}.{}", cause.field()))
         }
@@ -179,9 +201,16 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::Busy { .. } | Fault::NoUploads { .. } => plain(Code::Busy),
         Fault::TimedOut(_) => plain(Code::TimedOut),
         Fault::ShuttingDown => plain(Code::ShuttingDown),
-        Fault::Unauthorized => plain(Code::Unauthorized),
-        Fault::Forbidden { .. } => plain(Code::Forbidden),
-        Fault::UnknownUpload { .. } => plain(Code::UnknownUpload),
+        Fault::Unauthorized => at(Code::Unauthorized, "authorization"),
+        Fault::Forbidden { field, .. } => at(Code::Forbidden, field),
+        Fault::ForbiddenOrigin { .. } => at(Code::Forbidden, "origin"),
+        Fault::NoUpgrade => at(Code::InvalidRequest, "upgrade"),
+        Fault::Handshake { header, .. } => at(Code::InvalidRequest, header),
+        Fault::NoSubprotocol { .. } => at(Code::UnsupportedProtocol, "sec-websocket-protocol"),
+        Fault::NoRoute { .. } | Fault::NoMethod { .. } => plain(Code::InvalidRequest),
+        Fault::UnknownUpload { field, .. } => {
+            WireFault { code: Code::UnknownUpload, field: field.clone() }
+        }
         Fault::UploadOffset { .. } => at(Code::UploadOffset, "upload-offset"),
         Fault::UploadDigest { .. } => plain(Code::UploadDigest),
         Fault::StorageFull { .. } => plain(Code::StorageFull),
@@ -215,13 +244,15 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
         SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),
         SessionError::CameraTwice { index, .. } => {
-            at(Code::OutOfRange, &format!("outputs.cameras[{index}]"))
+            at(Code::InvalidName, &format!("outputs.cameras[{index}]"))
         }
+        SessionError::CameraOption { field, .. } => at(Code::OutOfRange, field),
         SessionError::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "start.trajectory"),
-        SessionError::Profile(_) | SessionError::Sky(_) => at(Code::OutOfRange, "profile"),
+        SessionError::Profile(error) => of_profile(error),
+        SessionError::Sky(_) => at(Code::OutOfRange, "profile.sky_error"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),
-        SessionError::AnswerTooLarge { .. } => plain(Code::AnswerTooLarge),
-        SessionError::EpisodeOver { .. } => plain(Code::SessionState),
+        SessionError::AnswerTooLarge { field, .. } => at(Code::AnswerTooLarge, field),
+        SessionError::EpisodeOver { .. } => at(Code::SessionState, "type"),
         SessionError::Ego(error) => {
             let code = match error {
                 EgoError::Command { .. } => Code::SessionState,
@@ -239,6 +270,14 @@ fn of_session(error: &SessionError) -> WireFault {
         | SessionError::Record(_)
         | SessionError::Crashed
         | SessionError::Thread { .. } => plain(Code::Internal),
+    }
+}
+
+fn of_profile(error: &ProfileError) -> WireFault {
+    match error {
+        ProfileError::Value { field, .. } => at(Code::OutOfRange, &format!("profile.{field}")),
+        ProfileError::Change { field, .. } => at(Code::InvalidRequest, &format!("profile.{field}")),
+        ProfileError::Setting { .. } => at(Code::InvalidRequest, "profile"),
     }
 }
 

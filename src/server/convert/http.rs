@@ -3,7 +3,6 @@
 use std::fmt::Display;
 use std::str::FromStr;
 
-use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use crate::fault::Fault;
@@ -16,16 +15,17 @@ use wildcity_push::{
     CellChange, CellSelection, FileReport, PushError, PushReport, PushRequest, PushedVersion,
     RequestedFile, SourceAxes, State, Status,
 };
-use wildcity_twin::ingest::BadGaussian;
+use wildcity_twin::ingest::{BadGaussian, IngestError};
 use wildcity_twin::store::{LogEntry, Version};
 
 use super::answer::pose;
 use super::fault::{WireFault, cells_of_push, of_push};
 use super::field::poses_of;
+use super::mistake::read_body;
 
 /// The body of `POST /v1/uploads`.
 pub(crate) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
-    let http::NewUpload { name, size, digest } = parse(body)?;
+    let http::NewUpload { name, size, digest } = read_body(body)?;
     let is_plain = |c: char| !c.is_control() && c != '/' && c != '\\';
     if name.is_empty() || name.len() > limits::UPLOAD_NAME_BYTES || !name.chars().all(is_plain) {
         let most = limits::UPLOAD_NAME_BYTES;
@@ -53,7 +53,7 @@ pub(crate) fn upload(upload: &Upload) -> Value {
 
 /// The body of `POST /v1/twins/{twin}/pushes`, checked as far as it can be without the files.
 pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> {
-    let body: http::NewPush = parse(body)?;
+    let body: http::NewPush = read_body(body)?;
     // The hash is computed from the parsed body, so that white space does not make it a different push.
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
     let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
@@ -87,9 +87,13 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
 
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
     let axes = SourceAxes::parse(&file.axes, file.scale);
-    let axes = axes.map_err(|error| PushError::InvalidField {
-        field: format!("files[{index}]"),
-        reason: error.to_string(),
+    let axes = axes.map_err(|error| {
+        let part = match error {
+            IngestError::InvalidAxes { option: "--scale", .. } => "scale",
+            _ => "axes",
+        };
+        let field = format!("files[{index}].{part}");
+        PushError::InvalidField { field, reason: error.to_string() }
     })?;
     Ok(RequestedFile { upload: file.upload, axes })
 }
@@ -178,7 +182,7 @@ fn file(file: &FileReport) -> http::FileReport {
 
 /// The body of `POST /v1/twins/{twin}/rollback`: the number of the old version.
 pub(crate) fn rollback(body: &[u8]) -> Result<u64, Fault> {
-    parse::<http::Rollback>(body).map(|rollback| rollback.version)
+    read_body::<http::Rollback>(body).map(|rollback| rollback.version)
 }
 
 /// The versions of a twin, the latest last. Versions after `held` are not ready.
@@ -226,30 +230,4 @@ pub(crate) fn episodes(episodes: &[(EpisodeFile, Listed)]) -> Value {
         verdict: episode.result.as_ref().map(|result| result.verdict.clone()),
     };
     json!({ "episodes": episodes.iter().map(info).collect::<Vec<_>>() })
-}
-
-/// Reads a body; a fault names the field of a mistake.
-fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, Fault> {
-    // serde would read a list as the values of the object's fields, in order.
-    if body.trim_ascii_start().first() == Some(&b'[') {
-        let reason = "expected one object, not a list".to_owned();
-        return Err(Fault::InvalidRequest { field: None, reason });
-    }
-    let deserializer = &mut serde_json::Deserializer::from_slice(body);
-    let parsed = serde_path_to_error::deserialize(&mut *deserializer);
-    let parsed = parsed.map_err(|error| {
-        let path = error.path().to_string();
-        let error = error.into_inner();
-        match error.classify() {
-            serde_json::error::Category::Data if path != "." => {
-                Fault::InvalidRequest { reason: format!("{path}: {error}"), field: Some(path) }
-            }
-            serde_json::error::Category::Data => {
-                Fault::InvalidRequest { field: None, reason: error.to_string() }
-            }
-            _ => Fault::MalformedJson(error.to_string()),
-        }
-    })?;
-    deserializer.end().map_err(|error| Fault::MalformedJson(error.to_string()))?;
-    Ok(parsed)
 }

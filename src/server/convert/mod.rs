@@ -1,9 +1,9 @@
 //! Conversion between the wire and the session: no other module of the server names the protocol's types.
 //!
 //! ```text
+//! mistake      mistakes in messages, as faults
 //! request      parses text frames as commands
 //! rig          rigs of requests
-//! non_finite   NaN and infinity in requests, which JSON cannot express
 //! answer       answers other than observations
 //! observation  observations
 //! camera       lenses, windshields, shutters and exposures, to and from the wire
@@ -16,13 +16,13 @@ mod camera;
 mod fault;
 mod field;
 mod http;
-mod non_finite;
+mod mistake;
 mod observation;
 mod request;
 mod rig;
 
 pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
-pub(crate) use fault::{WireCode, code, http_status, refusal_body, refused};
+pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
     episodes, new_push, new_upload, push, rollback, sessions, upload, version, versions,
 };

@@ -44,14 +44,14 @@ pub(crate) fn observation(
     header.metadata.insert("observation", observation);
     let header = text(&header)?;
 
-    // A safetensors file begins with the length of its header; the header is padded with spaces.
-    let room = frame.buffer.header_mut();
+    // A safetensors file begins with the length of its header; the header is padded with spaces, so that the
+    // tensors begin at a multiple of 8.
+    let padded = header.len().next_multiple_of(8);
+    let Some(room) = frame.buffer.header_mut(HEADER_PREFIX_BYTES + padded) else {
+        return Err(Fault::Internal(format!("there is no room for a header of {padded} bytes")));
+    };
     let (prefix, room) = room.split_at_mut(HEADER_PREFIX_BYTES);
-    if header.len() > room.len() {
-        let reason = format!("a header of {} bytes, room for {}", header.len(), room.len());
-        return Err(Fault::Internal(reason));
-    }
-    prefix.copy_from_slice(&(room.len() as u64).to_le_bytes());
+    prefix.copy_from_slice(&(padded as u64).to_le_bytes());
     let (written, padding) = room.split_at_mut(header.len());
     written.copy_from_slice(header.as_bytes());
     padding.fill(b' ');

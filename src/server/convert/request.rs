@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use serde::Deserialize;
-
 use crate::fault::Fault;
+use wildcity_protocol::PROTOCOL;
+use wildcity_protocol::decode::{Refused, decode};
 use wildcity_protocol::message::{self, Request};
-use wildcity_protocol::{PROTOCOL, unknown_field};
 use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{
@@ -16,7 +15,6 @@ use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
 
 use super::field::{name_of, pose_of, poses_of};
-use super::non_finite::{NonFinite, find_non_finite};
 use super::rig::rig_of;
 
 /// A text frame, checked as far as it can be without a session.
@@ -90,90 +88,16 @@ pub(crate) enum Command {
 
 /// Reads a text frame.
 pub(crate) fn parse(text: &str) -> Parsed {
-    use serde_json::error::Category;
-    let error = match serde_json::from_str::<Request>(text) {
-        Ok(request) => return checked(text, request),
-        Err(error) => error,
-    };
-    if let Some(NonFinite { seq, field }) = find_non_finite(text) {
-        return Parsed::refused(seq, Fault::NotFinite { field });
-    }
-    // An error in the data stops the parser before the rest, which may not be JSON.
-    let rest = serde_json::from_str::<serde::de::IgnoredAny>(text).err();
-    match (error.classify(), rest) {
-        (Category::Data, None) => Parsed::refused(seq_of(text), invalid(text, &error)),
-        (_, rest) => {
-            let reason = rest.unwrap_or(error).to_string();
-            Parsed::Unnumbered(Fault::MalformedJson(reason))
+    match decode::<Request>(text) {
+        Ok(request) => {
+            let (seq, command) = convert(request);
+            Parsed::Numbered { seq, command }
         }
-    }
-}
-
-impl Parsed {
-    fn refused(seq: Option<u64>, fault: Fault) -> Self {
-        match seq {
-            Some(seq) => Self::Numbered { seq, command: Err(fault) },
-            None => Self::Unnumbered(fault),
+        Err(Refused { seq: Some(seq), mistake }) => {
+            Parsed::Numbered { seq, command: Err(mistake.into()) }
         }
+        Err(Refused { seq: None, mistake }) => Parsed::Unnumbered(mistake.into()),
     }
-}
-
-/// A request, unless it has a field that was not understood.
-fn checked(text: &str, request: Request) -> Parsed {
-    let unknown = serde_json::from_str(text)
-        .and_then(|sent| Ok(unknown_field(&sent, &serde_json::to_value(&request)?)));
-    let (seq, command) = convert(request);
-    let command = match unknown {
-        Ok(None) => command,
-        Ok(Some(field)) => {
-            let reason = format!("there is no field {field}");
-            Err(Fault::InvalidRequest { field: Some(field), reason })
-        }
-        Err(error) => Err(Fault::Internal(error.to_string())),
-    };
-    Parsed::Numbered { seq, command }
-}
-
-/// What is wrong with a text that is JSON, but not a request.
-fn invalid(text: &str, error: &serde_json::Error) -> Fault {
-    // serde loses the path to a mistake behind the tag `type`: every field is read once more.
-    let deserializer = &mut serde_json::Deserializer::from_str(text);
-    match serde_path_to_error::deserialize::<_, Fields>(deserializer) {
-        Err(found) if found.path().iter().next().is_some() => {
-            let field = found.path().to_string();
-            let reason = format!("{field}: {}", found.inner());
-            Fault::InvalidRequest { reason, field: Some(field) }
-        }
-        _ => Fault::InvalidRequest { field: None, reason: error.to_string() },
-    }
-}
-
-/// Every field of any request.
-#[derive(Deserialize)]
-#[expect(dead_code, reason = "read for the path to a mistake, not for the values")]
-struct Fields {
-    seq: Option<u64>,
-    client: Option<message::ClientInfo>,
-    protocols: Option<Vec<String>>,
-    twin: Option<String>,
-    version: Option<u64>,
-    session: Option<String>,
-    seed: Option<u64>,
-    start: Option<message::Start>,
-    rig: Option<message::RigChoice>,
-    profile: Option<serde_json::Map<String, serde_json::Value>>,
-    outputs: Option<message::Outputs>,
-    dt_us: Option<i64>,
-    deadline_ms: Option<u64>,
-    decision_us: Option<i64>,
-    warm_up_us: Option<i64>,
-    pose: Option<message::Pose>,
-    trajectory: Option<Vec<message::TimedPose>>,
-    action: Option<message::Action>,
-    dynamics: Option<message::DynamicsChoice>,
-    poses: Option<Vec<message::Pose>>,
-    terminate: Option<bool>,
-    last_seq: Option<u64>,
 }
 
 /// The number and the command of a request.
@@ -302,9 +226,15 @@ fn movement_of(
             let action = Action::checked(acceleration, curvature);
             Ok(wildcity_sim::Command::Action(action.map_err(SessionError::from)?))
         }
-        _ => {
+        (pose, trajectory, _) => {
+            // The second of two, or the first of none.
+            let field = match (pose, trajectory) {
+                (Some(_), Some(_)) => "trajectory",
+                (None, None) => "pose",
+                _ => "action",
+            };
             let reason = "a step has exactly one of pose, trajectory and action".to_owned();
-            Err(Fault::InvalidRequest { field: Some("pose".to_owned()), reason })
+            Err(Fault::InvalidRequest { field: Some(field.to_owned()), reason })
         }
     }
 }
@@ -316,15 +246,6 @@ fn start_of(start: message::Start) -> Result<Start, Fault> {
             Start::Station { trajectory, station_m }
         }
     })
-}
-
-/// The number of a text that is not a request but has a number.
-fn seq_of(text: &str) -> Option<u64> {
-    #[derive(Deserialize)]
-    struct Numbered {
-        seq: u64,
-    }
-    serde_json::from_str::<Numbered>(text).ok().map(|numbered| numbered.seq)
 }
 
 #[cfg(test)]
@@ -345,7 +266,7 @@ mod tests {
         assert!(command(&step("1.5")).is_ok());
         for x in ["nope", "\"1\"", "1e", "[1]"] {
             let fault = command(&step(x)).unwrap_err();
-            assert!(!matches!(fault, Fault::NotFinite { .. }), "{x}: {fault}");
+            assert!(!matches!(fault, Fault::PoseNotFinite { .. }), "{x}: {fault}");
         }
     }
 
@@ -358,7 +279,7 @@ mod tests {
 
     fn field_of(command: Result<Command, Fault>) -> String {
         match command {
-            Err(Fault::NotFinite { field }) => field,
+            Err(Fault::PoseNotFinite { field }) => field,
             other => panic!("{other:?}"),
         }
     }

@@ -2,24 +2,36 @@
 
 use crate::fault::Fault;
 use wildcity_protocol::message;
+use wildcity_scene::appearance::AppearanceError;
 use wildcity_scene::geometry::camera::json::Intrinsics;
-use wildcity_scene::rig::{Rig, RigCamera, check_overlays};
+use wildcity_scene::rig::{Rig, RigCamera, RigError, check_overlays};
 
 use super::camera::{appearance_of, lens_of, shutter_of, windshield_of};
 use super::field::{name_of, pose_of};
 
 /// A rig from the wire, checked.
 pub(super) fn rig_of(rig: message::Rig) -> Result<Rig, Fault> {
-    let fault = |cause| Fault::Rig { field: "rig.cameras".to_owned(), cause };
-    let mut cameras = Vec::new();
-    // Reads at most one camera more than the maximum, which is enough for the check to refuse the rig.
-    for (index, camera) in rig.cameras.into_iter().take(Rig::MAX_CAMERAS + 1).enumerate() {
-        cameras.push(camera_of(&format!("rig.cameras[{index}]"), camera)?);
+    // Reads no camera of a rig that has too many.
+    let count = rig.cameras.len();
+    if count > Rig::MAX_CAMERAS {
+        let cause = RigError::Count { rig: rig.name, count, limit: Rig::MAX_CAMERAS };
+        return Err(Fault::Rig { field: "rig.cameras".to_owned(), cause });
+    }
+    let fault = |field: String| move |cause| Fault::Rig { field, cause };
+    let mut cameras: Vec<RigCamera> = Vec::new();
+    for (index, camera) in rig.cameras.into_iter().enumerate() {
+        let field = format!("rig.cameras[{index}]");
+        let camera = camera_of(&field, camera)?;
+        if cameras.iter().any(|other| other.name == camera.name) {
+            let cause = RigError::Duplicate { name: camera.name };
+            return Err(Fault::Rig { field: format!("{field}.name"), cause });
+        }
+        cameras.push(camera);
         // Checked before the next overlay is decompressed.
-        check_overlays(&cameras).map_err(fault)?;
+        check_overlays(&cameras).map_err(fault(format!("{field}.overlay")))?;
     }
     let rig = Rig { name: name_of("rig.name", rig.name)?, cameras };
-    rig.check().map_err(fault)?;
+    rig.check().map_err(fault("rig.cameras".to_owned()))?;
     Ok(rig)
 }
 
@@ -40,10 +52,18 @@ fn camera_of(field: &str, camera: message::RigCamera) -> Result<RigCamera, Fault
     let checked = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let shutter = camera.shutter.map(shutter_of).transpose().map_err(fault)?;
     let checked = checked.map_err(fault)?;
+    let has_gain = camera.exposure.as_ref().is_some_and(|exposure| exposure.gain.is_some());
     let appearance = appearance_of(camera.exposure, camera.overlay.as_deref(), size_px);
     let appearance = appearance.and_then(|read| read.check(size_px).map(|()| read));
     let appearance = appearance.map_err(|cause| Fault::Appearance {
-        field: format!("{field}.{}", cause.field()),
+        field: match &cause {
+            // A gain stands for a matrix.
+            AppearanceError::Exposure { field: "matrix", .. } if has_gain => {
+                format!("{field}.exposure.gain")
+            }
+            AppearanceError::Exposure { field: part, .. } => format!("{field}.exposure.{part}"),
+            cause => format!("{field}.{}", cause.field()),
+        },
         cause,
     })?;
     Ok(RigCamera { name, camera: checked, rig_from_camera, shutter, appearance })

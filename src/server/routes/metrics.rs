@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use axum::Extension;
 use axum::extract::{Request, State};
-use axum::http::header;
+use axum::http::{Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
@@ -14,7 +14,7 @@ use crate::fault::Fault;
 use crate::metrics::GaugeValues;
 use crate::state::ServerState;
 
-use super::refusal::HttpResult;
+use super::refusal::{HttpResult, Refusal};
 
 /// `GET /metrics`, in OpenMetrics' text format.
 pub(super) async fn show(
@@ -44,7 +44,23 @@ pub(super) async fn count_refusals(
     request: Request,
     next: Next,
 ) -> Response {
-    let response = next.run(request).await;
+    let limit = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
+    let too_large =
+        |bytes: usize| Refusal::from(Fault::MessageTooLarge { bytes, limit }).into_response();
+    let announced = request.headers().get(header::CONTENT_LENGTH);
+    let announced = announced.and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
+    // Only the parts of an upload may be larger.
+    let is_upload = request.method() == Method::PATCH;
+    let mut response = match announced {
+        Some(bytes) if bytes > limit && !is_upload => too_large(bytes),
+        _ => next.run(request).await,
+    };
+    // A body of unknown length is refused by axum itself, without a code.
+    if response.status() == StatusCode::PAYLOAD_TOO_LARGE
+        && response.extensions().get::<WireCode>().is_none()
+    {
+        response = too_large(limit + 1);
+    }
     if let Some(code) = response.extensions().get::<WireCode>() {
         state.metrics.refused(&code.0);
     }

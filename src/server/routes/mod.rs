@@ -12,7 +12,7 @@ mod websocket;
 use std::sync::Arc;
 
 use axum::extract::{DefaultBodyLimit, Request, State};
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 use axum::routing::{get, post};
@@ -53,6 +53,8 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .route_layer(from_fn_with_state(state.clone(), authorize))
         .route("/healthz", get(async || "ok\n"))
         .route("/readyz", get(ready))
+        .fallback(no_route)
+        .method_not_allowed_fallback(no_method)
         .layer(json_limit)
         .layer(from_fn_with_state(state.clone(), metrics::count_refusals))
         .with_state(state)
@@ -81,8 +83,8 @@ async fn authorize(
 fn check_origin(headers: &HeaderMap) -> Result<(), Fault> {
     match headers.get(header::ORIGIN) {
         Some(origin) if !origin.to_str().is_ok_and(is_local) => {
-            let reason = format!("pages from {origin:?} are refused; loopback origins are allowed");
-            Err(Fault::Forbidden { reason })
+            let origin = String::from_utf8_lossy(origin.as_bytes()).into_owned();
+            Err(Fault::ForbiddenOrigin { origin })
         }
         _ => Ok(()),
     }
@@ -97,6 +99,14 @@ async fn ready(State(state): State<Arc<ServerState>>) -> Response {
             (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
         }
     }
+}
+
+async fn no_route(uri: Uri) -> Refusal {
+    Fault::NoRoute { path: uri.path().to_owned() }.into()
+}
+
+async fn no_method(method: Method, uri: Uri) -> Refusal {
+    Fault::NoMethod { method: method.to_string(), path: uri.path().to_owned() }.into()
 }
 
 /// Whether an origin is a page served from this machine.

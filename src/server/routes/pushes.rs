@@ -90,7 +90,11 @@ fn find_uploads(state: &ServerState, request: &PushRequest) -> Result<Vec<Source
     let spool = state.spool()?;
     let mut files = Vec::with_capacity(request.files.len());
     for (index, file) in request.files.iter().enumerate() {
-        let upload = spool.get(&file.upload)?;
+        let field = format!("files[{index}].upload");
+        let upload = spool.get(&file.upload).map_err(|fault| match fault {
+            Fault::UnknownUpload { id, .. } => Fault::UnknownUpload { id, field: Some(field) },
+            fault => fault,
+        })?;
         let size = upload.announced().size;
         if !upload.is_complete() {
             let held = upload.offset();

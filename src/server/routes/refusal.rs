@@ -29,6 +29,12 @@ impl IntoResponse for Refusal {
             let bearer = HeaderValue::from_static("Bearer realm=\"wildcity\"");
             response.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
         }
+        // A client whose handshake is refused learns what this server speaks (RFC 6455, section 4.4).
+        if matches!(self.0, Fault::NoUpgrade | Fault::Handshake { .. }) {
+            let headers = response.headers_mut();
+            headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
+            headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
+        }
         // The middleware that counts refusals reads the code here, not in the body.
         response.extensions_mut().insert(convert::code(&self.0));
         response

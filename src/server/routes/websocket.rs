@@ -29,10 +29,7 @@ pub(super) async fn upgrade(
     Extension(grant): Extension<Arc<Grant>>,
     mut request: Request,
 ) -> HttpResult {
-    let accept = match check_handshake(request.headers()) {
-        Ok(key) => derive_accept_key(key),
-        Err((status, message)) => return Ok((status, format!("{message}\n")).into_response()),
-    };
+    let accept = derive_accept_key(check_handshake(request.headers())?);
     grant.require(Role::Drive)?;
     let Ok(websocket_permit) = state.websocket_permits.clone().try_acquire_owned() else {
         let limit = state.limits.connections;
@@ -68,27 +65,28 @@ fn into_tcp(upgraded: Upgraded) -> Result<(TcpStream, Vec<u8>), Upgraded> {
 }
 
 /// The client's key, if the headers are those of a WebSocket handshake.
-fn check_handshake(headers: &HeaderMap) -> Result<&[u8], (StatusCode, String)> {
+fn check_handshake(headers: &HeaderMap) -> Result<&[u8], Fault> {
     let any = |name: header::HeaderName, is_wanted: &dyn Fn(&str) -> bool| {
         let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
         values.flat_map(|value| value.split(',')).any(|value| is_wanted(value.trim()))
     };
     let has = |name, wanted: &str| any(name, &|value| value.eq_ignore_ascii_case(wanted));
-    let bad = |message: &str| Err((StatusCode::BAD_REQUEST, message.to_owned()));
     if !has(header::CONNECTION, "upgrade") || !has(header::UPGRADE, "websocket") {
-        let message = "this address speaks WebSocket: send an upgrade".to_owned();
-        return Err((StatusCode::UPGRADE_REQUIRED, message));
+        return Err(Fault::NoUpgrade);
     }
     if !has(header::SEC_WEBSOCKET_VERSION, "13") {
-        return bad("Sec-WebSocket-Version must be 13");
+        return Err(Fault::Handshake { header: "sec-websocket-version", must: "must be 13" });
     }
     // Unlike the values above, names of subprotocols are case-sensitive.
     if !any(header::SEC_WEBSOCKET_PROTOCOL, &|offered| offered == convert::SUBPROTOCOL) {
-        return bad("offer the subprotocol wildcity.v1 in Sec-WebSocket-Protocol");
+        return Err(Fault::NoSubprotocol { protocol: convert::SUBPROTOCOL });
     }
     match headers.get(header::SEC_WEBSOCKET_KEY) {
         Some(key) if is_key(key.as_bytes()) => Ok(key.as_bytes()),
-        _ => bad("Sec-WebSocket-Key must be 16 bytes in base64"),
+        _ => {
+            let must = "must be 16 bytes in base64";
+            Err(Fault::Handshake { header: "sec-websocket-key", must })
+        }
     }
 }
 

@@ -105,7 +105,7 @@ impl Spool {
     /// # Errors
     /// [`Fault::UnknownUpload`].
     pub(crate) fn get(&self, id: &str) -> Result<Arc<Upload>, Fault> {
-        let unknown = || Fault::UnknownUpload { id: id.to_owned() };
+        let unknown = || Fault::UnknownUpload { id: id.to_owned(), field: None };
         self.uploads.lock().get(id).cloned().ok_or_else(unknown)
     }
 

@@ -8,7 +8,10 @@ use crate::error::SessionError;
 pub struct ObservationBuffer {
     words: Vec<u64>,
     len: usize,
+    /// Bytes that are reserved at the front.
     header: usize,
+    /// Where the message begins: what of the reserved bytes is not needed comes before.
+    start: usize,
     share: BudgetShare,
 }
 
@@ -20,20 +23,24 @@ impl ObservationBuffer {
         header: usize,
     ) -> Result<Self, SessionError> {
         let share = budget.reserve(len as u64)?;
-        Ok(Self { words: vec![0; len.div_ceil(8)], len, header, share })
+        Ok(Self { words: vec![0; len.div_ceil(8)], len, header, start: 0, share })
     }
 
-    /// All bytes: those reserved for the header, its length prefix included, and the tensors.
+    /// The message: the header, its length prefix included, and the tensors.
     pub fn bytes(&self) -> &[u8] {
-        &bytemuck::cast_slice(&self.words)[..self.len]
+        &bytemuck::cast_slice(&self.words)[self.start..self.len]
     }
 
-    /// The bytes reserved for the header, its length prefix included.
-    pub fn header_mut(&mut self) -> &mut [u8] {
+    /// Makes the message begin with a header of `bytes`, its length prefix included, and returns them.
+    /// `None` if not so many are reserved.
+    pub fn header_mut(&mut self, bytes: usize) -> Option<&mut [u8]> {
         let header = self.header;
-        &mut self.bytes_mut()[..header]
+        self.start = header.checked_sub(bytes)?;
+        let start = self.start;
+        Some(&mut self.bytes_mut()[start..header])
     }
 
+    /// All bytes, from the first that is reserved for the header.
     pub(crate) fn bytes_mut(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.words)[..self.len]
     }
@@ -71,5 +78,13 @@ mod tests {
         assert_eq!(buffer.bytes().len(), 80_016);
         assert_eq!(buffer.words.capacity() * 8, 80_016);
         assert_eq!(buffer.bytes()[80_004..80_006], [1, 2]);
+    }
+
+    #[test]
+    fn the_message_begins_with_a_header_of_its_own_size() {
+        let mut buffer = ObservationBuffer::zeroed(&AnswerBudget::default(), 20, 16).unwrap();
+        assert!(buffer.header_mut(17).is_none());
+        buffer.header_mut(8).unwrap().fill(7);
+        assert_eq!(buffer.bytes(), [7, 7, 7, 7, 7, 7, 7, 7, 0, 0, 0, 0]);
     }
 }

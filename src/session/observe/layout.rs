@@ -98,7 +98,7 @@ impl ObservationLayout {
         };
         let visible_shares = cameras.iter().map(visible_share).collect();
         let layout = Self { cameras, visible_shares, encoding, maps, schedule };
-        layout.check_size(layout.schedule.frames())?;
+        layout.check_size("outputs", layout.schedule.frames())?;
         Ok(layout)
     }
 
@@ -164,15 +164,16 @@ impl ObservationLayout {
         episode.views(&self.cameras, &capture.cameras, capture.world_from_rig, in_motion)
     }
 
-    /// Checks that the images of so many rigs fit one answer.
-    pub(super) fn check_size(&self, rigs: usize) -> Result<(), SessionError> {
+    /// Checks that the images of so many rigs, which `field` of a request asks for, fit one answer.
+    pub(super) fn check_size(&self, field: &'static str, rigs: usize) -> Result<(), SessionError> {
         let rig_pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
-        let pixel_bytes = 3 + 4 * self.maps.values() as u64;
-        let room_bytes = limits::OBSERVATION_BYTES as u64 - limits::OBSERVATION_HEADER_BYTES;
-        let limit = limits::ANSWER_PIXELS.min(room_bytes / pixel_bytes);
+        let limit = match self.maps.normals {
+            true => limits::ANSWER_PIXELS / 2,
+            false => limits::ANSWER_PIXELS,
+        };
         let pixels = rig_pixels * rigs as u64;
         if pixels > limit {
-            return Err(SessionError::AnswerTooLarge { pixels, limit });
+            return Err(SessionError::AnswerTooLarge { field, pixels, limit });
         }
         Ok(())
     }

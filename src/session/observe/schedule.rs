@@ -50,7 +50,7 @@ impl Schedule {
                 let field = format!("outputs.period_us.{name}");
                 return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
             }
-            check_period("outputs.period_us", period_us, dt_us)?;
+            check_period(&format!("outputs.period_us.{name}"), period_us, dt_us)?;
         }
         let period_us = |camera: &RigCamera| periods_us.get(&camera.name).copied().unwrap_or(dt_us);
         let periods_us = cameras.iter().map(period_us).collect();
@@ -100,14 +100,14 @@ impl Schedule {
 }
 
 /// Checks that a period is a whole number of steps and within its limits.
-fn check_period(field: &'static str, value_us: i64, dt_us: i64) -> Result<(), SessionError> {
+fn check_period(field: &str, value_us: i64, dt_us: i64) -> Result<(), SessionError> {
     let limits_us = dt_us..=limits::BUNDLE_PERIOD_US.max(dt_us);
     if value_us % dt_us == 0 && limits_us.contains(&value_us) {
         return Ok(());
     }
     let most_us = limits::BUNDLE_PERIOD_US;
     let must = format!("{value_us} µs; whole steps of {dt_us} µs up to {most_us} µs are accepted");
-    Err(SessionError::OutOfRange { field, must })
+    Err(SessionError::CameraOption { field: field.to_owned(), must })
 }
 
 #[cfg(test)]
@@ -188,8 +188,8 @@ mod tests {
         assert_eq!(new(16, "rear", 100_000, 100_000), "");
         assert!(new(17, "rear", 100_000, 100_000).starts_with("outputs.frames is 17"));
         assert!(new(0, "rear", 100_000, 100_000).starts_with("outputs.frames is 0"));
-        assert!(new(1, "rear", 150_000, 100_000).starts_with("outputs.period_us is 150000"));
-        assert!(new(1, "rear", 0, 100_000).starts_with("outputs.period_us is 0"));
+        assert!(new(1, "rear", 150_000, 100_000).starts_with("outputs.period_us.rear is 150000"));
+        assert!(new(1, "rear", 0, 100_000).starts_with("outputs.period_us.rear is 0"));
         assert!(new(1, "rear", 100_000, -100_000).starts_with("decision_us is -100000"));
         assert!(new(1, "roof", 100_000, 100_000).contains("no camera \"roof\""));
     }

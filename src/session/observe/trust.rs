@@ -63,7 +63,8 @@ pub struct Trust {
     pub angle_rad: f64,
     /// Share of pixels with less than half opacity, of those that look down at the ground.
     pub low_coverage: f64,
-    /// Share of rays that meet no block of the twin within 200 m, of those that look down at the ground.
+    /// Share of rays that meet no block of the twin within 200 m, of those that look down at the ground. Of an
+    /// image without such rays: 1 if the twin has no block within 200 m, else 0.
     pub outside: f64,
 }
 
@@ -144,7 +145,7 @@ impl TrainingCoverage {
         deviation_from(nearest)
     }
 
-    /// Samples the pixels that look down at the ground. Both shares are 0 if there are none.
+    /// Samples the pixels that look down at the ground.
     fn ground_shares(&self, view: &View, opacity: &[f32]) -> GroundShares {
         let width = view.camera.width_px as usize;
         let height = view.camera.height_px as usize;
@@ -153,6 +154,8 @@ impl TrainingCoverage {
         let mut holes = 0_u64;
         let mut rays = 0_u64;
         let mut outside = 0_u64;
+        // Rays to the ground that were not followed.
+        let mut skipped: Vec<DVec3> = Vec::new();
         // Samples begin in the middle of the first stride, so that even a small image has one.
         let samples = |side: usize| (PIXEL_STRIDE.min(side) / 2..side).step_by(PIXEL_STRIDE);
         for (sample_row, row) in samples(height).enumerate() {
@@ -167,19 +170,38 @@ impl TrainingCoverage {
                 if is_followed {
                     rays += 1;
                     outside += u64::from(!self.meets_content(from_m, ray));
+                } else if rays == 0 {
+                    skipped.push(ray);
                 }
             }
+        }
+        if rays == 0 {
+            // An image of less than 64 rows may have all of its followed samples above the horizon.
+            rays = skipped.len() as u64;
+            outside =
+                skipped.iter().filter(|ray| !self.meets_content(from_m, **ray)).count() as u64;
+        }
+        if rays == 0 {
+            let outside = if self.is_near_content(from_m) { 0.0 } else { 1.0 };
+            return GroundShares { holes: 0.0, outside };
         }
         let share = |part: u64, of: u64| part as f64 / of.max(1) as f64;
         GroundShares { holes: share(holes, pixels), outside: share(outside, rays) }
     }
 
+    /// Whether the twin has a block within [`RAY_M`], in any direction.
+    fn is_near_content(&self, from_m: DVec3) -> bool {
+        let around = (RAY_M / BLOCK_M) as i64;
+        let here = [from_m.x, from_m.y].map(|m| block_of(m) as i64);
+        (-around..=around).any(|x| {
+            (-around..=around).any(|y| self.heights_m.contains_key(&[here[0] + x, here[1] + y]))
+        })
+    }
+
     /// Whether a ray passes through the height of the content of a block, within [`RAY_M`]. The ray
     /// descends, and has unit length.
     fn meets_content(&self, from_m: DVec3, ray: DVec3) -> bool {
-        // From block to block through the map (Amanatides and Woo 1987). Cells, and so blocks, are offset
-        // by half a cell from the origin.
-        let block_of = |m: f64| ((m + 0.5 * CELL_M) / BLOCK_M).floor();
+        // From block to block through the map (Amanatides and Woo 1987).
         let mut block = [block_of(from_m.x), block_of(from_m.y)];
         let mut enter_m = 0.0;
         while enter_m < RAY_M {
@@ -206,4 +228,10 @@ impl TrainingCoverage {
         }
         false
     }
+}
+
+/// Index of the block at a coordinate, in x or in y. Cells, and so blocks, are offset by half a cell from the
+/// origin.
+fn block_of(m: f64) -> f64 {
+    ((m + 0.5 * CELL_M) / BLOCK_M).floor()
 }

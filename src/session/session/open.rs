@@ -226,7 +226,10 @@ fn select_cameras(
 
 /// The same rig with the requested crops and sizes.
 fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> {
-    let refused = |must: String| SessionError::OutOfRange { field: "outputs.images", must };
+    let refused = |field: &str, must: String| {
+        let field = format!("outputs.images{field}");
+        SessionError::CameraOption { field, must }
+    };
     // Check the overlays' sizes before any of them is scaled up.
     let rendered_pixels = |camera: &RigCamera| {
         let full = [camera.camera.width_px, camera.camera.height_px].map(u64::from);
@@ -237,19 +240,24 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
     };
     let overlaid = rig.cameras.iter().filter(|camera| camera.appearance.overlay.is_some());
     let pixels = overlaid.map(rendered_pixels).fold(0, u64::saturating_add);
-    check_overlay_pixels(pixels).map_err(|cause| refused(cause.to_string()))?;
+    check_overlay_pixels(pixels).map_err(|cause| refused("", format!("too large: {cause}")))?;
 
     for (name, ImagePart { crop, size }) in &outputs.images {
-        let camera = rig.cameras.iter_mut().find(|camera| camera.name == *name);
-        let camera =
-            camera.ok_or_else(|| refused(format!("camera {name:?}, which is not rendered")))?;
+        let Some(index) = rig.cameras.iter().position(|camera| camera.name == *name) else {
+            let known = rig.cameras.iter().map(|camera| camera.name.clone()).collect();
+            let field = format!("outputs.images.{name}");
+            return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
+        };
+        let camera = &mut rig.cameras[index];
         if let Some([left, top, width, height]) = *crop {
             let cropped = camera.cropped([left, top], [width, height]);
-            *camera = cropped.map_err(|cause| refused(cause.to_string()))?;
+            *camera = cropped
+                .map_err(|cause| refused(&format!(".{name}.crop"), format!("unusable: {cause}")))?;
         }
         if let Some([width, height]) = *size {
             let scaled = camera.scaled(width, height);
-            *camera = scaled.map_err(|cause| refused(cause.to_string()))?;
+            *camera = scaled
+                .map_err(|cause| refused(&format!(".{name}.size"), format!("unusable: {cause}")))?;
         }
     }
     Ok(rig)

@@ -87,7 +87,8 @@ impl Session {
                 start.as_ref(),
                 self.warm_up_us,
                 self.dynamics,
-            )?,
+            )
+            .map_err(|error| error.of_reset(start.as_ref()))?,
             None => self.start.clone(),
         };
         let mut next = start.episode(seed, self.dynamics, self.dt_us);

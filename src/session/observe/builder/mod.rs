@@ -47,7 +47,8 @@ impl ObservationBuilder {
         episode: &Episode,
         captures: &[RigCapture],
     ) -> Result<Self, SessionError> {
-        layout.check_size(captures.iter().filter(|capture| capture.shown).count())?;
+        // Only `observe` can ask for more than `open` has checked.
+        layout.check_size("poses", captures.iter().filter(|capture| capture.shown).count())?;
         let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let history = history.concat();

@@ -1,0 +1,63 @@
+//! The messages of a client, read also while its last request is carried out.
+//!
+//! A request may take a minute. A client that sends a ping meanwhile, to see whether the server lives, gets its
+//! pong at once, and one that closes the connection gets its Close frame. A request that comes too early waits here.
+
+use std::collections::VecDeque;
+use std::pin::pin;
+
+use crate::limits;
+use crate::socket::{Disconnect, Incoming, Socket};
+
+/// A socket, and what was received too early.
+pub(crate) struct Inbox {
+    pub(crate) socket: Socket,
+    /// What was received while a request was carried out, in order.
+    early: VecDeque<Result<Incoming, Disconnect>>,
+    early_bytes: usize,
+    /// Whether nothing more will be received.
+    ended: bool,
+}
+
+impl Inbox {
+    pub(crate) fn new(socket: Socket) -> Self {
+        Self { socket, early: VecDeque::new(), early_bytes: 0, ended: false }
+    }
+
+    /// Waits for the next message. Dropping the future loses no message.
+    pub(crate) async fn next(&mut self) -> Result<Incoming, Disconnect> {
+        let Some(early) = self.early.pop_front() else { return self.socket.receive().await };
+        if let Ok(Incoming::Text(text)) = &early {
+            self.early_bytes -= text.len();
+        }
+        early
+    }
+
+    /// Carries out a request, and keeps what is received meanwhile. A client that sends too much ahead is not
+    /// read until the request is done: then its pings wait as well.
+    pub(crate) async fn during<T>(&mut self, request: impl Future<Output = T>) -> T {
+        let mut request = pin!(request);
+        loop {
+            let has_room = self.early.len() < limits::EARLY_MESSAGES
+                && self.early_bytes < wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
+            if self.ended || !has_room {
+                return request.await;
+            }
+            tokio::select! {
+                biased;
+                done = &mut request => return done,
+                received = self.socket.receive() => self.keep(received),
+            }
+        }
+    }
+
+    fn keep(&mut self, received: Result<Incoming, Disconnect>) {
+        match &received {
+            Ok(Incoming::Alive) => return,
+            Ok(Incoming::Text(text)) => self.early_bytes += text.len(),
+            Err(Disconnect::Fault(fault)) if !fault.is_fatal() => {}
+            Err(_) => self.ended = true,
+        }
+        self.early.push_back(received);
+    }
+}

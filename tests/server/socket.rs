@@ -1,0 +1,155 @@
+//! WebSocket itself (RFC 6455): pings and Close frames at any time.
+
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use futures_util::{SinkExt, StreamExt};
+use serde_json::json;
+use tokio::io::AsyncWriteExt;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::CloseFrame;
+use wildcity_server::Limits;
+
+use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, pose, refused};
+
+/// The next frame, whatever it is.
+async fn frame(agent: &mut Agent) -> Option<Message> {
+    let next = tokio::time::timeout(TEST_TIMEOUT, agent.socket.next()).await;
+    next.expect("a frame in time").and_then(Result::ok)
+}
+
+/// The code of the Close frame that comes next.
+async fn close_code(agent: &mut Agent) -> u16 {
+    match frame(agent).await {
+        Some(Message::Close(Some(CloseFrame { code, .. }))) => code.into(),
+        other => panic!("no Close frame with a code: {other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn pings_are_answered_while_a_request_runs() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    server.painter.slow_ms.store(1500, Ordering::SeqCst);
+    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    for number in 0..5_u8 {
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        let sent = Instant::now();
+        agent.socket.send(Message::Ping(vec![number; 3].into())).await.unwrap();
+        assert_eq!(frame(&mut agent).await, Some(Message::Pong(vec![number; 3].into())));
+        assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+    }
+    assert_eq!(agent.seen().await.meta["step"], 1);
+}
+
+#[tokio::test]
+async fn requests_that_come_early_wait_in_order() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    server.painter.slow_ms.store(100, Ordering::SeqCst);
+    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    agent.socket.send(Message::binary(vec![0; 8])).await.unwrap();
+    agent.send(json!({ "type": "step", "pose": pose(2.0) })).await;
+    agent.socket.send(Message::Ping("x".into())).await.unwrap();
+    agent.send(json!({ "type": "step", "pose": pose(3.0) })).await;
+    assert_eq!(frame(&mut agent).await, Some(Message::Pong("x".into())));
+    assert_eq!(agent.seen().await.meta["step"], 1);
+    let Reply::Text(answer) = agent.receive().await else { panic!("no text") };
+    refused(&answer, "unexpected_binary");
+    assert_eq!(agent.seen().await.meta["step"], 2);
+    assert_eq!(agent.seen().await.meta["step"], 3);
+
+    // More than the server holds: the rest waits in the socket, and comes in order too.
+    server.painter.slow_ms.store(300, Ordering::SeqCst);
+    agent.send(json!({ "type": "step", "pose": pose(4.0) })).await;
+    server.painter.slow_ms.store(0, Ordering::SeqCst);
+    for number in 0..200 {
+        agent.send(json!({ "type": "step", "pose": pose(f64::from(number)) })).await;
+    }
+    for step in 4..=204 {
+        assert_eq!(agent.seen().await.meta["step"], step);
+    }
+}
+
+#[tokio::test]
+async fn a_close_frame_is_answered_with_its_code() {
+    let server = TestServer::start().await;
+    for (code, answered) in
+        [(Some(1000_u16), Some(1000_u16)), (Some(4321), Some(4321)), (None, None)]
+    {
+        let mut agent = server.agent().await;
+        let frame = code.map(|code| CloseFrame { code: code.into(), reason: "done".into() });
+        agent.socket.send(Message::Close(frame)).await.unwrap();
+        let Some(Message::Close(found)) = self::frame(&mut agent).await else { panic!("no Close") };
+        assert_eq!(found.map(|frame| u16::from(frame.code)), answered);
+        assert_eq!(self::frame(&mut agent).await, None);
+    }
+}
+
+/// A client that leaves during a step gets its Close frame at once, and the step is there when it comes back.
+#[tokio::test]
+async fn a_close_frame_is_answered_while_a_request_runs() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    server.painter.slow_ms.store(800, Ordering::SeqCst);
+    agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    let sent = Instant::now();
+    agent.socket.send(Message::Close(None)).await.unwrap();
+    assert_eq!(frame(&mut agent).await, Some(Message::Close(None)));
+    assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+    let mut agent = server.agent().await;
+    let resume = json!({ "type": "resume", "session": "a", "last_seq": 1 });
+    let resumed = agent.ask(resume).await;
+    assert_eq!((&resumed["last_seq"], &resumed["step"]), (&json!(2), &json!(1)));
+}
+
+#[tokio::test]
+async fn the_servers_own_close_frame_says_why() {
+    // A silent client.
+    let idle = Duration::from_millis(200);
+    let server = TestServer::with(Limits { idle, ..Limits::default() }).await;
+    let mut agent = server.agent().await;
+    let Reply::Text(answer) = agent.receive().await else { panic!("no text") };
+    refused(&answer, "timed_out");
+    assert_eq!(close_code(&mut agent).await, 1008);
+
+    // Frames that are not WebSocket, text that is not UTF-8, a message that is too large.
+    let server = TestServer::start().await;
+    let mut too_large = vec![0x81, 0x80 | 127];
+    too_large.extend((2_u64 << 20).to_be_bytes());
+    too_large.extend([0; 4]);
+    for (bytes, code, close) in [
+        (vec![0x81, 0x01, b'x'], "malformed_json", 1002),
+        (vec![0x83, 0x80, 0, 0, 0, 0], "malformed_json", 1002),
+        (vec![0xC1, 0x80, 0, 0, 0, 0], "malformed_json", 1002),
+        (vec![0x80, 0x80, 0, 0, 0, 0], "malformed_json", 1002),
+        (vec![0x09, 0x80, 0, 0, 0, 0], "malformed_json", 1002),
+        (vec![0x81, 0x82, 0, 0, 0, 0, 0xC3, 0x28], "malformed_json", 1007),
+        (too_large, "message_too_large", 1009),
+    ] {
+        let mut agent = server.agent().await;
+        agent.tcp().write_all(&bytes).await.unwrap();
+        let Reply::Text(answer) = agent.receive().await else { panic!("no text") };
+        refused(&answer, code);
+        assert_eq!(close_code(&mut agent).await, close, "{bytes:x?}");
+    }
+
+    // A session that was resumed elsewhere; a server that stops.
+    let mut old = server.driver("a").await;
+    let mut new = server.agent().await;
+    let resume = json!({ "type": "resume", "session": "a", "last_seq": 1 });
+    assert_eq!(new.ask(resume).await["type"], "resumed");
+    let Reply::Text(answer) = old.receive().await else { panic!("no text") };
+    refused(&answer, "session_state");
+    assert_eq!(close_code(&mut old).await, 1008);
+    let TestServer { running, .. } = server;
+    let stopping = tokio::spawn(running.stop());
+    let Reply::Text(answer) = new.receive().await else { panic!("no text") };
+    refused(&answer, "shutting_down");
+    let message = answer["message"].as_str().unwrap();
+    assert!(!message.contains("resume") && message.contains("open"), "{message}");
+    assert_eq!(close_code(&mut new).await, 1001);
+    drop(new);
+    stopping.await.unwrap();
+}
