@@ -10,11 +10,13 @@
 //! | `drive` | an episode as the scores see it |
 //! | `outcome` | the result of an episode |
 //! | `diff` | where two episodes part |
+//! | `export` | an episode as MCAP |
 //! | `listing` | the episodes of a directory |
 //! | [`limits`] | limits |
 
 mod diff;
 mod drive;
+mod export;
 mod file;
 pub mod limits;
 mod lines;
@@ -23,10 +25,11 @@ mod outcome;
 
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
+pub use export::{ExportError, Exported, export};
 pub use file::{CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead};
 pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list};
+pub use listing::{Listed, list, text};
 pub use outcome::result;
