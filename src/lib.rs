@@ -10,7 +10,8 @@
 //! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | nothing of ours |
 //! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
 //! | [`wildcity_generate`] | procedural streets and cities | scene |
-//! | [`wildcity_sim`] | what moves: the dynamics of the ego vehicle | scene |
+//! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | scene |
+//! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |

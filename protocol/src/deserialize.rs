@@ -7,7 +7,10 @@ use serde::de::{Error, IntoDeserializer, MapAccess, Visitor, value::MapAccessDes
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
-use crate::message::{Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, Start};
+use crate::message::{
+    BranchPoint, Dynamics, DynamicsChoice, DynamicsModel, Pose, Rig, RigChoice, ScenarioChoice,
+    Start,
+};
 
 /// Path of the first field of a request that no type knows, for example `rig.cameras[2].widht`.
 ///
@@ -56,6 +59,64 @@ impl<'de> Deserialize<'de> for Start {
             }
             _ => Err(D::Error::custom("a start has either pose, or trajectory and station_m")),
         }
+    }
+}
+
+/// Decided by the fields that are present.
+impl<'de> Deserialize<'de> for BranchPoint {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Either {
+            session: Option<String>,
+            snapshot: Option<String>,
+            episode: Option<String>,
+            step: Option<u64>,
+        }
+        let Either { session, snapshot, episode, step } = Either::deserialize(deserializer)?;
+        match (session, snapshot, episode, step) {
+            (Some(session), Some(snapshot), None, None) => Ok(Self::Snapshot { session, snapshot }),
+            (None, None, Some(episode), Some(step)) => Ok(Self::Recorded { episode, step }),
+            _ => Err(D::Error::custom(
+                "a branch is from either session and snapshot, or episode and step",
+            )),
+        }
+    }
+}
+
+/// A string is a name; an object is the scenario if it has a format, and else a name with values.
+impl<'de> Deserialize<'de> for ScenarioChoice {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Values {
+            name: String,
+            #[serde(default)]
+            values: serde_json::Map<String, serde_json::Value>,
+        }
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = ScenarioChoice;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("the name of a scenario, an object with name and values, or a scenario")
+            }
+
+            fn visit_str<E: Error>(self, name: &str) -> Result<ScenarioChoice, E> {
+                Ok(ScenarioChoice::Name(name.to_owned()))
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<ScenarioChoice, A::Error> {
+                let map = serde_json::Map::deserialize(MapAccessDeserializer::new(map))?;
+                if map.contains_key("format") {
+                    return Ok(ScenarioChoice::Inline(map));
+                }
+                let Values { name, values } =
+                    serde_json::from_value(map.into()).map_err(A::Error::custom)?;
+                Ok(ScenarioChoice::Values { name, values })
+            }
+        }
+        deserializer.deserialize_any(Either)
     }
 }
 

@@ -38,6 +38,12 @@ pub enum Code {
     UnknownTrajectory,
     /// There is no session of this name that can be resumed.
     UnknownSession,
+    /// There is no such snapshot or recorded episode, or the recorded episode cannot be continued.
+    UnknownState,
+    /// The server has no scenario of this name.
+    UnknownScenario,
+    /// The scenario is malformed, does not fit the twin, or a hash that it names differs.
+    ScenarioInvalid,
     /// A session of this name already exists.
     SessionExists,
     /// A name is not 1 to 64 characters of `[a-z0-9._-]`, or starts with a dot.

@@ -56,6 +56,15 @@ pub struct ObservationMetadata {
     /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Image>,
+    /// What happened since the observation before, by time. Only with a scenario.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub events: Vec<Event>,
+    /// Where to drive. Only with a scenario that has a route.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub route: Option<Route>,
+    /// The actors that are there. Only with `outputs.actors`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actors: Option<Vec<Actor>>,
     /// Wall time that the observation took.
     pub timings: Timings,
     /// Memory of the server, and how long the observation waited for loading.
@@ -84,6 +93,95 @@ pub struct Ego {
     /// Number of poses of the history, counted from its end, that were driven. The earlier ones repeat the
     /// start.
     pub history_count: u64,
+}
+
+/// Something that happened in a scenario.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Event {
+    /// When, in simulated microseconds.
+    pub time_us: i64,
+    /// What.
+    pub kind: EventKind,
+    /// Name of the actor, if it is about one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actor: Option<String>,
+    /// Name of the trigger, or the reason of an end: `time`, `off_route`, `contact`, `stuck` or `route_done`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// Whether the ego is at fault for the contact.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub at_fault: Option<bool>,
+    /// Speed of the two against each other at the contact, in m/s.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub impact: Option<f64>,
+}
+
+/// What happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum EventKind {
+    /// The ego began to touch an actor.
+    Contact,
+    /// A trigger of an actor fired.
+    Trigger,
+    /// An actor appeared.
+    Appeared,
+    /// An actor disappeared.
+    Left,
+    /// A rule of the scenario ended the episode.
+    End,
+}
+
+/// Where to drive.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Route {
+    /// Up to 20 points of the route in the rig's frame, in metres: the first beside the ego, then every 80/19 m.
+    pub points: Vec<[f64; 3]>,
+    /// What to do next.
+    pub command: NavigationCommand,
+    /// The same in words, if the scenario has them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text: Option<String>,
+    /// Distance of the ego along the route, in metres.
+    pub station_m: f64,
+    /// Distance of the ego from the route, in metres.
+    pub off_m: f64,
+    /// Length of the route, in metres.
+    pub length_m: f64,
+}
+
+/// What to do next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum NavigationCommand {
+    /// To the left.
+    Left,
+    /// To the right.
+    Right,
+    /// Straight on.
+    Straight,
+}
+
+/// An actor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Actor {
+    /// Name within the scenario.
+    pub name: String,
+    /// `vehicle`, `pedestrian`, `bicycle` or `object`.
+    pub kind: String,
+    /// Length, width and height of its box, in metres.
+    pub size: [f64; 3],
+    /// `world_from_actor`: the box's origin is on the ground under its middle, x forward, z up.
+    pub pose: Pose,
+    /// Velocity in world axes, in m/s.
+    pub velocity: [f64; 3],
+    /// Yaw rate, positive to the left, in rad/s.
+    pub yaw_rate: f64,
 }
 
 /// One image.

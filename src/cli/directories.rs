@@ -67,6 +67,28 @@ impl Episodes {
     }
 }
 
+/// `--scenarios`, for the server.
+#[derive(Debug, clap::Args)]
+pub(super) struct Scenarios {
+    /// Directory of the scenarios that sessions can open by name: NAME.json, with the tracks and maps that they
+    /// name [default: $XDG_DATA_HOME/wildcity/scenarios, or ~/.local/share/wildcity/scenarios]
+    #[arg(long, value_name = "DIR")]
+    scenarios: Option<PathBuf>,
+}
+
+impl Scenarios {
+    /// The directory of `--scenarios`, or the user's own.
+    pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
+        if let Some(dir) = &self.scenarios {
+            return Ok(dir.clone());
+        }
+        match xdg_dir("XDG_DATA_HOME", ".local/share") {
+            Some(data) => Ok(data.join("wildcity/scenarios")),
+            None => anyhow::bail!("neither HOME nor XDG_DATA_HOME is set: give --scenarios DIR"),
+        }
+    }
+}
+
 /// `--uploads`, for every command that accepts uploads.
 #[derive(Debug, clap::Args)]
 pub(super) struct Uploads {

@@ -24,6 +24,7 @@ mod input_files;
 mod inspect;
 mod limits;
 mod lod;
+mod map;
 mod output;
 mod profile_options;
 mod progress;
@@ -33,6 +34,7 @@ mod replay;
 mod report;
 mod rig;
 mod route;
+mod scenario;
 mod scene_source;
 mod serve;
 mod sky_source;
@@ -71,6 +73,8 @@ enum Command {
     Episode(episode::Episode),
     Rig(rig::RigCommand),
     Route(route::Route),
+    Scenario(scenario::ScenarioCommand),
+    Map(map::MapCommand),
     Bench(bench::Bench),
     Bisect(bisect::Bisect),
     Stress(stress::Stress),
@@ -95,6 +99,8 @@ pub fn main() -> ExitCode {
         Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),
         Command::Route(command) => command.run(),
+        Command::Scenario(command) => command.run(),
+        Command::Map(command) => command.run(),
         Command::Bench(command) => command.run(),
         Command::Bisect(command) => command.run(),
         Command::Stress(command) => command.run(),

@@ -24,6 +24,8 @@ pub struct Config {
     pub cache: Option<DiskCacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
+    /// Directory of the scenarios that can be opened by name; it need not exist.
+    pub scenarios: PathBuf,
     /// Directory where uploads are kept until they are pushed. One server uses it at a time.
     pub uploads: PathBuf,
     /// The tokens of clients; without tokens every client may do everything.
@@ -109,13 +111,24 @@ impl Default for SpoolLimits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
-            self;
+        let Self {
+            listen,
+            twins,
+            cache,
+            episodes,
+            scenarios,
+            uploads,
+            tokens,
+            backend,
+            profile,
+            limits,
+        } = self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("twins", twins)
             .field("cache", cache)
             .field("episodes", episodes)
+            .field("scenarios", scenarios)
             .field("uploads", uploads)
             .field("tokens", &tokens.is_some())
             .field("backend", &backend.name())

@@ -12,7 +12,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions};
 
 use crate::auth::Grant;
-use crate::convert::{self, Command, Parsed};
+use crate::convert::{self, BranchPoint, Command, DriveRequest, Parsed};
 use crate::fault::Fault;
 use crate::limits;
 use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
@@ -51,6 +51,10 @@ struct Connection {
 }
 
 const NO_SESSION: Fault = Fault::SessionState("no session is open; send open or resume");
+
+fn new_session_name() -> String {
+    format!("s-{}", uuid::Uuid::now_v7().as_simple())
+}
 
 impl Connection {
     /// Answers requests until the connection ends; returns why it did.
@@ -171,10 +175,13 @@ impl Connection {
         match command {
             Command::Hello { client } => self.hello(seq, client).await,
             _ if !self.hello_done => Err(Fault::WrongOrder("the first request is hello")),
-            Command::Open { .. } | Command::Resume { .. } if self.slot.is_some() => {
+            Command::Open { .. } | Command::Branch { .. } | Command::Resume { .. }
+                if self.slot.is_some() =>
+            {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Open { name, opening } => self.open(seq, name, *opening).await,
+            Command::Open { name, opening, drive } => self.open(seq, name, *opening, drive).await,
+            Command::Branch { name, from } => self.branch(seq, name, from).await,
             Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
             Command::Step { movement, terminate } => {
                 let begun = Instant::now();
@@ -192,6 +199,14 @@ impl Connection {
             Command::Prefetch { poses } => {
                 self.session()?.prefetch(poses)?;
                 Ok(Answer::Text(convert::ok(seq)?.into()))
+            }
+            Command::Snapshot { name } => {
+                self.session()?.take_snapshot(name)?;
+                Ok(Answer::Text(convert::ok(seq)?.into()))
+            }
+            Command::Restore { name } => {
+                let frame = self.session()?.restore(&name).await?;
+                self.observation(seq, frame)
             }
             Command::Reset { seed, start } => {
                 let frame = self.session()?.reset(seed, start).await?;
@@ -235,16 +250,55 @@ impl Connection {
         seq: u64,
         name: Option<String>,
         mut opening: SessionOptions,
+        drive: Option<DriveRequest>,
     ) -> Result<Answer, Fault> {
         opening.profile = opening.profile.or(&self.state.profile);
         self.grant.require_twin(&opening.twin)?;
-        let name = name.unwrap_or_else(|| format!("s-{}", uuid::Uuid::now_v7().as_simple()));
-        let mut slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+        let name = name.unwrap_or_else(new_session_name);
+        let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
         let opened = Session::open(self.state.engine.clone(), name, opening);
-        let opened = timeout(self.state.limits.step, opened).await;
+        self.fill(seq, slot, drive, opened).await
+    }
+
+    /// Opens a session in a state of another episode.
+    async fn branch(
+        &mut self,
+        seq: u64,
+        name: Option<String>,
+        from: BranchPoint,
+    ) -> Result<Answer, Fault> {
+        let name = name.unwrap_or_else(new_session_name);
+        let engine = self.state.engine.clone();
+        match from {
+            BranchPoint::Snapshot { session, snapshot } => {
+                let snapshots = self.state.sessions.snapshots(&session, &self.grant.name)?;
+                let from = snapshots.find("from.snapshot", &snapshot)?;
+                self.grant.require_twin(from.twin())?;
+                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+                self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
+            }
+            BranchPoint::Recorded { episode, step } => {
+                let from = Session::recorded(&engine, &episode, step).await?;
+                self.grant.require_twin(from.twin())?;
+                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+                self.fill(seq, slot, None, Session::continued(engine, name, from)).await
+            }
+        }
+    }
+
+    /// Opens a session into a new slot.
+    async fn fill(
+        &mut self,
+        seq: u64,
+        mut slot: SlotGuard,
+        drive: Option<DriveRequest>,
+        opening: impl Future<Output = Result<Session, SessionError>>,
+    ) -> Result<Answer, Fault> {
+        let opened = timeout(self.state.limits.step, opening).await;
         let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
-        let text = convert::opened(seq, &session)?;
+        let text = convert::opened(seq, &session, drive.as_ref())?;
         tracing::info!(session = session.name(), "opened");
+        slot.share_snapshots(&session);
         slot.session = Some(session);
         self.slot = Some(slot);
         Ok(Answer::Text(text.into()))

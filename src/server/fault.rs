@@ -72,6 +72,24 @@ pub(crate) enum Fault {
         /// The name asked for.
         name: String,
     },
+    /// There is no session of that name to open another one from.
+    #[error("there is no session {name:?} of this token; it ended, or was never opened")]
+    NoSuchSession {
+        /// The field of the request that names it.
+        field: &'static str,
+        /// The name asked for.
+        name: String,
+    },
+    /// The twin has no trajectory of this name.
+    #[error("the twin has no trajectory {name:?}; it has {}", known.join(", "))]
+    UnknownTrajectory {
+        /// The field of the request that names it.
+        field: String,
+        /// The name asked for.
+        name: String,
+        /// The names of the twin's trajectories.
+        known: Vec<String>,
+    },
     /// Another session has the name.
     #[error("there is a session {name:?} already; resume it, or choose another name")]
     SessionExists {

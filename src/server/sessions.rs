@@ -9,7 +9,7 @@ use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::{Instant, timeout};
 
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{Observation, Outcome, Session};
+use wildcity_session::{Observation, Outcome, Session, Snapshots};
 use wildcity_twin::residency::Viewpoint;
 
 use crate::fault::Fault;
@@ -28,6 +28,8 @@ struct Entry {
     slot: Arc<AsyncMutex<SessionSlot>>,
     /// Name of the token that opened the session.
     owner: String,
+    /// The session's snapshots, from which other sessions can be opened.
+    snapshots: Snapshots,
     /// The session after its last request; none before the first.
     view: Option<SessionView>,
     /// Asks the connection that holds the slot to release it.
@@ -126,6 +128,7 @@ impl SessionRegistry {
         let entry = Entry {
             slot,
             owner: owner.to_owned(),
+            snapshots: Snapshots::default(),
             view: None,
             release: release.clone(),
             parked: None,
@@ -133,6 +136,18 @@ impl SessionRegistry {
         entries.insert(name.clone(), entry);
         drop(entries);
         Ok(self.guard(name, release, guard))
+    }
+
+    /// The snapshots of a session, whichever connection holds it.
+    ///
+    /// # Errors
+    /// There is no such session of this owner.
+    pub(crate) fn snapshots(&self, name: &str, owner: &str) -> Result<Snapshots, Fault> {
+        let entries = self.entries.lock();
+        // Other clients must not learn that the session exists.
+        let entry = entries.get(name).filter(|entry| entry.owner == owner);
+        let unknown = || Fault::NoSuchSession { field: "from.session", name: name.to_owned() };
+        Ok(entry.ok_or_else(unknown)?.snapshots.clone())
     }
 
     /// Takes over the slot of a session, even if its old connection still holds it: after a network
@@ -263,6 +278,13 @@ impl SessionRegistry {
 }
 
 impl SlotGuard {
+    /// Lets other sessions be opened from the snapshots of this slot's new session.
+    pub(crate) fn share_snapshots(&self, session: &Session) {
+        if let Some(entry) = self.registry.entries.lock().get_mut(&self.name) {
+            entry.snapshots = session.snapshots().clone();
+        }
+    }
+
     /// Updates the part of the session's state that is visible to the rest of the server.
     pub(crate) fn update_view(&self) {
         let Some(session) = &self.slot.session else { return };

@@ -9,7 +9,7 @@ use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
 
 use wildcity_push::PushQueue;
-use wildcity_session::{Engine, EngineSettings, SessionError};
+use wildcity_session::{Engine, EngineSettings, Scenarios, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
@@ -64,8 +64,18 @@ pub enum ServerError {
 /// be used. A directory for uploads that cannot be used is only logged: the server starts and refuses
 /// uploads.
 pub async fn start(config: Config) -> Result<Running, ServerError> {
-    let Config { listen, twins, cache, episodes, uploads, tokens, backend, profile, limits } =
-        config;
+    let Config {
+        listen,
+        twins,
+        cache,
+        episodes,
+        scenarios,
+        uploads,
+        tokens,
+        backend,
+        profile,
+        limits,
+    } = config;
     if tokens.is_none() && !listen.ip().is_loopback() {
         return Err(ServerError::PublicAddress { address: listen });
     }
@@ -75,8 +85,13 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
     let catalog = Catalog::open_cached(&twins, cache.as_ref())?;
     let cache = Cache::limited(catalog, limits.resident_bytes);
-    let engine =
-        Engine::start(EngineSettings { cache, episodes, backend, step_timeout: limits.step })?;
+    let engine = Engine::start(EngineSettings {
+        cache,
+        episodes,
+        scenarios: Scenarios::in_dir(scenarios),
+        backend,
+        step_timeout: limits.step,
+    })?;
 
     // The socket.
     let listen_error = |cause| ServerError::Listen { address: listen, cause };

@@ -1,6 +1,7 @@
 //! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
-//! A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
+//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues
+//! exactly as the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
 //! new one before it replaces the old, so that a step which fails on the way has not happened.
 
 use std::collections::VecDeque;
@@ -11,6 +12,7 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::trajectory::Keyframe;
+use wildcity_sim::scenario::EndReason;
 use wildcity_sim::{Command, Ego, Ground};
 
 use crate::error::SessionError;
@@ -20,7 +22,8 @@ use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
 const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
 
 /// The state of an episode.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Episode {
     seed: u64,
     dt_us: i64,
@@ -34,7 +37,15 @@ pub struct Episode {
     /// Where the track began, in microseconds: 0, or the start of the warm-up, which is below 0.
     begin_us: i64,
     /// The least mean trust of an observation, of those that came with a trust.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     least_trust: Option<f64>,
+    /// Whether a rule of the scenario ended it because the ego failed.
+    #[serde(default, skip_serializing_if = "is_false")]
+    failed: bool,
+}
+
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// Why an episode ended.
@@ -46,6 +57,8 @@ pub enum Outcome {
     /// As `Completed`, but the ego left the recorded area: the trust of an observation was below
     /// [`limits::OFF_MODEL_TRUST`]. Only in sessions whose observations have a trust.
     OffModel,
+    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    DrivingFailure,
     /// The agent broke the protocol, and the connection was closed.
     AgentError,
     /// The agent was silent for too long.
@@ -106,6 +119,7 @@ impl Episode {
             track,
             begin_us,
             least_trust: None,
+            failed: false,
         }
     }
 
@@ -164,6 +178,31 @@ impl Episode {
         selected.iter().map(|&camera| all[camera]).collect()
     }
 
+    /// Checks a state that was read from a file. Returns what is wrong with it otherwise.
+    pub(crate) fn check(&self) -> Result<(), &'static str> {
+        let rising = self.track.iter().is_sorted_by(|a, b| a.time_us < b.time_us);
+        match self.track.back() {
+            None => Err("a state without a pose"),
+            Some(_) if !rising => Err("a state whose times do not rise"),
+            Some(_) if self.dt_us <= 0 => Err("a state whose steps take no time"),
+            Some(now) if now.world_from_rig != self.world_from_rig() => {
+                Err("a state whose last pose is not the ego's")
+            }
+            Some(_) => Ok(()),
+        }
+    }
+
+    /// The poses before its start, if it is still there.
+    pub(crate) fn warm_up(&self) -> Vec<Keyframe> {
+        let before = self.track.iter().filter(|key| self.step == 0 && key.time_us < 0);
+        before.copied().collect()
+    }
+
+    /// Whether it has its start alone: no step was made, and there is no warm-up before the start.
+    pub(crate) fn is_start_alone(&self) -> bool {
+        self.step == 0 && self.begin_us == 0
+    }
+
     /// Seed of the episode.
     pub fn seed(&self) -> u64 {
         self.seed
@@ -211,13 +250,16 @@ impl Episode {
         outcome: Outcome,
         least_trust: Option<f64>,
     ) -> EpisodeSummary {
-        let completed =
-            self.terminated || matches!(outcome, Outcome::Completed | Outcome::OffModel);
+        let completed = self.terminated
+            || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
         let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
-        let outcome = match (completed, off_model) {
-            (true, true) => Outcome::OffModel,
-            (true, false) => Outcome::Completed,
-            (false, _) => outcome,
+        // Rules of a scenario are not evaluated by a replay: what a record says of them is believed.
+        let failed = self.failed || outcome == Outcome::DrivingFailure;
+        let outcome = match (completed, off_model, failed) {
+            (true, true, _) => Outcome::OffModel,
+            (true, false, true) => Outcome::DrivingFailure,
+            (true, false, false) => Outcome::Completed,
+            (false, ..) => outcome,
         };
         EpisodeSummary {
             outcome,
@@ -226,6 +268,12 @@ impl Episode {
             distance_m: self.distance_m,
             least_trust,
         }
+    }
+
+    /// Ends the episode by a rule of the scenario.
+    pub(crate) fn end(&mut self, reason: EndReason) {
+        self.terminated = true;
+        self.failed = reason.is_failure();
     }
 
     /// Takes the trusts of an observation's images, 0 to 1 each, into account; there may be none.

@@ -8,7 +8,8 @@ use wildcity_sim::EgoError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
-use crate::record::error::RecordError;
+use crate::record::error::{BranchError, RecordError};
+use crate::scenario::ScenarioError;
 
 /// Why a request was refused. The session is then as it was before the request.
 #[derive(Debug, thiserror::Error)]
@@ -19,6 +20,9 @@ pub enum SessionError {
     /// What a frame needs does not fit into memory, or could not be loaded.
     #[error(transparent)]
     Residency(ResidencyError),
+    /// The scenario does not exist, is malformed, or does not fit the twin.
+    #[error(transparent)]
+    Scenario(#[from] ScenarioError),
     /// There is no rig preset of this name.
     #[error("there is no rig preset {name:?}; there is {}", known.join(", "))]
     UnknownRig {
@@ -40,6 +44,27 @@ pub enum SessionError {
     /// A recorded drive of the twin is no route.
     #[error(transparent)]
     Route(#[from] RouteError),
+    /// The session has no snapshot of this name.
+    #[error("there is no snapshot {name:?}; there is {}", joined_or_none(known))]
+    UnknownSnapshot {
+        /// The field of the request that names it, as on the wire.
+        field: &'static str,
+        /// The requested name.
+        name: String,
+        /// The names of the session's snapshots.
+        known: Vec<String>,
+    },
+    /// There is no recorded episode of this name.
+    #[error(
+        "there is no recorded episode {name:?}; an episode is named SESSION-NUMBER, as its file"
+    )]
+    UnknownEpisode {
+        /// The requested name.
+        name: String,
+    },
+    /// A recorded episode cannot be continued.
+    #[error("the recorded episode cannot be continued: {0}")]
+    Branch(Box<BranchError>),
     /// A camera was requested twice.
     #[error("camera {name:?} is requested twice; name each camera once")]
     CameraTwice {

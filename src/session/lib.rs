@@ -8,11 +8,13 @@
 //! |---|---|
 //! | `session` | a session: opening it, answering its requests |
 //! | `options`, `start` | what a client requests when it opens a session; where episodes start |
-//! | `episode` | the ego's pose, the simulated time, and the past poses |
+//! | `state`, `episode` | the parts of a session; the ego's pose, the simulated time, and the past poses |
+//! | `snapshot` | named states, to return to and to open other sessions from |
 //! | `engine` | the twins in memory, the render queue, the budget for answers |
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
+//! | `scenario` | scenarios by name, and the files beside them |
 //! | `preview` | the preview of a push |
 //! | [`limits`] | limits and defaults |
 
@@ -26,8 +28,11 @@ mod options;
 mod prefetch;
 mod preview;
 mod record;
+mod scenario;
 mod session;
+mod snapshot;
 mod start;
+mod state;
 mod viewpoint;
 
 pub use engine::render_queue::Scratch;
@@ -42,17 +47,25 @@ pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
 pub use observe::trust::{TrainingCoverage, Trust};
-pub use options::{ImagePart, Outputs, PixelMaps, RigChoice, SessionOptions, Start};
+pub use options::{
+    ImagePart, Outputs, PixelMaps, RigChoice, ScenarioOptions, SessionOptions, Start,
+};
 pub use preview::{ProposedChange, PsnrPreview};
+pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
-pub use record::error::RecordError;
+pub use record::error::{BranchError, RecordError};
 pub use record::format::{
-    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOutputs, RecordedVersion,
+    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOrigin, RecordedOutputs,
+    RecordedSettings, RecordedVersion, is_episode_name,
 };
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
     WrongValue,
 };
+pub use scenario::{
+    EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
+};
 pub use session::Session;
+pub use snapshot::{Snapshot, Snapshots};
 pub use viewpoint::viewpoints;

@@ -2,6 +2,16 @@
 
 use std::time::Duration;
 
+/// Most events of one observation.
+pub const EVENTS: usize = 64;
+
+/// Room in the header of an observation for its events and the route: 64 events of at most 600 bytes, 20 points of 80,
+/// and a text of a command of at most 1,000 bytes, each twice at worst, since the metadata is a text within JSON.
+pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
+
+/// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
+pub const ACTOR_HEADER_BYTES: usize = 640;
+
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
@@ -26,6 +36,10 @@ pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
 /// Sessions at once, both connected ones and ones that wait for their client to resume.
 pub const SESSIONS: usize = 256;
+
+/// Snapshots of one session. A snapshot holds the last frames of a bundle, which count against
+/// [`ANSWERS_BYTES`], and the poses of 1.5 s.
+pub const SNAPSHOTS: usize = 64;
 
 /// Poses of one `observe` request.
 pub const OBSERVE_POSES: usize = 16;

@@ -9,6 +9,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
 
 use crate::observe::encode::Encoding;
+use crate::scenario::ScenarioSource;
 
 /// How to open a session. For a field that is `None`, the twin or this package's `limits` decide.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,6 +40,23 @@ pub struct SessionOptions {
     pub warm_up_us: i64,
     /// How long one answer may take.
     pub deadline: Option<Duration>,
+    /// The scenario that is driven; without one there are no actors.
+    pub scenario: Option<ScenarioOptions>,
+}
+
+/// A scenario, and what of its ego section holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScenarioOptions {
+    /// Which scenario.
+    pub source: ScenarioSource,
+    /// Values of its sweep; the first ones where absent.
+    pub values: BTreeMap<String, serde_json::Value>,
+    /// Whether its dynamics hold: the request names none.
+    pub dynamics: bool,
+    /// Whether its warm-up holds: the request names none.
+    pub warm_up: bool,
+    /// Whether observations tell where the actors are.
+    pub actors: bool,
 }
 
 impl SessionOptions {
@@ -57,6 +75,7 @@ impl SessionOptions {
             decision_us: None,
             warm_up_us: 0,
             deadline: None,
+            scenario: None,
         }
     }
 }

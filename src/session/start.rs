@@ -114,6 +114,12 @@ impl EpisodeStart {
         Ok(Self { warm_up: std::iter::once(first).chain(between).collect(), world_from_rig })
     }
 
+    /// The start of a recorded episode; `state` is the one at the beginning of its file.
+    pub(crate) fn recorded(world_from_rig: Pose, state: Option<&Episode>) -> Self {
+        let warm_up = state.map(Episode::warm_up).unwrap_or_default();
+        Self { warm_up, world_from_rig }
+    }
+
     /// `world_from_rig` of the start.
     pub(crate) fn world_from_rig(&self) -> Pose {
         self.world_from_rig

@@ -26,6 +26,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         twins: twins.path().to_owned(),
         cache: None,
         episodes: episodes.path().to_owned(),
+        scenarios: twins.path().join(".scenarios"),
         uploads: twins.path().join(".uploads"),
         tokens: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),

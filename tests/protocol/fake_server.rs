@@ -139,6 +139,9 @@ pub(crate) fn seq_of(request: &Request) -> u64 {
         | Request::Reset { seq, .. }
         | Request::SwitchVersion { seq, .. }
         | Request::Close { seq }
+        | Request::Snapshot { seq, .. }
+        | Request::Restore { seq, .. }
         | Request::Resume { seq, .. } => *seq,
+        Request::Branch(branch) => branch.seq,
     }
 }

@@ -267,6 +267,9 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationM
                 Stage { name: "rasterize".into(), ms: 9.75 },
             ],
         },
+        events: Vec::new(),
+        route: None,
+        actors: None,
         residency: Residency {
             held_bytes: 30_000_000,
             limit_bytes: 64_000_000,

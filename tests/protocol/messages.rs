@@ -129,6 +129,12 @@ fn requests() -> Vec<(&'static str, Request)> {
         ..front()
     };
     let rig = Rig { name: "pair".into(), cameras: vec![seen, rear()] };
+    let section = DriveSection {
+        name: "log".into(),
+        from_m: Some(12.5),
+        to_m: Some(62.5),
+        every_m: Some(0.5),
+    };
     let open = Open {
         seq: 1,
         version: Some(3),
@@ -150,12 +156,15 @@ fn requests() -> Vec<(&'static str, Request)> {
             normals: Some(true),
             frames: Some(4),
             trust: Some(true),
+            actors: None,
             period_us: Some([("rear".to_owned(), 200_000)].into()),
         },
         dt_us: Some(100_000),
         deadline_ms: Some(20_000),
         decision_us: Some(500_000),
+        scenario: None,
         warm_up_us: Some(1_600_000),
+        trajectory: Some(section),
         ..Open::twin("street")
     };
     let preset = Open {
@@ -185,6 +194,9 @@ fn requests() -> Vec<(&'static str, Request)> {
     let start = Start::Pose { pose: there };
     let client = ClientInfo { name: "golden".into(), version: "0.1.0".into() };
     let protocols = vec![PROTOCOL.to_owned()];
+    let taken =
+        BranchPoint::Snapshot { session: "run-17".into(), snapshot: "before-junction".into() };
+    let recorded = BranchPoint::Recorded { episode: "run-17-1".into(), step: 40 };
     vec![
         ("hello", Request::Hello { seq: 0, client, protocols }),
         ("open", Request::Open(Box::new(open))),
@@ -202,9 +214,29 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("reset_station", Request::Reset { seq: 7, seed: 9, start: Some(station) }),
         ("switch_version", Request::SwitchVersion { seq: 8, version: Some(4) }),
         ("switch_latest", Request::SwitchVersion { seq: 8, version: None }),
+        ("snapshot", Request::Snapshot { seq: 9, name: "before-junction".into() }),
+        ("restore", Request::Restore { seq: 10, name: "before-junction".into() }),
+        ("branch", Request::Branch(Branch { seq: 1, from: taken, session: Some("run-18".into()) })),
+        ("branch_recorded", Request::Branch(Branch { seq: 1, from: recorded, session: None })),
         ("close", Request::Close { seq: 8 }),
         ("resume", Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4 }),
     ]
+}
+
+/// Two poses of a drive.
+pub(crate) fn drive() -> Drive {
+    let at = |station_m: f64, time_us, x_m| DrivePose {
+        station_m,
+        time_us,
+        pose: pose([x_m, -3.25, 0.125], [0.8, 0.0, 0.0, 0.6]),
+    };
+    Drive {
+        name: "log".into(),
+        version: 3,
+        version_hash: blake3::hash(b"a manifest").to_hex().to_string(),
+        length_m: 350.5,
+        poses: vec![at(12.5, 1_250_000, 12.5), at(13.0, 1_300_000, 13.0)],
+    }
 }
 
 fn answers() -> Vec<(&'static str, Answer)> {
@@ -259,11 +291,14 @@ fn answers() -> Vec<(&'static str, Answer)> {
             opacity: true,
             frames: Some(4),
             trust: Some(true),
+            actors: None,
             period_us: Some([("front".to_owned(), 100_000), ("rear".to_owned(), 200_000)].into()),
             ..Outputs::default()
         },
         trajectories: vec![trajectory],
         reserved_bytes: 36_000_000,
+        scenario: None,
+        trajectory: Some(drive()),
     };
     let switched = Answer::Switched {
         seq: 8,

@@ -4,7 +4,7 @@ use schemars::schema_for;
 use serde::de::DeserializeOwned;
 use wildcity_protocol::error::Code;
 use wildcity_protocol::http;
-use wildcity_protocol::message::{Answer, Request};
+use wildcity_protocol::message::{Answer, Drive, Request};
 use wildcity_protocol::observation::ObservationMetadata;
 
 use super::read;
@@ -18,17 +18,18 @@ fn every_json_example_is_a_message() {
         ("answer", parses::<Answer>),
         ("observation", parses::<ObservationMetadata>),
     ];
-    // Every request has one example and `open` two; `step` has three. Every answer has one.
-    assert_eq!(counted(page, kinds), [12, 7, 1]);
-    let kinds: [Kind; 6] = [
+    // Every request has one example, `open` three and `branch` two; `step` has three. Every answer has one.
+    assert_eq!(counted(page, kinds), [17, 7, 1]);
+    let kinds: [Kind; 7] = [
         ("new upload", parses::<http::NewUpload>),
         ("upload", parses::<http::Upload>),
         ("new push", parses::<http::NewPush>),
         ("push", parses::<http::Push>),
         ("rollback", parses::<http::Rollback>),
         ("refusal", parses::<http::Refusal>),
+        ("drive", parses::<Drive>),
     ];
-    assert_eq!(counted(http, kinds), [1, 1, 1, 1, 1, 1]);
+    assert_eq!(counted(http, kinds), [1, 1, 1, 1, 1, 1, 1]);
 }
 
 /// A kind of message, and a parser that returns the error if a text is not one.

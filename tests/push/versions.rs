@@ -10,7 +10,7 @@ use serde_json::json;
 use wildcity_client::PushState;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Outputs, RecordedEpisode, ReplayUntil, Session,
+    Encoding, Engine, EngineSettings, Outputs, RecordedEpisode, ReplayUntil, Scenarios, Session,
     SessionOptions,
 };
 use wildcity_twin::residency::Cache;
@@ -170,6 +170,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     let engine = Engine::start(EngineSettings {
         cache: Cache::new(Catalog::open(server.twins.path()).unwrap()),
         episodes: episodes.path().to_owned(),
+        scenarios: Scenarios::in_dir(""),
         backend: server.painter.clone(),
         step_timeout: TEST_TIMEOUT,
     });

@@ -22,7 +22,8 @@ use wildcity_scene::geometry::camera::{Fisheye, Lens};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ProfileOverrides, Rays, RecordFormat, RenderProfile, Rig, Scene};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Outputs, Session, SessionOptions, Tensor, TensorKind,
+    Encoding, Engine, EngineSettings, Outputs, Scenarios, Session, SessionOptions, Tensor,
+    TensorKind,
 };
 use wildcity_twin::residency::{Cache, Resident};
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes, StorageOptions};
@@ -335,6 +336,7 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
     let engine = Engine::start(EngineSettings {
         cache: Cache::new(Catalog::open(dir.path()).unwrap()),
         episodes: dir.path().join("episodes"),
+        scenarios: Scenarios::in_dir(""),
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
     });

@@ -139,6 +139,7 @@ async fn public_addresses_are_refused() {
         twins: server.twins.path().to_owned(),
         cache: None,
         episodes: server.episodes.path().to_owned(),
+        scenarios: server.twins.path().join(".scenarios"),
         uploads: server.twins.path().join(".uploads"),
         tokens: None,
         backend: server.painter.clone(),

@@ -8,7 +8,9 @@ mod root;
 mod support;
 
 mod appearance;
+mod branches;
 mod bundles;
+mod drives;
 mod ego;
 mod http;
 mod leases;
@@ -19,4 +21,5 @@ mod record;
 mod refused;
 mod replay;
 mod resume;
+mod scenarios;
 mod shutdown;

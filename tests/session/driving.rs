@@ -8,8 +8,8 @@ use glam::{DQuat, DVec3};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_session::{
-    Encoding, Engine, EngineSettings, Observation, Outputs, RigChoice, Session, SessionError,
-    SessionOptions,
+    Encoding, Engine, EngineSettings, Observation, Outputs, RigChoice, Scenarios, Session,
+    SessionError, SessionOptions,
 };
 use wildcity_twin::residency::{Cache, ResidencyError, Resident, SectionRef};
 
@@ -27,6 +27,7 @@ fn bench(cache: Cache) -> Bench {
     let engine = Engine::start(EngineSettings {
         cache,
         episodes: episodes.path().to_owned(),
+        scenarios: Scenarios::in_dir(""),
         backend: Arc::new(crate::images::cpu()),
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
     });

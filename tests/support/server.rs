@@ -178,6 +178,7 @@ impl TestServer {
             twins: twins.path().to_owned(),
             cache: None,
             episodes: episodes.path().to_owned(),
+            scenarios: twins.path().join(".scenarios"),
             uploads: twins.path().join(".uploads"),
             tokens: None,
             backend: painter.clone(),

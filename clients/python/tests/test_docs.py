@@ -20,6 +20,7 @@ PAGES = [
     "docs/agents.md",
     "docs/operators.md",
     "docs/pipelines.md",
+    "docs/scenarios.md",
     "docs/scenes.md",
     "docs/suites.md",
 ]

@@ -7,8 +7,8 @@ use wildcity_protocol::PROTOCOL;
 use wildcity_protocol::error::Code;
 use wildcity_protocol::limits::HELLO_TIMEOUT;
 use wildcity_protocol::message::{
-    Action, Answer, ClientInfo, Limits, Open, Opened, Pose, Request, ServerInfo, Start, Summary,
-    TimedPose, TwinInfo,
+    Action, Answer, Branch, BranchPoint, ClientInfo, Limits, Open, Opened, Pose, Request,
+    ServerInfo, Start, Summary, TimedPose, TwinInfo,
 };
 
 use crate::connection::{Connection, Endpoint, Incoming};
@@ -203,6 +203,48 @@ impl Client {
             }
             other => Err(self.unexpected_answer("opened", &other)),
         }
+    }
+
+    /// Opens a session in a state of another episode, with that episode's settings: a snapshot of a session that
+    /// still exists, or a step of an episode that the server has recorded. The new session has that state as its
+    /// snapshot `start`.
+    ///
+    /// # Errors
+    /// [`Code::UnknownState`] if there is no such state; otherwise as [`Client::open`].
+    pub async fn branch(
+        &mut self,
+        from: BranchPoint,
+        session: Option<String>,
+    ) -> Result<Opened, ClientError> {
+        let request = Request::Branch(Branch { seq: self.next_seq, from, session });
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Opened(opened)) => {
+                self.session = Some(opened.session.clone());
+                Ok(*opened)
+            }
+            other => Err(self.unexpected_answer("opened", &other)),
+        }
+    }
+
+    /// Stores the state of the episode under a name, in place of an earlier snapshot of that name.
+    ///
+    /// # Errors
+    /// As [`Client::step`].
+    pub async fn snapshot(&mut self, name: &str) -> Result<(), ClientError> {
+        let request = Request::Snapshot { seq: self.next_seq, name: name.to_owned() };
+        match self.exchange(&request).await? {
+            Incoming::Answer(Answer::Ok { .. }) => Ok(()),
+            other => Err(self.unexpected_answer("ok", &other)),
+        }
+    }
+
+    /// Returns to a snapshot of this session, and renders it.
+    ///
+    /// # Errors
+    /// [`Code::UnknownState`] if there is no such snapshot; otherwise as [`Client::step`].
+    pub async fn restore(&mut self, name: &str) -> Result<Observation, ClientError> {
+        let request = Request::Restore { seq: self.next_seq, name: name.to_owned() };
+        self.exchange_for_observation(&request).await
     }
 
     /// Moves the ego to `pose` (`world_from_rig`), advances the simulated time by one step, and returns the

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_protocol::error::Code;
 use wildcity_protocol::http::{NewPush, Push, PushState, Refusal, Rollback};
+use wildcity_protocol::message::{Drive, DriveSection};
 
 use crate::limits;
 use crate::options::ConnectOptions;
@@ -198,6 +199,28 @@ impl HttpClient {
         Ok(made.version)
     }
 
+    /// Poses of a recorded drive of a version of a twin; of the latest if `version` is `None`.
+    ///
+    /// # Errors
+    /// The server refuses, or does not answer.
+    pub async fn trajectory(
+        &self,
+        twin: &str,
+        version: Option<u64>,
+        section: &DriveSection,
+    ) -> Result<Drive, HttpError> {
+        let DriveSection { name, from_m, to_m, every_m } = section;
+        let path = ["v1", "twins", twin, "trajectories", name];
+        let version = version.map(|number| ("version", number.to_string()));
+        let stations = [("from_m", from_m), ("to_m", to_m), ("every_m", every_m)];
+        let stations =
+            stations.into_iter().filter_map(|(field, value)| Some((field, (*value)?.to_string())));
+        let mut url = self.url(&path);
+        url.query_pairs_mut().extend_pairs(version.into_iter().chain(stations));
+        let answer = self.send(self.http.request(Method::GET, url), limits::HTTP_TIMEOUT).await?;
+        serde_json::from_slice(&answer).map_err(|error| self.unreadable(&error))
+    }
+
     /// Sends a request with an optional JSON body, and reads the JSON of the answer.
     pub(crate) async fn request_json<T: DeserializeOwned>(
         &self,
@@ -216,11 +239,16 @@ impl HttpClient {
 
     /// A request to a path, given by its segments.
     pub(crate) fn request(&self, method: Method, path: &[&str]) -> RequestBuilder {
+        self.http.request(method, self.url(path))
+    }
+
+    /// The address of a path, given by its segments.
+    fn url(&self, path: &[&str]) -> Url {
         let mut url = self.server.clone();
         if let Ok(mut segments) = url.path_segments_mut() {
             segments.clear().extend(path);
         }
-        self.http.request(method, url)
+        url
     }
 
     /// Sends a request and returns the body of a successful answer.

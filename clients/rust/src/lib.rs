@@ -50,5 +50,6 @@ pub use wildcity_protocol::http::{
     PushState, Upload,
 };
 pub use wildcity_protocol::message::{
-    Action, Dynamics, DynamicsChoice, DynamicsModel, Open, Pose, Start, TimedPose,
+    Action, BranchPoint, Drive, DrivePose, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,
+    Open, Pose, Start, TimedPose,
 };

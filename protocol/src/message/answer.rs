@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::drive::Drive;
 use super::open::{Dynamics, Outputs, RigCamera};
 use super::pose::Pose;
 use crate::error::Code;
@@ -26,7 +27,7 @@ pub enum Answer {
         /// Twins that can be opened.
         twins: Vec<TwinInfo>,
     },
-    /// Answer to `open`: every setting of the session, defaults included.
+    /// Answer to `open` and to `branch`: every setting of the session, defaults included.
     Opened(Box<Opened>),
     /// Answer to `resume`.
     Resumed {
@@ -42,7 +43,7 @@ pub enum Answer {
         /// Simulated time, in microseconds.
         time_us: i64,
     },
-    /// Answer to `prefetch`.
+    /// Answer to `prefetch` and to `snapshot`.
     Ok {
         /// Number of the request.
         seq: u64,
@@ -166,7 +167,7 @@ pub struct Opened {
     pub backend: String,
     /// Seed of the first episode.
     pub seed: u64,
-    /// `world_from_rig` at time zero.
+    /// `world_from_rig` at time zero; after `branch`, where a `reset` without a start begins.
     pub start: Pose,
     /// How the ego moves.
     pub dynamics: Dynamics,
@@ -186,6 +187,24 @@ pub struct Opened {
     pub trajectories: Vec<TrajectoryInfo>,
     /// Memory of the server that is reserved for the largest frame of the session, in bytes.
     pub reserved_bytes: u64,
+    /// The scenario.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<OpenedScenario>,
+    /// The part of a recorded drive that `open` asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<Drive>,
+}
+
+/// The scenario of a session.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct OpenedScenario {
+    /// Its name.
+    pub name: String,
+    /// BLAKE3 of the scenario with the first episode's seed, all values and all hashes: what that episode is.
+    pub hash: String,
+    /// Number of actors.
+    pub actors: u64,
 }
 
 /// Summary of an episode.
@@ -218,6 +237,8 @@ pub enum Outcome {
     /// As `completed`, but the images of a reset or a step had a mean confidence below 0.1: the agent left
     /// the recorded area. Only with `outputs.trust`.
     OffModel,
+    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    DrivingFailure,
     /// The agent violated the protocol in a way that ended the connection.
     AgentError,
     /// The agent sent nothing, or did not read, for too long.

@@ -6,14 +6,20 @@
 //! Unknown fields of answers are ignored, because answers may gain fields.
 
 mod answer;
+mod branch;
+mod drive;
 mod open;
 mod pose;
 mod request;
 
-pub use answer::{Answer, Limits, Opened, Outcome, ServerInfo, Summary, TrajectoryInfo, TwinInfo};
+pub use answer::{
+    Answer, Limits, Opened, OpenedScenario, Outcome, ServerInfo, Summary, TrajectoryInfo, TwinInfo,
+};
+pub use branch::{Branch, BranchPoint};
+pub use drive::{Drive, DrivePose, DriveSection};
 pub use open::{
     Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, Rig, RigCamera,
-    RigChoice, Start,
+    RigChoice, ScenarioChoice, Start,
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, TimedPose};

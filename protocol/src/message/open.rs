@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::drive::DriveSection;
 use super::pose::Pose;
 use crate::camera::{Exposure, Lens, Shutter, Windshield};
 
@@ -79,10 +80,16 @@ pub struct Open {
     /// observations at decisions have images. If absent, every observation has images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub decision_us: Option<i64>,
+    /// The scenario to drive. If absent, there are no actors and no route.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<ScenarioChoice>,
     /// Length of the recorded drive before the start, in microseconds. Its poses are the ego's history, and
     /// its frames are in the first bundle. If absent, 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub warm_up_us: Option<i64>,
+    /// A part of a recorded drive that the answer is to have.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<DriveSection>,
 }
 
 impl Open {
@@ -113,7 +120,9 @@ impl Open {
             dt_us: None,
             deadline_ms: None,
             decision_us: None,
+            scenario: None,
             warm_up_us: None,
+            trajectory: None,
         }
     }
 }
@@ -136,6 +145,24 @@ pub enum Start {
         #[serde(default)]
         station_m: f64,
     },
+}
+
+/// The scenario of a session.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(untagged)]
+pub enum ScenarioChoice {
+    /// A scenario of the server, by name, with the first values of its sweep.
+    Name(String),
+    /// A scenario of the server with values of its sweep.
+    Values {
+        /// Its name.
+        name: String,
+        /// The values, by their name; the first of each list where absent.
+        values: serde_json::Map<String, serde_json::Value>,
+    },
+    /// The scenario itself, in the format `wildcity.scenario/1`.
+    Inline(serde_json::Map<String, serde_json::Value>),
 }
 
 /// The cameras of a session.
@@ -242,6 +269,9 @@ pub struct Outputs {
     /// Whether to add a confidence to each image. If absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub trust: Option<bool>,
+    /// Whether to tell where the actors of the scenario are. If absent, false.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub actors: Option<bool>,
     /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps. If
     /// absent, every camera takes a frame with every step.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -260,6 +290,7 @@ impl Default for Outputs {
             normals: None,
             frames: None,
             trust: None,
+            actors: None,
             period_us: None,
         }
     }

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::branch::Branch;
 use super::open::{Open, Start};
 use super::pose::Pose;
 
@@ -79,6 +80,22 @@ pub enum Request {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         version: Option<u64>,
     },
+    /// Stores the state of the episode under a name, in place of an earlier snapshot of that name. Answer: `ok`.
+    Snapshot {
+        /// Number of this request.
+        seq: u64,
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Returns to a snapshot of this session. Answer: an observation of that state.
+    Restore {
+        /// Number of this request.
+        seq: u64,
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Opens a session in a state of another episode. Answer: `opened`.
+    Branch(Branch),
     /// Ends the session. Answer: `closed`.
     Close {
         /// Number of this request.

@@ -75,6 +75,7 @@ impl Demo {
             twins,
             cache: self.twins.cache(),
             episodes: self.out.join("episodes"),
+            scenarios: self.out.join("scenarios"),
             uploads: self.out.join("uploads"),
             tokens: None,
             backend: Arc::from(self.backend.backend()?),

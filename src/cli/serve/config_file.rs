@@ -235,8 +235,8 @@ mod tests {
     use super::*;
 
     /// Options that name all directories, so that no test depends on HOME.
-    const DIRECTORIES: [&str; 4] =
-        ["--twins=/t", "--episodes=/e", "--uploads=/u", "--cache-dir=/c"];
+    const DIRECTORIES: [&str; 5] =
+        ["--twins=/t", "--episodes=/e", "--scenarios=/s", "--uploads=/u", "--cache-dir=/c"];
 
     fn resolve_with(file: &str, flags: &[&str]) -> anyhow::Result<Resolved> {
         let dir = tempfile::tempdir().unwrap();

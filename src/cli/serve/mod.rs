@@ -18,7 +18,7 @@ use wildcity_twin::residency::default_memory_bytes;
 use limit_options::{LimitOptions, gib_of};
 
 use super::backend_options::{BackendOptions, bytes_of_gib, gib};
-use super::directories::{Episodes, Twins, Uploads};
+use super::directories::{Episodes, Scenarios, Twins, Uploads};
 use super::profile_options::read_profile;
 
 /// Serve twins to agents over WebSocket.
@@ -44,6 +44,9 @@ pub(super) struct Serve {
 
     #[command(flatten)]
     episodes: Episodes,
+
+    #[command(flatten)]
+    scenarios: Scenarios,
 
     #[command(flatten)]
     uploads: Uploads,
@@ -115,6 +118,7 @@ impl Serve {
         Ok(match id {
             "twins" => text(self.twins.dir()?),
             "episodes" => text(self.episodes.dir()?),
+            "scenarios" => text(self.scenarios.dir()?),
             "uploads" => text(self.uploads.dir()?),
             "cache_dir" => self.twins.cache().and_then(|cache| text(cache.dir)),
             "memory_gib" => Some(gib_of(default_memory_bytes()).to_string()),
@@ -151,6 +155,7 @@ impl Serve {
             twins,
             cache: self.twins.cache(),
             episodes: self.episodes.dir()?,
+            scenarios: self.scenarios.dir()?,
             uploads: self.uploads.dir()?,
             tokens,
             backend: Arc::from(self.backend.backend()?),

@@ -5,6 +5,7 @@
 
 mod box_index;
 mod clock;
+mod section;
 mod sub_trajectory;
 
 use std::ops::Range;
@@ -14,6 +15,7 @@ use super::trajectory::{Keyframe, TrajectoryError};
 
 pub use box_index::BoxIndex;
 pub use clock::{Association, TimePair, associate};
+pub use section::{MAX_SECTION_POSES, RoutePose, RouteSection};
 pub use sub_trajectory::{MAX_SUB_TRAJECTORIES, SubTrajectory, length_label, sub_trajectories};
 
 /// Distance between keyframes of a route, in metres.

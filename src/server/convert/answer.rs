@@ -13,12 +13,14 @@ use wildcity_protocol::message::{
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    Encoding, EpisodeSummary, Outcome, PixelMaps, Session, TrajectorySummary, TwinSummary,
+    Encoding, EpisodeSummary, EpisodeTraffic, Outcome, PixelMaps, Session, TrajectorySummary,
+    TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
 
 use super::camera::{exposure_to, lens_and_windshield_to, shutter_to};
+use super::drive::{DriveRequest, drive};
 
 /// Name of the server in `welcome`.
 const SERVER_NAME: &str = "wildcity";
@@ -52,10 +54,15 @@ pub(crate) fn welcome(
     })
 }
 
-/// The answer to `open`.
-pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
+/// The answer to `open`, with a part of a recorded drive if the client asked for one.
+pub(crate) fn opened(
+    seq: u64,
+    session: &Session,
+    section: Option<&DriveRequest>,
+) -> Result<String, Fault> {
     let resident = session.resident();
     let Version { number, hash, manifest, .. } = &*resident.version;
+    let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
     let PixelMaps { depth, opacity, normals } = session.maps();
@@ -69,6 +76,7 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
         normals: Some(normals),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
+        actors: session.tells_actors().then_some(true),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
         cameras: Some(names),
         images: BTreeMap::new(),
@@ -98,7 +106,17 @@ pub(crate) fn opened(seq: u64, session: &Session) -> Result<String, Fault> {
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),
+        scenario: session.traffic().map(opened_scenario),
+        trajectory: trajectory.transpose()?,
     })))
+}
+
+fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
+    message::OpenedScenario {
+        name: traffic.loaded().scenario.file.name.clone(),
+        hash: traffic.loaded().hash.clone(),
+        actors: traffic.specs().len() as u64,
+    }
 }
 
 /// The answer to `resume`.
@@ -140,6 +158,7 @@ pub(crate) fn closed(
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
         Outcome::OffModel => message::Outcome::OffModel,
+        Outcome::DrivingFailure => message::Outcome::DrivingFailure,
         Outcome::AgentError => message::Outcome::AgentError,
         Outcome::AgentTimeout => message::Outcome::AgentTimeout,
         Outcome::AgentLost => message::Outcome::AgentLost,

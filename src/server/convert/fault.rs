@@ -12,7 +12,7 @@ use wildcity_push::PushError;
 use wildcity_render::RenderError;
 use wildcity_scene::geometry::PoseError;
 use wildcity_scene::rig::RigError;
-use wildcity_session::SessionError;
+use wildcity_session::{ScenarioError, SessionError};
 use wildcity_sim::EgoError;
 use wildcity_twin::ingest::IngestError;
 use wildcity_twin::residency::ResidencyError;
@@ -95,6 +95,7 @@ fn status_of(code: Code) -> StatusCode {
         | Code::PoseNotFinite
         | Code::PoseInvalid
         | Code::CameraInvalid
+        | Code::ScenarioInvalid
         | Code::OutOfRange => StatusCode::BAD_REQUEST,
         Code::Unauthorized => StatusCode::UNAUTHORIZED,
         Code::Forbidden => StatusCode::FORBIDDEN,
@@ -104,6 +105,8 @@ fn status_of(code: Code) -> StatusCode {
         | Code::UnknownCamera
         | Code::UnknownTrajectory
         | Code::UnknownSession
+        | Code::UnknownState
+        | Code::UnknownScenario
         | Code::UnknownUpload
         | Code::UnknownPush => StatusCode::NOT_FOUND,
         Code::TimedOut => StatusCode::REQUEST_TIMEOUT,
@@ -150,6 +153,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
         // The list of codes is closed, and episodes are named by their sessions.
         Fault::UnknownEpisode { .. } => at(Code::UnknownSession, "episode"),
+        Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
+        Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
@@ -212,11 +217,18 @@ fn of_session(error: &SessionError) -> WireFault {
         SessionError::Twin(error) => of_store(error),
         SessionError::Residency(error) => of_residency(error),
         SessionError::Route(_) => at(Code::TwinDamaged, "twin"),
+        SessionError::Scenario(error) => match error {
+            ScenarioError::Unknown { .. } => at(Code::UnknownScenario, "scenario"),
+            _ => at(Code::ScenarioInvalid, error.field()),
+        },
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
         SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),
         SessionError::CameraTwice { index, .. } => {
             at(Code::OutOfRange, &format!("outputs.cameras[{index}]"))
         }
+        SessionError::UnknownSnapshot { field, .. } => at(Code::UnknownState, field),
+        SessionError::UnknownEpisode { .. } => at(Code::UnknownState, "from.episode"),
+        SessionError::Branch(_) => at(Code::UnknownState, "from"),
         SessionError::UnknownTrajectory { .. } => at(Code::UnknownTrajectory, "start.trajectory"),
         SessionError::Profile(_) | SessionError::Sky(_) => at(Code::OutOfRange, "profile"),
         SessionError::OutOfRange { field, .. } => at(Code::OutOfRange, field),

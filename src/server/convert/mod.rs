@@ -7,12 +7,14 @@
 //! answer       answers other than observations
 //! observation  observations
 //! camera       lenses, windshields, shutters and exposures, to and from the wire
+//! drive        recorded drives
 //! http         bodies of HTTP requests and answers
 //! fault        the wire code and the HTTP status of each fault
 //! ```
 
 mod answer;
 mod camera;
+mod drive;
 mod fault;
 mod field;
 mod http;
@@ -22,12 +24,13 @@ mod request;
 mod rig;
 
 pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
+pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, code, http_status, refusal_body, refused};
 pub(crate) use http::{
     episodes, new_push, new_upload, push, rollback, sessions, upload, version, versions,
 };
 pub(crate) use observation::observation;
-pub(crate) use request::{Command, Parsed, parse};
+pub(crate) use request::{BranchPoint, Command, Parsed, parse};
 
 /// The WebSocket subprotocol.
 pub(crate) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;

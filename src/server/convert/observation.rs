@@ -7,10 +7,16 @@ use serde::Serialize;
 use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
 use wildcity_protocol::observation::{
-    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+    self as wire, Actor, Ego, Event, Image, NavigationCommand, ObservationMetadata, Residency,
+    Route, Stage, Timings, Trust,
 };
+use wildcity_scene::ActorBox;
 use wildcity_scene::geometry::camera::Pinhole;
-use wildcity_session::{DType, HEADER_PREFIX_BYTES, PastImageInfo, Session, TensorKind};
+use wildcity_session::{
+    DType, Episode, EpisodeTraffic, EventKind, HEADER_PREFIX_BYTES, PastImageInfo, Session,
+    TensorKind,
+};
+use wildcity_sim::scenario;
 
 use super::answer::{camera, encoding, pose, text};
 
@@ -167,6 +173,9 @@ fn metadata(
         },
         images: frame.images.iter().zip(image_names).map(drawn).collect(),
         history: frame.history.iter().map(past).collect(),
+        events: session.traffic().map(events).unwrap_or_default(),
+        route: session.traffic().and_then(|traffic| route(traffic, episode)),
+        actors: session.traffic().filter(|_| session.tells_actors()).map(actors),
         timings: Timings {
             queue_ms: ms(timings.queue),
             render_ms: ms(timings.render),
@@ -180,6 +189,81 @@ fn metadata(
             waited_us: frame.residency.waited.as_micros() as u64,
         },
     }
+}
+
+fn events(traffic: &EpisodeTraffic) -> Vec<Event> {
+    let name_of = |actor: u16| traffic.specs()[usize::from(actor)].name.clone();
+    let event = |event: &wildcity_session::Event| {
+        let mut told = Event {
+            time_us: event.time_us,
+            kind: wire::EventKind::End,
+            actor: None,
+            name: None,
+            at_fault: None,
+            impact: None,
+        };
+        match &event.kind {
+            EventKind::Contact(contact) => {
+                told.kind = wire::EventKind::Contact;
+                told.actor = Some(name_of(contact.actor));
+                told.at_fault = (!contact.at_start).then_some(contact.ego_at_fault);
+                told.impact = Some(contact.impact_mps);
+            }
+            EventKind::Trigger { actor, trigger } => {
+                told.kind = wire::EventKind::Trigger;
+                told.actor = Some(name_of(*actor));
+                let name = traffic.trigger_name(*actor, *trigger);
+                told.name = (!name.is_empty()).then(|| name.to_owned());
+            }
+            EventKind::Appeared { actor } => {
+                told.kind = wire::EventKind::Appeared;
+                told.actor = Some(name_of(*actor));
+            }
+            EventKind::Left { actor } => {
+                told.kind = wire::EventKind::Left;
+                told.actor = Some(name_of(*actor));
+            }
+            EventKind::End(reason) => told.name = Some(reason.name().to_owned()),
+        }
+        told
+    };
+    traffic.events().iter().map(event).collect()
+}
+
+fn route(traffic: &EpisodeTraffic, episode: &Episode) -> Option<Route> {
+    let view = traffic.route(episode.ego())?;
+    let (route, progress) = traffic.route_progress()?;
+    let command = match view.command {
+        scenario::NavigationCommand::Left => NavigationCommand::Left,
+        scenario::NavigationCommand::Right => NavigationCommand::Right,
+        scenario::NavigationCommand::Straight => NavigationCommand::Straight,
+    };
+    Some(Route {
+        points: view.points_m.iter().map(|point_m| point_m.to_array()).collect(),
+        command,
+        text: view.text,
+        station_m: progress.station_m,
+        off_m: progress.off_m,
+        length_m: route.course.length_m(),
+    })
+}
+
+fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
+    let present = traffic.states().iter().filter(|state| state.present);
+    present
+        .map(|state| {
+            let spec = &traffic.specs()[usize::from(state.index)];
+            let ActorBox { length_m, width_m, height_m } = spec.box_;
+            Actor {
+                name: spec.name.clone(),
+                kind: spec.class.name().to_owned(),
+                size: [length_m, width_m, height_m],
+                pose: pose(&state.world_from_actor),
+                velocity: state.velocity_mps.to_array(),
+                yaw_rate: state.yaw_rate_radps,
+            }
+        })
+        .collect()
 }
 
 fn trust(trust: wildcity_session::Trust) -> Trust {

@@ -1,20 +1,25 @@
 //! Parses text frames as commands.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use serde::Deserialize;
+use serde_json::Value;
 
 use crate::fault::Fault;
 use wildcity_protocol::message::{self, Request};
 use wildcity_protocol::{PROTOCOL, unknown_field};
 use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
+use wildcity_session::is_episode_name;
 use wildcity_session::{
-    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, SessionError, SessionOptions, Start,
+    Encoding, ImagePart, Outputs, PixelMaps, RigChoice, ScenarioOptions, ScenarioSource,
+    SessionError, SessionOptions, Start,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
 
+use super::drive::DriveRequest;
 use super::field::{name_of, pose_of, poses_of};
 use super::non_finite::{NonFinite, find_non_finite};
 use super::rig::rig_of;
@@ -47,6 +52,8 @@ pub(crate) enum Command {
         name: Option<String>,
         /// What is opened.
         opening: Box<SessionOptions>,
+        /// The part of a recorded drive that the answer is to have.
+        drive: Option<DriveRequest>,
     },
     /// Carries out a step.
     Step {
@@ -77,6 +84,23 @@ pub(crate) enum Command {
         /// The version; the latest if there is none.
         version: Option<u64>,
     },
+    /// Stores the state of the episode.
+    Snapshot {
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Returns to a snapshot.
+    Restore {
+        /// Name of the snapshot.
+        name: String,
+    },
+    /// Opens a session in a state of another episode.
+    Branch {
+        /// Its name, if the client chose one.
+        name: Option<String>,
+        /// The state.
+        from: BranchPoint,
+    },
     /// Ends the session.
     Close,
     /// Takes over a session of an earlier connection.
@@ -85,6 +109,25 @@ pub(crate) enum Command {
         session: String,
         /// Number of the last request with an answer that arrived.
         last_seq: u64,
+    },
+}
+
+/// A state of an episode, with names that are checked.
+#[derive(Debug)]
+pub(crate) enum BranchPoint {
+    /// A snapshot of a session.
+    Snapshot {
+        /// The session.
+        session: String,
+        /// The snapshot.
+        snapshot: String,
+    },
+    /// A step of a recorded episode.
+    Recorded {
+        /// The episode.
+        episode: String,
+        /// Steps done.
+        step: u64,
     },
 }
 
@@ -170,7 +213,10 @@ struct Fields {
     pose: Option<message::Pose>,
     trajectory: Option<Vec<message::TimedPose>>,
     action: Option<message::Action>,
+    name: Option<String>,
+    from: Option<message::BranchPoint>,
     dynamics: Option<message::DynamicsChoice>,
+    scenario: Option<message::ScenarioChoice>,
     poses: Option<Vec<message::Pose>>,
     terminate: Option<bool>,
     last_seq: Option<u64>,
@@ -205,6 +251,13 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             (seq, start.map(|start| Command::Reset { seed, start }))
         }
         Request::SwitchVersion { seq, version } => (seq, Ok(Command::SwitchVersion { version })),
+        Request::Snapshot { seq, name } => {
+            (seq, name_of("name", name).map(|name| Command::Snapshot { name }))
+        }
+        Request::Restore { seq, name } => {
+            (seq, name_of("name", name).map(|name| Command::Restore { name }))
+        }
+        Request::Branch(branch) => (branch.seq, branch_command(branch)),
         Request::Close { seq } => (seq, Ok(Command::Close)),
         Request::Resume { seq, session, last_seq } => {
             let command =
@@ -231,6 +284,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         normals,
         frames,
         trust,
+        actors,
         period_us,
     } = open.outputs;
     let part = |message::ImagePart { crop, size }| ImagePart { crop, size };
@@ -257,13 +311,52 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
             trust: trust.unwrap_or(false),
             periods_us: period_us.unwrap_or_default(),
         },
+        scenario: open.scenario.map(|choice| {
+            let (source, values) = scenario_of(choice);
+            ScenarioOptions {
+                source,
+                values,
+                dynamics: open.dynamics.is_none(),
+                warm_up: open.warm_up_us.is_none(),
+                actors: actors.unwrap_or(false),
+            }
+        }),
         dynamics: open.dynamics.map(dynamics_of).transpose()?.unwrap_or_default(),
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
         decision_us: open.decision_us,
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
-    Ok(Command::Open { name, opening: Box::new(opening) })
+    Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
+}
+
+fn scenario_of(choice: message::ScenarioChoice) -> (ScenarioSource, BTreeMap<String, Value>) {
+    match choice {
+        message::ScenarioChoice::Name(name) => (ScenarioSource::Named(name), BTreeMap::new()),
+        message::ScenarioChoice::Values { name, values } => {
+            (ScenarioSource::Named(name), values.into_iter().collect())
+        }
+        message::ScenarioChoice::Inline(scenario) => {
+            (ScenarioSource::Inline(Value::Object(scenario)), BTreeMap::new())
+        }
+    }
+}
+
+fn branch_command(branch: message::Branch) -> Result<Command, Fault> {
+    let name = branch.session.map(|name| name_of("session", name)).transpose()?;
+    let from = match branch.from {
+        message::BranchPoint::Snapshot { session, snapshot } => BranchPoint::Snapshot {
+            session: name_of("from.session", session)?,
+            snapshot: name_of("from.snapshot", snapshot)?,
+        },
+        message::BranchPoint::Recorded { episode, step } => {
+            if !is_episode_name(&episode) {
+                return Err(Fault::InvalidName { field: "from.episode".into(), name: episode });
+            }
+            BranchPoint::Recorded { episode, step }
+        }
+    };
+    Ok(Command::Branch { name, from })
 }
 
 fn dynamics_of(choice: message::DynamicsChoice) -> Result<Dynamics, Fault> {

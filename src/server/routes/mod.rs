@@ -36,6 +36,7 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .route("/v1/twins", get(twins::list))
         .route("/v1/twins/{twin}", get(twins::show))
         .route("/v1/twins/{twin}/versions", get(twins::versions))
+        .route("/v1/twins/{twin}/trajectories/{name}", get(twins::trajectory))
         .route("/v1/twins/{twin}/rollback", post(twins::rollback))
         .route("/v1/twins/{twin}/pushes", post(pushes::begin))
         .route("/v1/twins/{twin}/pushes/{id}", get(pushes::show))

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use axum::body::Bytes;
-use axum::extract::{Path, State};
+use axum::extract::{Path, RawQuery, State};
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
@@ -63,6 +63,24 @@ pub(super) async fn versions(
     });
     let (versions, held) = listed.await?;
     Ok(Json(convert::versions(&versions, held)).into_response())
+}
+
+/// `GET /v1/twins/{twin}/trajectories/{name}`: poses of a recorded drive.
+pub(super) async fn trajectory(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path((twin, name)): Path<(String, String)>,
+    RawQuery(query): RawQuery,
+) -> HttpResult {
+    grant.require_twin(&twin)?;
+    let (version, section) = convert::drive_query(name, query.as_deref().unwrap_or_default())?;
+    let version = version.or_else(|| state.engine.pinned_latest(&twin));
+    let catalog = state.engine.catalog().clone();
+    let body = blocking(move || {
+        let version = catalog.version(&twin, version).map_err(Fault::from)?;
+        convert::drive_body(&version, &section)
+    });
+    Ok(Json(body.await?).into_response())
 }
 
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.

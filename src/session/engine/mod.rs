@@ -27,6 +27,7 @@ use self::twin_summaries::{SummaryCache, TwinSummary};
 use crate::blocking::run_blocking;
 use crate::error::SessionError;
 use crate::limits;
+use crate::scenario::Scenarios;
 
 /// The parts and settings of an [`Engine`].
 pub struct EngineSettings {
@@ -34,6 +35,8 @@ pub struct EngineSettings {
     pub cache: Cache,
     /// Directory of the episodes' files.
     pub episodes: PathBuf,
+    /// The scenarios that can be opened by name.
+    pub scenarios: Scenarios,
     /// The backend that renders.
     pub backend: Arc<dyn Backend>,
     /// How long one step may take, time in queues included.
@@ -46,6 +49,7 @@ pub struct Engine {
     cache: Cache,
     leases: Arc<Leases>,
     episodes: PathBuf,
+    scenarios: Scenarios,
     step_timeout: Duration,
     queue: RenderQueue,
     answer_budget: AnswerBudget,
@@ -66,12 +70,13 @@ impl Engine {
     /// # Errors
     /// [`SessionError::Thread`] if a thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { cache, episodes, backend, step_timeout } = settings;
+        let EngineSettings { cache, episodes, scenarios, backend, step_timeout } = settings;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),
             cache,
             episodes,
+            scenarios,
             step_timeout,
             queue: RenderQueue::start(backend)?,
             answer_budget: AnswerBudget::default(),
@@ -89,6 +94,11 @@ impl Engine {
         let pinned = move |twin: &str| engine.pinned_latest(twin);
         let summaries = self.summaries.clone();
         Ok(run_blocking(move || summaries.read(&pinned)).await??)
+    }
+
+    /// The scenarios that can be opened by name.
+    pub fn scenarios(&self) -> &Scenarios {
+        &self.scenarios
     }
 
     /// Checks that twins can be listed.

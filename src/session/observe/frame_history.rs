@@ -51,6 +51,22 @@ impl FrameHistory {
         frames.into_iter().find(|frame| frame.camera == camera && frame.time_us == time_us)
     }
 
+    /// The frames that were taken before a time, in microseconds.
+    pub(crate) fn before(&self, time_us: i64) -> Self {
+        Self(self.0.iter().filter(|kept| kept.frame.time_us < time_us).cloned().collect())
+    }
+
+    /// These frames, and those of another history that this one lacks.
+    #[must_use]
+    pub(crate) fn or(mut self, other: &Self) -> Self {
+        for kept in &other.0 {
+            if self.find(kept.frame.camera, kept.frame.time_us).is_none() {
+                self.0.push(kept.clone());
+            }
+        }
+        self
+    }
+
     /// Drops the frames that no decision after a time will show.
     pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
         self.0

@@ -47,6 +47,8 @@ pub(crate) struct ObservationLayout {
     encoding: Encoding,
     maps: PixelMaps,
     schedule: Schedule,
+    /// Room in the header for what a scenario tells.
+    scenario_bytes: usize,
 }
 
 /// What is rendered at once: some cameras of the rig, at one pose and time.
@@ -97,7 +99,7 @@ impl ObservationLayout {
             FieldMask::of(camera).map(|field| field.visible_share(camera))
         };
         let visible_shares = cameras.iter().map(visible_share).collect();
-        let layout = Self { cameras, visible_shares, encoding, maps, schedule };
+        let layout = Self { cameras, visible_shares, encoding, maps, schedule, scenario_bytes: 0 };
         layout.check_size(layout.schedule.frames())?;
         Ok(layout)
     }
@@ -127,11 +129,21 @@ impl ObservationLayout {
     /// or a later one contains and that are not in the history. One capture per time; the last one is that of
     /// the present time, and may have no cameras.
     pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
+        self.captures_beside(episode, &|camera, time_us| history.find(camera, time_us).is_some())
+    }
+
+    /// As [`Self::captures`], with a history of the frames of which `is_kept` (camera, time in microseconds) is
+    /// true.
+    pub(crate) fn captures_beside(
+        &self,
+        episode: &Episode,
+        is_kept: &dyn Fn(usize, i64) -> bool,
+    ) -> Vec<RigCapture> {
         let now_us = episode.time_us();
         let mut cameras_by_time = BTreeMap::from([(now_us, Vec::new())]);
         for camera in 0..self.cameras.len() {
             for time_us in self.schedule.due(camera, now_us) {
-                if time_us >= episode.begin_us() && history.find(camera, time_us).is_none() {
+                if time_us >= episode.begin_us() && !is_kept(camera, time_us) {
                     cameras_by_time.entry(time_us).or_default().push(camera);
                 }
             }
@@ -177,12 +189,31 @@ impl ObservationLayout {
         Ok(())
     }
 
+    /// Reserves room in the headers for what a scenario with so many actors tells.
+    ///
+    /// # Errors
+    /// The largest header would be longer than clients accept.
+    pub(crate) fn reserve_header(&mut self, actors: usize) -> Result<(), SessionError> {
+        self.scenario_bytes = limits::SCENARIO_HEADER_BYTES + actors * limits::ACTOR_HEADER_BYTES;
+        let images = self.schedule.frames() * self.cameras.len();
+        let most = limits::OBSERVATION_HEADER_BYTES as usize;
+        let needed = HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES + self.scenario_bytes;
+        if needed <= most {
+            return Ok(());
+        }
+        let must = format!(
+            "true for {actors} actors beside {images} images, whose header would have {needed} bytes; at most {most} \
+             are accepted: request fewer images"
+        );
+        Err(SessionError::OutOfRange { field: "outputs.actors", must })
+    }
+
     /// Bytes to reserve for the header of an observation of some captures, including its length prefix.
     pub(super) fn header_bytes(&self, captures: &[RigCapture]) -> usize {
         let rendered: usize = captures.iter().map(|capture| capture.cameras.len()).sum();
         // With several frames per camera, an observation contains more images than it renders.
         let images = rendered.max(self.schedule.frames() * self.cameras.len());
-        HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES
+        HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES + self.scenario_bytes
     }
 
     /// Bytes that the renderer writes into the buffer for a capture.
@@ -199,7 +230,7 @@ impl ObservationLayout {
     }
 
     /// Whether a later observation shows a camera's image of a capture.
-    pub(super) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
+    pub(crate) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
         !capture.shown || self.schedule.is_shown_after(camera, capture.time_us, capture.time_us)
     }
 

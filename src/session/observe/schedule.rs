@@ -6,13 +6,16 @@
 
 use std::collections::BTreeMap;
 
+use serde::{Deserialize, Serialize};
+
 use wildcity_scene::rig::RigCamera;
 
 use crate::error::SessionError;
 use crate::limits;
 
 /// When the cameras take frames, and when the agent decides.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct Schedule {
     /// How many last frames of each camera a decision shows.
     frames: usize,
@@ -55,6 +58,28 @@ impl Schedule {
         let period_us = |camera: &RigCamera| periods_us.get(&camera.name).copied().unwrap_or(dt_us);
         let periods_us = cameras.iter().map(period_us).collect();
         Ok(Self { frames: frames as usize, periods_us, decision_us })
+    }
+
+    /// One frame of each camera with every step, and a decision at every step.
+    pub(crate) fn every_step(cameras: usize, dt_us: i64) -> Self {
+        Self { frames: 1, periods_us: vec![dt_us; cameras], decision_us: dt_us }
+    }
+
+    /// Checks a schedule that was read from a file.
+    ///
+    /// # Errors
+    /// Names the first value that is out of range.
+    pub(crate) fn check(&self, cameras: usize, dt_us: i64) -> Result<(), SessionError> {
+        let field = "outputs.frames";
+        if self.periods_us.len() != cameras || !(1..=limits::BUNDLE_FRAMES).contains(&self.frames) {
+            let periods = self.periods_us.len();
+            let must = format!("{}, with {periods} periods of {cameras} cameras", self.frames);
+            return Err(SessionError::OutOfRange { field, must });
+        }
+        check_period("decision_us", self.decision_us, dt_us)?;
+        self.periods_us
+            .iter()
+            .try_for_each(|&period_us| check_period("outputs.period_us", period_us, dt_us))
     }
 
     /// How many last frames of each camera a decision shows.

@@ -2,7 +2,7 @@
 
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::ego::Path;
-use wildcity_sim::{Command, Ego, Ground};
+use wildcity_sim::{Command, Ground};
 
 use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
 use crate::episode::Episode;
@@ -28,8 +28,12 @@ pub(crate) struct EgoReplay {
 
 impl EgoReplay {
     pub(crate) fn new(header: &EpisodeHeader) -> Self {
-        let EpisodeHeader { seed, dynamics, start, dt_us, .. } = *header;
-        Self { episode: Episode::new(seed, Ego::new(dynamics, start), dt_us) }
+        Self { episode: header.first_state() }
+    }
+
+    /// The state after the frames so far.
+    pub(crate) fn into_episode(self) -> Episode {
+        self.episode
     }
 
     /// The episode after the frames so far.

@@ -14,12 +14,15 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{RenderProfile, Rig};
+use wildcity_scene::rig::is_name;
+use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
 use wildcity_sim::ego::{Action, TimedPose};
-use wildcity_sim::{Command, Dynamics};
+use wildcity_sim::{Command, Dynamics, Ego};
 
-use crate::episode::EpisodeSummary;
+use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
+use crate::observe::schedule::Schedule;
+use crate::state::SessionSettings;
 
 /// This build, as it is named in records.
 pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
@@ -62,6 +65,42 @@ pub struct EpisodeHeader {
     pub start: Pose,
     /// Simulated time of a step, in microseconds.
     pub dt_us: i64,
+    /// The session's other settings; absent if all are the defaults.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub settings: Option<RecordedSettings>,
+    /// The state at the beginning of the file, if that is more than a start: after a warm-up, or of a branch.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub state: Option<Episode>,
+    /// The recorded episode that this one is a branch of.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub origin: Option<RecordedOrigin>,
+    /// BLAKE3 of the resolved scenario, in hex; absent without a scenario.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<String>,
+}
+
+/// Settings of a session that images do not depend on, but bundles, later versions and later episodes do.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedSettings {
+    /// Fields that override the profile of each version.
+    pub profile_overrides: ProfileOverrides,
+    /// When the cameras take frames, and when the agent decides.
+    pub(crate) schedule: Schedule,
+    /// Whether images had a trust.
+    pub trust: bool,
+    /// Length of the warm-up, in microseconds.
+    pub warm_up_us: i64,
+}
+
+/// Where a branch begins.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordedOrigin {
+    /// Name of the episode's file, without its ending.
+    pub episode: String,
+    /// Steps done there.
+    pub step: u64,
 }
 
 /// What the observations held.
@@ -139,6 +178,8 @@ pub enum FrameRequest {
     Reset,
     /// A step.
     Step,
+    /// A snapshot was restored.
+    Restore,
     /// Poses to render from without moving the ego.
     Observe,
 }
@@ -165,9 +206,41 @@ pub(crate) enum Line {
     End(EpisodeSummary),
 }
 
+impl RecordedSettings {
+    /// The settings of a session; `None` if all are the defaults.
+    pub(crate) fn of(settings: &SessionSettings, trust: bool) -> Option<Self> {
+        let recorded = Self {
+            profile_overrides: settings.profile_overrides.clone(),
+            schedule: settings.layout.schedule().clone(),
+            trust,
+            warm_up_us: settings.warm_up_us,
+        };
+        let cameras = settings.layout.cameras().len();
+        (recorded != Self::default_of(cameras, settings.dt_us)).then_some(recorded)
+    }
+
+    /// The settings of a session that requests none.
+    pub(crate) fn default_of(cameras: usize, dt_us: i64) -> Self {
+        Self {
+            profile_overrides: ProfileOverrides::default(),
+            schedule: Schedule::every_step(cameras, dt_us),
+            trust: false,
+            warm_up_us: 0,
+        }
+    }
+}
+
 impl EpisodeHeader {
     /// The version of the format that this build writes and reads.
     pub const FORMAT: u32 = 0;
+
+    /// The state at the beginning of the file.
+    pub(crate) fn first_state(&self) -> Episode {
+        match &self.state {
+            Some(state) => state.clone(),
+            None => Episode::new(self.seed, Ego::new(self.dynamics, self.start), self.dt_us),
+        }
+    }
 }
 
 impl FrameRecord {
@@ -186,6 +259,14 @@ impl RecordedCommand {
             Command::Action(action) => Some(Self::Action(*action)),
         }
     }
+}
+
+/// Whether a text names an episode: the name of a session, a hyphen and a number. Such a name is safe as a file
+/// name and cannot be a path.
+pub fn is_episode_name(text: &str) -> bool {
+    let is_number =
+        |text: &str| (1..=20).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());
+    text.rsplit_once('-').is_some_and(|(session, number)| is_name(session) && is_number(number))
 }
 
 /// BLAKE3 of a profile's JSON.

@@ -84,6 +84,9 @@ impl RecordedEpisode {
                         return Err(wrong(format!("format {format}; this build reads {known}")));
                     }
                     first.rig.check()?;
+                    if let Some(state) = &first.state {
+                        state.check().map_err(|reason| wrong(reason.to_owned()))?;
+                    }
                     header = Some(*first);
                 }
                 Line::Frame(frame) if number > 1 => {

@@ -54,6 +54,13 @@ impl Recorder {
         Ok(NewFile { recorder, number })
     }
 
+    /// Removes the file, which must be new.
+    pub(crate) fn discard(self) {
+        if let Err(error) = fs::remove_file(&self.path) {
+            tracing::warn!(path = %self.path.display(), "an unused record was not removed: {error}");
+        }
+    }
+
     /// Appends whole lines, or nothing.
     pub(crate) fn append(&self, lines: &[Line]) -> Result<(), RecordError> {
         self.try_append(lines).map_err(|cause| RecordError { path: self.path.to_path_buf(), cause })

@@ -3,10 +3,12 @@
 //! | file | what the session does |
 //! |---|---|
 //! | `open.rs` | opens, and switches to another version of the twin |
+//! | `branch.rs` | takes and restores snapshots, and opens sessions from a state of another episode |
 //! | `requests.rs` | answers step, observe, reset and close |
 //! | `recording.rs` | writes the episode's file |
 //! | `prefetching.rs` | loads what the next steps will need |
 
+mod branch;
 mod open;
 mod prefetching;
 mod recording;
@@ -18,24 +20,22 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use wildcity_render::View;
+use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_sim::Dynamics;
 use wildcity_twin::residency::{Reservation, Resident, Viewpoint};
 
 use crate::engine::Engine;
-use crate::engine::answer_budget::BudgetShare;
 use crate::episode::Episode;
 use crate::observe::encode::Encoding;
-use crate::observe::frame_history::FrameHistory;
-use crate::observe::layout::ObservationLayout;
-use crate::observe::trust::TrainingCoverage;
 use crate::options::PixelMaps;
 use crate::prefetch::latest_task::LatestTask;
-use crate::prefetch::recorded_drive::RecordedDrive;
+use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
-use crate::start::EpisodeStart;
+use crate::scenario::EpisodeTraffic;
+use crate::snapshot::Snapshots;
+use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 use crate::viewpoint::viewpoints;
 
 /// One agent's session on a twin. It stays on one version until the agent switches to another.
@@ -47,35 +47,19 @@ pub struct Session {
     /// Prefetches beside the session.
     prefetch_task: LatestTask,
     name: String,
-    /// Fields that override the profile of each version of the twin.
-    profile_overrides: ProfileOverrides,
-    /// The version's profile with the overrides.
-    profile: RenderProfile,
-    profile_hash: blake3::Hash,
-    rig_name: String,
-    layout: Arc<ObservationLayout>,
-    /// The share of the budget for answers that the cameras' overlays take.
-    _overlays: BudgetShare,
-    dynamics: Dynamics,
-    /// Where episodes start unless `reset` names another start.
-    start: EpisodeStart,
-    warm_up_us: i64,
-    dt_us: i64,
-    deadline: Duration,
-    episode: Episode,
-    /// The episode's frames that later observations show again.
-    frame_history: FrameHistory,
+    settings: Arc<SessionSettings>,
+    version: PinnedVersion,
+    state: EpisodeState,
+    snapshots: Snapshots,
+    /// The recorded episode that this one is a branch of, if it is one.
+    origin: Option<RecordedOrigin>,
     /// Number of the current episode's file, and the file once it exists: it begins with the first frame.
     episode_number: u64,
     recorder: Option<Recorder>,
     /// The session has switched versions, and the episode's file does not say so yet.
     version_switched: bool,
-    /// The recorded drive that the ego may follow.
-    drive: Option<Arc<RecordedDrive>>,
     /// The agent's announced path (`prefetch`): poses (`world_from_rig`), in order.
     hint: Vec<Pose>,
-    /// Where the twin was recorded; only if images come with their trust.
-    coverage: Option<Arc<TrainingCoverage>>,
     /// When the last frame was ready, and the time between it and the frame before.
     last_frame_at: Instant,
     frame_interval: Duration,
@@ -89,12 +73,15 @@ impl Session {
 
     /// The version of the twin.
     pub fn resident(&self) -> &Arc<Resident> {
-        self.reservation.resident()
+        &self.version.resident
     }
 
     /// The viewpoints of the next frame if the ego stays where it is.
     pub fn viewpoints(&self) -> Vec<Viewpoint> {
-        viewpoints(&View::of_rig(self.layout.cameras(), self.episode.world_from_rig()))
+        viewpoints(&View::of_rig(
+            self.settings.layout.cameras(),
+            self.state.episode.world_from_rig(),
+        ))
     }
 
     /// Memory that is reserved for the worst frame, in bytes.
@@ -104,12 +91,12 @@ impl Session {
 
     /// How it is rendered: the version's profile with the overrides from opening.
     pub fn profile(&self) -> &RenderProfile {
-        &self.profile
+        &self.version.profile
     }
 
     /// BLAKE3 of the render profile's JSON.
     pub fn profile_hash(&self) -> blake3::Hash {
-        self.profile_hash
+        self.version.profile_hash
     }
 
     /// Name of the backend that renders.
@@ -119,67 +106,82 @@ impl Session {
 
     /// The cameras that are rendered, in the order of the images.
     pub fn cameras(&self) -> &[RigCamera] {
-        self.layout.cameras()
+        self.settings.layout.cameras()
     }
 
     /// The share of a camera's image that its lens sees; `None` if that is all of it.
     pub fn visible_share(&self, camera: usize) -> Option<f64> {
-        self.layout.visible_share(camera)
+        self.settings.layout.visible_share(camera)
     }
 
     /// How colour images are encoded.
     pub fn encoding(&self) -> Encoding {
-        self.layout.encoding()
+        self.settings.layout.encoding()
     }
 
     /// Which maps come with every image.
     pub fn maps(&self) -> PixelMaps {
-        self.layout.maps()
+        self.settings.layout.maps()
     }
 
     /// Whether images come with their trust.
     pub fn trust(&self) -> bool {
-        self.coverage.is_some()
+        self.version.coverage.is_some()
     }
 
     /// How the ego moves.
     pub fn dynamics(&self) -> Dynamics {
-        self.dynamics
+        self.settings.dynamics
     }
 
     /// `world_from_rig` where episodes start unless `reset` names another start.
     pub fn start(&self) -> Pose {
-        self.start.world_from_rig()
+        self.settings.start.world_from_rig()
     }
 
     /// Length of the warm-up before the start, in microseconds.
     pub fn warm_up_us(&self) -> i64 {
-        self.warm_up_us
+        self.settings.warm_up_us
     }
 
     /// How many last frames of each camera an observation holds.
     pub fn frames(&self) -> usize {
-        self.layout.schedule().frames()
+        self.settings.layout.schedule().frames()
     }
 
     /// Time between two frames of a camera, by its index, in microseconds.
     pub fn period_us(&self, camera: usize) -> i64 {
-        self.layout.schedule().period_us(camera)
+        self.settings.layout.schedule().period_us(camera)
     }
 
     /// Time between two observations with images, in microseconds.
     pub fn decision_us(&self) -> i64 {
-        self.layout.schedule().decision_us()
+        self.settings.layout.schedule().decision_us()
     }
 
     /// Simulated time of a step, in microseconds.
     pub fn dt_us(&self) -> i64 {
-        self.dt_us
+        self.settings.dt_us
     }
 
     /// How long one answer may take.
     pub fn deadline(&self) -> Duration {
-        self.deadline
+        self.settings.deadline
+    }
+
+    /// Its snapshots. They stay usable after the session ends, as long as this copy exists.
+    pub fn snapshots(&self) -> &Snapshots {
+        &self.snapshots
+    }
+
+    /// The actors and the route of the current episode; only with a scenario.
+    pub fn traffic(&self) -> Option<&EpisodeTraffic> {
+        self.state.traffic.as_ref()
+    }
+
+    /// Whether observations tell where the actors are.
+    pub fn tells_actors(&self) -> bool {
+        self.settings.tells_actors
     }
 
     /// Name of the current episode's record; `None` before its first frame.
@@ -189,6 +191,6 @@ impl Session {
 
     /// The current episode.
     pub fn episode(&self) -> &Episode {
-        &self.episode
+        &self.state.episode
     }
 }

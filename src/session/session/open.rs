@@ -10,22 +10,23 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
 use wildcity_scene::{Manifest, Trajectory};
-use wildcity_twin::residency::{Resident, RigExtent, Urgency};
+use wildcity_twin::residency::{Reservation, Resident, RigExtent, Urgency};
 
 use super::Session;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::error::SessionError;
 use crate::limits;
-use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::schedule::Schedule;
 use crate::observe::trust::TrainingCoverage;
 use crate::options::{ImagePart, Outputs, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
-use crate::record::format::profile_hash;
+use crate::scenario::{EpisodeTraffic, ScenarioError, SessionScenario};
+use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
+use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 use crate::viewpoint::viewpoints;
 
 impl Session {
@@ -36,15 +37,44 @@ impl Session {
     pub async fn open(
         engine: Arc<Engine>,
         name: String,
-        options: SessionOptions,
+        mut options: SessionOptions,
     ) -> Result<Self, SessionError> {
         // How long a step takes in simulated time, and an answer in real time.
         let dt_us = check_dt(options.dt_us)?;
         let deadline = check_deadline(options.deadline, engine.step_timeout())?;
 
         // The version of the twin. Its Gaussians are loaded frame by frame.
-        let resident = engine.open_version(options.twin, options.version).await?;
+        let resident = engine.open_version(options.twin.clone(), options.version).await?;
         let manifest = &resident.version.manifest;
+
+        // The scenario, whose ego section fills in what the request leaves open.
+        let scenario = options.scenario.take();
+        let tells_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
+        let mut loaded = None;
+        let scenario = match scenario {
+            None => None,
+            Some(asked) => {
+                let scenarios = engine.scenarios().clone();
+                let version = resident.version.clone();
+                let seed = options.seed;
+                let (asked, scenario, found) = run_blocking(move || {
+                    let read = SessionScenario::read(scenarios, &asked.source, &asked.values);
+                    let scenario = read?;
+                    let found = scenario.of_episode(seed, &version)?;
+                    Ok::<_, ScenarioError>((asked, scenario, found))
+                })
+                .await??;
+                options.start = options.start.or_else(|| found.start());
+                if let (true, Some(dynamics)) = (asked.dynamics, found.scenario.dynamics) {
+                    options.dynamics = dynamics;
+                }
+                if let (true, Some(warm_up_us)) = (asked.warm_up, found.scenario.warm_up_us) {
+                    options.warm_up_us = warm_up_us;
+                }
+                loaded = Some(found);
+                Some(scenario)
+            }
+        };
 
         // The cameras. Scaling their overlays takes a second at worst.
         let outputs = options.outputs;
@@ -69,7 +99,12 @@ impl Session {
             &outputs.periods_us,
             options.decision_us,
         )?;
-        let layout = ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
+        let mut layout =
+            ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
+        if let Some(loaded) = &loaded {
+            let actors = loaded.scenario.traffic.actors.len();
+            layout.reserve_header(if tells_actors { actors } else { 0 })?;
+        }
 
         // Where episodes start, and the recorded drive that the ego may follow from there.
         let start = EpisodeStart::resolve(
@@ -94,37 +129,59 @@ impl Session {
         // The memory for the worst frame anywhere in the twin.
         let reservation = Engine::reserve(resident.clone(), extent, profile).await?;
 
+        let episode = start.episode(options.seed, options.dynamics, dt_us);
+        let settings = SessionSettings {
+            profile_overrides: options.profile,
+            rig_name: rig.name,
+            layout: Arc::new(layout),
+            _overlays: overlays,
+            dynamics: options.dynamics,
+            start,
+            warm_up_us: options.warm_up_us,
+            dt_us,
+            deadline,
+            drive,
+            scenario,
+            tells_actors,
+        };
+        let version = PinnedVersion::new(resident, profile, coverage);
+        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, episode.ego()));
+        let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
+        Ok(Self::assembled(engine, name, Arc::new(settings), reservation, version, state))
+    }
+
+    /// A session in a state of an episode.
+    pub(super) fn assembled(
+        engine: Arc<Engine>,
+        name: String,
+        settings: Arc<SessionSettings>,
+        reservation: Reservation,
+        version: PinnedVersion,
+        state: EpisodeState,
+    ) -> Self {
+        let dt_us = settings.dt_us;
         let session = Self {
             engine,
             reservation,
             prefetch_task: LatestTask::default(),
             name,
-            profile_overrides: options.profile,
-            profile,
-            profile_hash: profile_hash(&profile),
-            rig_name: rig.name,
-            layout: Arc::new(layout),
-            _overlays: overlays,
-            dynamics: options.dynamics,
-            episode: start.episode(options.seed, options.dynamics, dt_us),
-            start,
-            warm_up_us: options.warm_up_us,
-            dt_us,
-            deadline,
-            frame_history: FrameHistory::default(),
+            settings,
+            version,
+            state,
+            snapshots: Snapshots::default(),
+            origin: None,
             episode_number: 0,
             recorder: None,
             version_switched: false,
-            drive,
             hint: Vec::new(),
-            coverage,
             last_frame_at: Instant::now(),
             // Assume real time until a step shows the agent's pace.
             frame_interval: Duration::from_micros(dt_us.unsigned_abs()),
         };
-        // The first frame is likely to be at the start: load that while the agent prepares.
-        session.prefetch_at(vec![(Urgency::Imminent, session.start())]);
-        Ok(session)
+        // The first frame is likely to be where the ego is: load that while the agent prepares.
+        let here = session.state.episode.world_from_rig();
+        session.prefetch_at(vec![(Urgency::Imminent, here)]);
+        session
     }
 
     /// Switches to another version of the twin, or to its latest; the episode goes on.
@@ -140,21 +197,20 @@ impl Session {
         if resident.version.number == current.number {
             return Ok(());
         }
-        let extent = rig_extent(self.layout.cameras());
-        let profile = self.profile_overrides.apply(resident.version.manifest.profile)?;
+        let extent = rig_extent(self.settings.layout.cameras());
+        let overrides = &self.settings.profile_overrides;
+        let profile = overrides.apply(resident.version.manifest.profile)?;
         Engine::bake_sky(resident.clone(), profile).await?;
         let bytes = Engine::worst_case_bytes(resident.clone(), extent, profile).await?;
-        let coverage = match &self.coverage {
+        let coverage = match &self.version.coverage {
             Some(_) => Some(training_coverage(&resident).await?),
             None => None,
         };
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
-        self.reservation.exchange(resident, bytes)?;
-        self.coverage = coverage;
-        self.profile = profile;
-        self.profile_hash = profile_hash(&profile);
+        self.reservation.exchange(resident.clone(), bytes)?;
+        self.version = PinnedVersion::new(resident, profile, coverage);
         self.version_switched = true;
-        let mut places = vec![(Urgency::Imminent, self.episode.world_from_rig())];
+        let mut places = vec![(Urgency::Imminent, self.state.episode.world_from_rig())];
         places.extend(self.forecast().places());
         self.prefetch_at(places);
         Ok(())
@@ -256,7 +312,7 @@ fn crop_and_scale(mut rig: Rig, outputs: &Outputs) -> Result<Rig, SessionError> 
 }
 
 /// The properties of a rig that determine how much memory its frames need.
-fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
+pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
     let viewpoints = viewpoints(&View::of_rig(cameras, Pose::IDENTITY));
     RigExtent {
         focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
@@ -275,7 +331,7 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
 }
 
 /// Where a version of the twin was recorded and trained.
-async fn training_coverage(
+pub(super) async fn training_coverage(
     resident: &Arc<Resident>,
 ) -> Result<Arc<TrainingCoverage>, SessionError> {
     let resident = resident.clone();

@@ -33,7 +33,7 @@ impl Session {
     pub(super) fn look_ahead(&mut self) {
         self.frame_interval = self.last_frame_at.elapsed();
         self.last_frame_at = Instant::now();
-        self.hint = remaining_hint(&self.hint, self.episode.world_from_rig()).to_vec();
+        self.hint = remaining_hint(&self.hint, self.state.episode.world_from_rig()).to_vec();
         self.prefetch_at(self.forecast().places());
     }
 
@@ -43,10 +43,11 @@ impl Session {
         let ahead = (3 * self.resident().load_p99()).clamp(shortest, longest);
         let steps = ahead.as_secs_f64() / self.frame_interval.as_secs_f64().max(1e-3);
         EgoForecast {
-            world_from_rig: self.episode.world_from_rig(),
-            last_step_m: self.episode.ego().velocity_m_s() * (self.dt_us as f64 * 1e-6),
+            world_from_rig: self.state.episode.world_from_rig(),
+            last_step_m: self.state.episode.ego().velocity_m_s()
+                * (self.settings.dt_us as f64 * 1e-6),
             steps: (steps.ceil() as usize).min(limits::STEPS_AHEAD),
-            drive: self.drive.as_deref(),
+            drive: self.settings.drive.as_deref(),
             hint: &self.hint,
         }
     }
@@ -54,8 +55,8 @@ impl Session {
     /// Loads in the background what is seen from some poses, in place of what was to be prefetched before.
     pub(super) fn prefetch_at(&self, places: Vec<(Urgency, Pose)>) {
         let prefetcher = self.reservation.prefetcher().clone();
-        let layout = self.layout.clone();
-        let profile = self.profile;
+        let layout = self.settings.layout.clone();
+        let profile = self.version.profile;
         self.prefetch_task.submit(move || {
             let places: Vec<_> = places
                 .into_iter()

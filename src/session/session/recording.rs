@@ -9,9 +9,12 @@ use crate::error::SessionError;
 use crate::observe::builder::finish::RenderedObservation;
 use crate::options::PixelMaps;
 use crate::record::format::{
-    BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOutputs, RecordedVersion,
+    BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,
+    RecordedSettings, RecordedVersion,
 };
 use crate::record::recorder::{NewFile, Recorder};
+use crate::scenario::EpisodeTraffic;
+use crate::state::PinnedVersion;
 
 impl Session {
     /// Appends a frame to the episode's file. The first frame of an episode creates the file.
@@ -23,7 +26,11 @@ impl Session {
                 append(recorder, version.into_iter().chain([frame]).collect()).await?;
             }
             None => {
-                let file = self.create_file(&self.episode, frame).await?;
+                let scenario = scenario_hash(self.state.traffic.as_ref());
+                let origin = self.origin.clone();
+                let file = self
+                    .create_file(&self.version, origin, scenario, &self.state.episode, frame)
+                    .await?;
                 self.recorder = Some(file.recorder);
                 self.episode_number = file.number;
             }
@@ -40,7 +47,7 @@ impl Session {
         rendered: &RenderedObservation,
     ) -> FrameRecord {
         let RenderedObservation { observation, captures, hashes, .. } = rendered;
-        let all_cameras = self.layout.cameras().len();
+        let all_cameras = self.settings.layout.cameras().len();
         let mut cameras: Vec<_> = captures.iter().map(|capture| capture.cameras.clone()).collect();
         if cameras.iter().all(|of_pose| of_pose.len() == all_cameras) {
             cameras.clear();
@@ -62,23 +69,28 @@ impl Session {
     fn version_line(&self) -> Line {
         let version = &self.resident().version;
         Line::Version(RecordedVersion {
-            step: self.episode.step(),
+            step: self.state.episode.step(),
             version: version.number,
             version_hash: version.hash.clone(),
-            profile: self.profile,
-            profile_hash: self.profile_hash.to_hex().to_string(),
+            profile: self.version.profile,
+            profile_hash: self.version.profile_hash.to_hex().to_string(),
         })
     }
 
-    /// Creates the file of an episode that has not moved yet, with its header and its first frame.
+    /// Creates the file of an episode, with its header and its first frame. `episode` is the state before that
+    /// frame's step.
     pub(super) async fn create_file(
         &self,
+        pinned: &PinnedVersion,
+        origin: Option<RecordedOrigin>,
+        scenario: Option<String>,
         episode: &Episode,
         first_frame: Line,
     ) -> Result<NewFile, SessionError> {
-        let version = &self.resident().version;
-        let PixelMaps { depth, opacity, normals } = self.layout.maps();
-        let cameras = self.layout.cameras().to_vec();
+        let version = &pinned.resident.version;
+        let settings = &self.settings;
+        let PixelMaps { depth, opacity, normals } = settings.layout.maps();
+        let cameras = settings.layout.cameras().to_vec();
         let header = EpisodeHeader {
             format: EpisodeHeader::FORMAT,
             build: BUILD.to_owned(),
@@ -86,16 +98,25 @@ impl Session {
             twin: version.manifest.twin.clone(),
             version: version.number,
             version_hash: version.hash.clone(),
-            profile: self.profile,
-            profile_hash: self.profile_hash.to_hex().to_string(),
+            profile: pinned.profile,
+            profile_hash: pinned.profile_hash.to_hex().to_string(),
             backend: self.engine.backend().to_owned(),
             backend_detail: self.engine.backend_detail(),
-            rig: Rig { name: self.rig_name.clone(), cameras },
-            outputs: RecordedOutputs { encoding: self.layout.encoding(), depth, opacity, normals },
+            rig: Rig { name: settings.rig_name.clone(), cameras },
+            outputs: RecordedOutputs {
+                encoding: settings.layout.encoding(),
+                depth,
+                opacity,
+                normals,
+            },
             seed: episode.seed(),
-            dynamics: self.dynamics,
+            dynamics: episode.ego().dynamics(),
             start: episode.world_from_rig(),
-            dt_us: self.dt_us,
+            dt_us: settings.dt_us,
+            settings: RecordedSettings::of(settings, pinned.coverage.is_some()),
+            state: (!episode.is_start_alone()).then(|| episode.clone()),
+            origin,
+            scenario,
         };
         let dir = self.engine.episodes().to_owned();
         let name = self.name.clone();
@@ -109,10 +130,17 @@ impl Session {
     /// way.
     pub(super) async fn end_recording(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
-        if let Err(error) = append(recorder, vec![Line::End(self.episode.summary(outcome))]).await {
+        if let Err(error) =
+            append(recorder, vec![Line::End(self.state.episode.summary(outcome))]).await
+        {
             tracing::warn!(session = self.name, "the episode's summary was not recorded: {error}");
         }
     }
+}
+
+/// BLAKE3 of an episode's scenario, in hex.
+pub(super) fn scenario_hash(traffic: Option<&EpisodeTraffic>) -> Option<String> {
+    traffic.map(|traffic| traffic.loaded().hash.clone())
 }
 
 async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {

@@ -12,6 +12,7 @@ use wildcity_sim::{Command, Ground};
 use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
+use super::recording::scenario_hash;
 use crate::blocking::run_blocking;
 use crate::engine::render_queue::Scratch;
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -23,8 +24,11 @@ use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
 use crate::options::Start;
-use crate::record::format::{FrameRequest, Line, RecordedCommand};
+use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
+use crate::record::recorder::NewFile;
+use crate::scenario::EpisodeTraffic;
 use crate::start::EpisodeStart;
+use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
 
 impl Session {
@@ -40,18 +44,25 @@ impl Session {
     ) -> Result<Observation, SessionError> {
         let command = command.into();
         let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
-        let mut next = self.episode.stepped(&command, &ground, terminate)?;
+        let mut next = self.state.episode.stepped(&command, &ground, terminate)?;
+        let traffic = self.state.traffic.as_ref().map(|traffic| {
+            traffic.stepped(self.state.episode.ego(), next.ego(), self.settings.dt_us)
+        });
+        if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
+            next.end(reason);
+        }
 
-        let captures = self.layout.captures(&next, &self.frame_history);
-        let rendered = self.render(&next, captures, Some(self.frame_history.clone())).await?;
+        let frame_history = self.state.frame_history.clone();
+        let captures = self.settings.layout.captures(&next, &frame_history);
+        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = RecordedCommand::of(&command);
         self.record(record).await?;
 
         next.add_trusts(rendered.trusts());
-        self.episode = next;
-        self.frame_history = rendered.frame_history;
+        let frame_history = rendered.frame_history;
+        self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
         Ok(rendered.observation)
     }
@@ -65,9 +76,9 @@ impl Session {
             let must = format!("{}; 1 to {} are accepted", poses.len(), limits::OBSERVE_POSES);
             return Err(SessionError::OutOfRange { field: "poses", must });
         }
-        let episode = self.episode.clone();
-        let captures = self.layout.captures_at(&episode, poses);
-        let rendered = self.render(&episode, captures, None).await?;
+        let episode = self.state.episode.clone();
+        let captures = self.settings.layout.captures_at(&episode, poses);
+        let rendered = self.render(&self.version, &episode, captures, None).await?;
         self.record(self.frame_record(FrameRequest::Observe, &episode, &rendered)).await?;
         Ok(rendered.observation)
     }
@@ -81,55 +92,77 @@ impl Session {
         seed: u64,
         start: Option<Start>,
     ) -> Result<Observation, SessionError> {
+        // With a scenario, the seed decides jitter, and perhaps the start.
+        let loaded = match &self.settings.scenario {
+            None => None,
+            Some(scenario) => {
+                let scenario = scenario.clone();
+                let version = self.resident().version.clone();
+                Some(run_blocking(move || scenario.of_episode(seed, &version)).await??)
+            }
+        };
+        let start = start.or_else(|| loaded.as_ref().and_then(|loaded| loaded.start()));
         let start = match &start {
             Some(_) => EpisodeStart::resolve(
                 &self.resident().version.manifest,
                 start.as_ref(),
-                self.warm_up_us,
-                self.dynamics,
+                self.settings.warm_up_us,
+                self.settings.dynamics,
             )?,
-            None => self.start.clone(),
+            None => self.settings.start.clone(),
         };
-        let mut next = start.episode(seed, self.dynamics, self.dt_us);
+        let mut next = start.episode(seed, self.settings.dynamics, self.settings.dt_us);
+        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, next.ego()));
 
-        let captures = self.layout.captures(&next, &FrameHistory::default());
-        let rendered = self.render(&next, captures, Some(FrameHistory::default())).await?;
+        let frame_history = FrameHistory::default();
+        let captures = self.settings.layout.captures(&next, &frame_history);
+        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let file = self.create_file(&next, Line::Frame(record)).await?;
+        let scenario = scenario_hash(traffic.as_ref());
+        let line = Line::Frame(record);
+        let file = self.create_file(&self.version, None, scenario, &next, line).await?;
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());
+        self.begin(file, None);
+        let frame_history = rendered.frame_history;
+        self.state = EpisodeState { episode: next, frame_history, traffic };
+        self.look_ahead();
+        Ok(rendered.observation)
+    }
+
+    /// Goes over to another episode, which has its own file. The caller sets its state.
+    pub(super) fn begin(&mut self, file: NewFile, origin: Option<RecordedOrigin>) {
         self.recorder = Some(file.recorder);
         self.episode_number = file.number;
         self.version_switched = false;
-        self.episode = next;
-        self.frame_history = rendered.frame_history;
+        self.origin = origin;
         self.hint.clear();
-        self.look_ahead();
-        Ok(rendered.observation)
     }
 
     /// Ends the session and summarizes its last episode.
     pub async fn close(mut self, outcome: Outcome) -> EpisodeSummary {
         self.end_recording(outcome).await;
-        self.episode.summary(outcome)
+        self.state.episode.summary(outcome)
     }
 
-    /// Renders captures one after the other, each in its turn among the other sessions' frames.
+    /// Renders captures of a version one after the other, each in its turn among the other sessions' frames.
     ///
     /// With a history, the observation also shows its earlier frames; without one (`observe`), it does not.
-    async fn render(
+    pub(super) async fn render(
         &self,
+        version: &PinnedVersion,
         episode: &Episode,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
     ) -> Result<RenderedObservation, SessionError> {
-        let deadline = Instant::now() + self.deadline;
+        let layout = &self.settings.layout;
+        let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(
-            self.layout.clone(),
+            layout.clone(),
             self.engine.answer_budget(),
-            self.coverage.clone(),
+            version.coverage.clone(),
             episode,
             &captures,
         )?;
@@ -138,11 +171,11 @@ impl Session {
                 builder.add_capture(capture);
                 continue;
             }
-            let views = self.layout.views(episode, &capture);
+            let views = layout.views(episode, &capture);
             // Load before the job is queued, so that no render thread waits for a disk.
-            let pinned = self.pin(deadline, viewpoints(&views)).await?;
+            let pinned = pin(version, deadline, viewpoints(&views)).await?;
             builder.add_load(pinned.waited_for, pinned.waited);
-            let profile = self.profile;
+            let profile = version.profile;
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {
                 let frame = Frame { scene: &pinned, profile: &profile, views: &views };
                 let rendered = builder.render(&capture, &frame, backend, scratch);
@@ -153,32 +186,32 @@ impl Session {
             builder = rendered?;
             builder.add_queue_time(queued);
         }
-        let (held_bytes, limit_bytes) = self.resident().memory();
+        let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
     }
+}
 
-    /// Waits until all sections that a frame needs are in memory, and pins them.
-    async fn pin(
-        &self,
-        deadline: Instant,
-        viewpoints: Vec<Viewpoint>,
-    ) -> Result<PinnedScene, SessionError> {
-        let (reply, answer) = oneshot::channel();
-        let resident = self.resident().clone();
-        let profile = self.profile;
-        let request = run_blocking(move || {
-            let done = Box::new(move |pinned| {
-                // Sending fails if the deadline has passed and the receiver is gone.
-                let _ = reply.send(pinned);
-            });
-            resident.request(&viewpoints, &profile, done)
+/// Waits until all sections that a frame needs are in memory, and pins them.
+async fn pin(
+    version: &PinnedVersion,
+    deadline: Instant,
+    viewpoints: Vec<Viewpoint>,
+) -> Result<PinnedScene, SessionError> {
+    let (reply, answer) = oneshot::channel();
+    let resident = version.resident.clone();
+    let profile = version.profile;
+    let request = run_blocking(move || {
+        let done = Box::new(move |pinned| {
+            // Sending fails if the deadline has passed and the receiver is gone.
+            let _ = reply.send(pinned);
         });
-        // Dropping the request takes the frame out of the pager's queue.
-        let request = request.await??;
-        match timeout_at(deadline, answer).await {
-            Ok(Ok(pinned)) => Ok(pinned?),
-            Ok(Err(_)) => Err(SessionError::Crashed),
-            Err(_) => Err(request.timeout_error().into()),
-        }
+        resident.request(&viewpoints, &profile, done)
+    });
+    // Dropping the request takes the frame out of the pager's queue.
+    let request = request.await??;
+    match timeout_at(deadline, answer).await {
+        Ok(Ok(pinned)) => Ok(pinned?),
+        Ok(Err(_)) => Err(SessionError::Crashed),
+        Err(_) => Err(request.timeout_error().into()),
     }
 }

@@ -100,7 +100,8 @@ pub struct Action {
 }
 
 /// The state of an ego between two steps.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Ego {
     dynamics: Dynamics,
     world_from_rig: Pose,

@@ -1,6 +1,7 @@
 //! One step of the linear single-track model: speed, steering, lateral velocity, yaw rate, and the pose.
 
 use glam::DVec2;
+use serde::{Deserialize, Serialize};
 
 use super::collocation::{INTEGRALS, NODES, POINTS, solve};
 use super::constant_speed::{ConstantSpeed, Steering};
@@ -8,7 +9,8 @@ use super::speed::{Drive, Phase};
 use super::vehicle::{LateralDynamics, Vehicle};
 
 /// The state of a car in the plane.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct SingleTrackState {
     /// Position of the middle of the rear axle, in metres.
     pub position_m: DVec2,

@@ -46,9 +46,7 @@ impl Document {
         remove_notes(&mut value);
         let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
             None => SweepSection::default(),
-            Some(sweep) => {
-                typed::<SweepSection>(sweep, "sweep").map_err(|error| error.within_root("sweep"))?
-            }
+            Some(sweep) => sweep_of(sweep)?,
         };
         let document = Self { value, sweep };
         document.check_sweep()?;
@@ -128,11 +126,22 @@ impl Document {
     }
 }
 
-impl FileError {
-    /// The path of a part that was read by itself.
-    fn within_root(self, root: &str) -> Self {
-        if self.path == root { self } else { self.within(root) }
+/// The sweep, field by field, since the path within a flattened map would be lost.
+fn sweep_of(value: Value) -> Result<SweepSection, FileError> {
+    let Value::Object(fields) = value else {
+        let message = "is no object; write {\"seeds\": [0, 9], \"NAME\": [values]}";
+        return Err(FileError::new("sweep", message));
+    };
+    let mut sweep = SweepSection::default();
+    for (name, value) in fields {
+        let path = format!("sweep.{name}");
+        if name == "seeds" {
+            sweep.seeds = Some(typed(value, &path)?);
+        } else {
+            sweep.values.insert(name, typed(value, &path)?);
+        }
     }
+    Ok(sweep)
 }
 
 /// Removes the comments of all objects.

@@ -307,7 +307,8 @@ impl EgoMotion {
 
     /// The ego at a time of a step of `dt_us`.
     pub fn at(&self, since_us: i64, dt_us: i64) -> EgoState {
-        if since_us <= 0 {
+        // Exact for an ego that stands: interpolation could round.
+        if since_us <= 0 || self.from == self.to {
             return self.from;
         }
         if since_us >= dt_us {

@@ -21,6 +21,9 @@ from .observation import Observation, View
 from .protocol import (
     Action,
     Camera,
+    Drive,
+    DrivePose,
+    DriveSection,
     Dynamics,
     Ego,
     Exposure,
@@ -31,9 +34,11 @@ from .protocol import (
     Opened,
     Outputs,
     Pose,
+    RecordedPoint,
     Resumed,
     Rig,
     Shutter,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -46,7 +51,7 @@ from .protocol import (
     Windshield,
     png_data_uri,
 )
-from .pushing import Push, PushProgress, push, rollback
+from .pushing import Push, PushProgress, push, recorded_drive, rollback
 from .sync import Client, Session, connect
 
 __version__ = _version("wildcity")
@@ -59,6 +64,9 @@ __all__ = [
     "Code",
     "ConnectFailed",
     "Disconnected",
+    "Drive",
+    "DrivePose",
+    "DriveSection",
     "Dynamics",
     "Ego",
     "Exposure",
@@ -74,11 +82,13 @@ __all__ = [
     "Push",
     "PushFailed",
     "PushProgress",
+    "RecordedPoint",
     "Refused",
     "Resumed",
     "Rig",
     "Session",
     "Shutter",
+    "SnapshotPoint",
     "Station",
     "Summary",
     "Switched",
@@ -95,5 +105,6 @@ __all__ = [
     "connect",
     "png_data_uri",
     "push",
+    "recorded_drive",
     "rollback",
 ]

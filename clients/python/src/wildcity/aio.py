@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as connect_websocket
@@ -25,13 +25,16 @@ from .observation import Observation
 from .protocol import (
     PROTOCOL,
     Action,
+    DriveSection,
     Dynamics,
     Model,
     Opened,
     Outputs,
     Pose,
+    RecordedPoint,
     Resumed,
     Rig,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -90,8 +93,12 @@ class Client:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        scenario: str | Mapping[str, Any] | None = None,
+        trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
+
+        `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
 
         Raises `Refused` if the server refuses.
         """
@@ -110,9 +117,19 @@ class Client:
                 deadline_ms=deadline_ms,
                 decision_us=decision_us,
                 warm_up_us=warm_up_us,
+                scenario=scenario,
+                trajectory=trajectory,
             )
         )
         return Session(self, opened)
+
+    async def branch(self, point: SnapshotPoint | RecordedPoint, *, session: str | None = None) -> Session:
+        """Opens a session in a state of another episode, with that episode's settings.
+
+        The new session has that state as its snapshot `start`: `restore("start")` shows it. Raises `Refused` if
+        there is no such state.
+        """
+        return Session(self, await self._run(self._protocol.branch(point, session)))
 
     async def resume(self, session: str, last_seq: int) -> Session:
         """Continues a session that another client opened; see `wildcity.sync`."""
@@ -219,6 +236,14 @@ class Session:
     async def reset(self, seed: int = 0, start: Pose | Station | None = None) -> Observation:
         """Starts a new episode at `start`, or at the session's start if it is None."""
         return await self._client._run(self._protocol.reset(seed, start))
+
+    async def snapshot(self, name: str) -> None:
+        """Stores the state of the episode under a name, in place of an earlier snapshot of that name."""
+        return await self._client._run(self._protocol.snapshot(name))
+
+    async def restore(self, name: str) -> Observation:
+        """Returns to a snapshot of this session, and returns the observation of that state."""
+        return await self._client._run(self._protocol.restore(name))
 
     async def switch_version(self, version: int | None = None) -> Switched:
         """Shows another version of the twin from the next step on, or the latest. The episode continues."""

@@ -92,6 +92,55 @@ class Station:
 
 
 @dataclass(frozen=True)
+class DriveSection:
+    """A part of a recorded drive: from `from_m` (0) to `to_m` (its end), with a pose every `every_m` metres.
+
+    Without `every_m` the poses are the recorded keyframes.
+    """
+
+    name: str
+    from_m: float | None = None
+    to_m: float | None = None
+    every_m: float | None = None
+
+
+@dataclass(frozen=True)
+class DrivePose:
+    """A pose of a recorded drive (`world_from_rig`), its distance from the start and its time on the drive's clock."""
+
+    station_m: float
+    time_us: int
+    pose: Pose
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Poses of a recorded drive, in driving order; `length_m` is that of the whole drive."""
+
+    name: str
+    version: int
+    version_hash: str
+    length_m: float
+    poses: tuple[DrivePose, ...]
+
+
+@dataclass(frozen=True)
+class SnapshotPoint:
+    """A snapshot of a session that still exists, on any connection with the same token."""
+
+    session: str
+    snapshot: str
+
+
+@dataclass(frozen=True)
+class RecordedPoint:
+    """A step of an episode that the server has recorded; `episode` is the name of its file, without `.jsonl`."""
+
+    episode: str
+    step: int
+
+
+@dataclass(frozen=True)
 class Lens:
     """A lens model other than the pinhole. Each model has its own fields; the others are None.
 
@@ -186,7 +235,8 @@ class Outputs:
 
     `images` has crops and sizes that differ from the rig's, by camera name. `frames` is how many of the newest
     frames of each camera an observation has, 1 if None. `period_us` is the time between two frames of a camera, by
-    name, for cameras that do not take one with every step. `trust` adds a confidence to each image.
+    name, for cameras that do not take one with every step. `trust` adds a confidence to each image. `actors` tells
+    where the actors of the scenario are.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -198,6 +248,7 @@ class Outputs:
     images: dict[str, ImagePart] | None = None
     frames: int | None = None
     trust: bool | None = None
+    actors: bool | None = None
     period_us: dict[str, int] | None = None
 
 
@@ -256,6 +307,15 @@ class Welcome:
 
 
 @dataclass(frozen=True)
+class OpenedScenario:
+    """The scenario of a session. `hash` is what its first episode is: the scenario with seed, values and hashes."""
+
+    name: str
+    hash: str
+    actors: int
+
+
+@dataclass(frozen=True)
 class Opened:
     """Answer to `open`: every setting of the session, defaults included."""
 
@@ -278,6 +338,8 @@ class Opened:
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
     reserved_bytes: int
+    scenario: OpenedScenario | None = None
+    trajectory: Drive | None = None
 
 
 @dataclass(frozen=True)
@@ -307,7 +369,13 @@ class Summary:
     """Summary of an episode."""
 
     outcome: Literal[
-        "completed", "off_model", "agent_error", "agent_timeout", "agent_lost", "server_error"
+        "completed",
+        "off_model",
+        "driving_failure",
+        "agent_error",
+        "agent_timeout",
+        "agent_lost",
+        "server_error",
     ]
     steps: int
     time_us: int
@@ -318,7 +386,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Ok:
-    """Answer to `prefetch`."""
+    """Answer to `prefetch` and to `snapshot`."""
 
     seq: int
 
@@ -435,6 +503,42 @@ class Residency:
 
 
 @dataclass(frozen=True)
+class Event:
+    """Something that happened in a scenario since the observation before."""
+
+    time_us: int
+    kind: Literal["contact", "trigger", "appeared", "left", "end"]
+    actor: str | None = None
+    name: str | None = None
+    at_fault: bool | None = None
+    impact: float | None = None
+
+
+@dataclass(frozen=True)
+class Route:
+    """Where to drive: points in the rig's frame (metres), what to do next, and where the ego is on the route."""
+
+    points: tuple[Vector, ...]
+    command: Literal["left", "right", "straight"]
+    station_m: float
+    off_m: float
+    length_m: float
+    text: str | None = None
+
+
+@dataclass(frozen=True)
+class Actor:
+    """An actor of the scenario: its box stands on the ground at `pose`, x forward; `size` is length, width, height."""
+
+    name: str
+    kind: str
+    size: Vector
+    pose: Pose
+    velocity: Vector
+    yaw_rate: float
+
+
+@dataclass(frozen=True)
 class Metadata:
     """Everything that an observation holds beside its tensors."""
 
@@ -455,6 +559,9 @@ class Metadata:
     timings: Timings
     residency: Residency
     history: tuple[ImageInfo, ...] = ()
+    events: tuple[Event, ...] = ()
+    route: Route | None = None
+    actors: tuple[Actor, ...] | None = None
 
 
 ANSWERS: dict[str, type[Any]] = {

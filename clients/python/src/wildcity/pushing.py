@@ -1,4 +1,4 @@
-"""Pushes trained scenes to a server as new versions of a twin."""
+"""Requests over HTTP: pushes of trained scenes as new versions of a twin, rollbacks, recorded drives."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from .errors import Code, ConnectFailed, ProtocolError, PushFailed, Refused
+from .protocol import Drive, decode
 
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are read at a time."""
@@ -151,6 +152,30 @@ def rollback(
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/rollback"
     answer = _HttpClient(server, token, timeout).json("POST", path, {"version": version})
     return int(answer["version"])
+
+
+def recorded_drive(
+    twin: str,
+    name: str,
+    *,
+    from_m: float | None = None,
+    to_m: float | None = None,
+    every_m: float | None = None,
+    version: int | None = None,
+    server: str = "http://127.0.0.1:8080",
+    token: str | None = None,
+    timeout: float = 60.0,
+) -> Drive:
+    """Poses of a recorded drive of a twin, as `DriveSection` describes them; of the latest version if it is None.
+
+    Raises `Refused` if the server refuses, and `ConnectFailed` if it does not answer.
+    """
+    optional = {"version": version, "from_m": from_m, "to_m": to_m, "every_m": every_m}
+    query = urllib.parse.urlencode({key: value for key, value in optional.items() if value is not None})
+    twin, name = (urllib.parse.quote(text, safe="") for text in (twin, name))
+    answer = _HttpClient(server, token, timeout).json("GET", f"/v1/twins/{twin}/trajectories/{name}?{query}", None)
+    drive: Drive = decode(Drive, answer, "drive")
+    return drive
 
 
 def _finished_push(answer: dict[str, Any]) -> Push:

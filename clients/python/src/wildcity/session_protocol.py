@@ -22,15 +22,18 @@ from .protocol import (
     PROTOCOL,
     Action,
     Closed,
+    DriveSection,
     Dynamics,
     Model,
     Ok,
     Opened,
     Outputs,
     Pose,
+    RecordedPoint,
     Refusal,
     Resumed,
     Rig,
+    SnapshotPoint,
     Station,
     Summary,
     Switched,
@@ -81,6 +84,8 @@ class SessionProtocol:
         deadline_ms: int | None = None,
         decision_us: int | None = None,
         warm_up_us: int | None = None,
+        scenario: str | Mapping[str, Any] | None = None,
+        trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
         optional = {
@@ -94,6 +99,8 @@ class SessionProtocol:
             "deadline_ms": deadline_ms,
             "decision_us": decision_us,
             "warm_up_us": warm_up_us,
+            "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
+            "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}
         fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}
@@ -120,6 +127,23 @@ class SessionProtocol:
         if start is not None:
             fields["start"] = _start(start)
         return (yield from self._next("reset", Observation, fields))
+
+    def branch(self, point: SnapshotPoint | RecordedPoint, session: str | None) -> Exchange[Opened]:
+        """Opens a session in a state of another episode."""
+        fields = {"from": encode(point)}
+        if session is not None:
+            fields["session"] = session
+        opened = yield from self._next("branch", Opened, fields)
+        self.session = opened.session
+        return opened
+
+    def snapshot(self, name: str) -> Exchange[None]:
+        """Stores the state of the episode under a name."""
+        yield from self._next("snapshot", Ok, {"name": name})
+
+    def restore(self, name: str) -> Exchange[Observation]:
+        """Returns to a snapshot."""
+        return (yield from self._next("restore", Observation, {"name": name}))
 
     def switch_version(self, version: int | None) -> Exchange[Switched]:
         """Shows another version of the twin."""

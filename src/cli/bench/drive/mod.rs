@@ -17,7 +17,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
 use wildcity_session::{
-    Encoding, EngineSettings, Outputs, RigChoice, Session, SessionOptions, Start,
+    Encoding, EngineSettings, Outputs, RigChoice, Scenarios, Session, SessionOptions, Start,
 };
 use wildcity_twin::residency::{Cache, Stats};
 
@@ -95,6 +95,7 @@ impl Drive {
         let engine = wildcity_session::Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
             episodes: episodes.0.clone(),
+            scenarios: Scenarios::in_dir(""),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
         })?;

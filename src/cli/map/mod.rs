@@ -1,0 +1,36 @@
+//! `wildcity map`.
+
+mod check;
+mod import;
+mod strips;
+
+/// Make and check maps: lanes and areas of a twin.
+///
+/// A twin needs no map. With one, actors can follow lanes, and scores can tell which ego is off the road.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity map import town.xodr --out town.map.json
+  wildcity map strips street --left-m 5.2 --right-m 1.7 --out street.map.json
+  wildcity map check street.map.json")]
+pub(super) struct MapCommand {
+    #[command(subcommand)]
+    subcommand: Subcommand,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Subcommand {
+    Import(import::Import),
+    Strips(strips::Strips),
+    Check(check::Check),
+}
+
+impl MapCommand {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        match self.subcommand {
+            Subcommand::Import(import) => import.run(),
+            Subcommand::Strips(strips) => strips.run(),
+            Subcommand::Check(check) => check.run(),
+        }
+    }
+}

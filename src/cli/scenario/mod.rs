@@ -1,0 +1,109 @@
+//! `wildcity scenario`.
+
+mod check;
+mod import;
+mod show;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use serde_json::Value;
+
+use wildcity_session::{ScenarioSource, Scenarios};
+use wildcity_sim::scenario::{AssetInfo, Document};
+use wildcity_twin::store::{Catalog, Version};
+
+/// Check scenarios, show what they come to, and read those of other formats.
+///
+/// A scenario is a JSON file: a twin, an ego, actors, a route, and when an episode ends. The tracks and maps that it
+/// names are in the same directory. docs/scenarios.md explains every field.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity scenario check cut-in.json
+  wildcity scenario show cut-in.json --seed 7
+  wildcity scenario import cut-in.xosc --twin street --out cut-in.json")]
+pub(super) struct ScenarioCommand {
+    #[command(subcommand)]
+    subcommand: Subcommand,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Subcommand {
+    Check(check::Check),
+    Show(show::Show),
+    Import(import::Import),
+}
+
+impl ScenarioCommand {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        match self.subcommand {
+            Subcommand::Check(check) => check.run(),
+            Subcommand::Show(show) => show.run(),
+            Subcommand::Import(import) => import.run(),
+        }
+    }
+}
+
+/// A scenario file with its directory and the version of its twin.
+struct Opened {
+    scenarios: Scenarios,
+    document: Document,
+    version: Version,
+}
+
+/// Opens a scenario file, and the latest version of its twin or the one that it names.
+fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
+    let context = || format!("{}", path.display());
+    let dir = path.parent().map_or_else(|| PathBuf::from("."), Path::to_owned);
+    let scenarios = Scenarios::in_dir(dir);
+    let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default().to_owned();
+    let has_extension = path.extension().is_some_and(|extension| extension == "json");
+    anyhow::ensure!(has_extension, "{}: a scenario is a .json file", path.display());
+    let document = scenarios.document(&ScenarioSource::Named(stem)).with_context(context)?;
+    let file = document.with(&document.first_values()).with_context(context)?;
+    let version = match &file.twin.version_hash {
+        None => catalog.version(&file.twin.name, None),
+        Some(hash) => version_of(catalog, &file.twin.name, hash),
+    };
+    let version = version.with_context(context)?;
+    Ok(Opened { scenarios, document, version })
+}
+
+/// The version of a hash; the latest if there is none of that hash, which the pin then refuses.
+fn version_of(
+    catalog: &Catalog,
+    twin: &str,
+    hash: &str,
+) -> Result<Version, wildcity_twin::store::StoreError> {
+    let latest = catalog.version(twin, None)?;
+    let mut number = latest.number;
+    while latest.hash != *hash && number > 1 {
+        number -= 1;
+        match catalog.version(twin, Some(number)) {
+            Ok(version) if version.hash == *hash => return Ok(version),
+            Ok(_) => {}
+            // Older versions may be gone.
+            Err(_) => break,
+        }
+    }
+    Ok(latest)
+}
+
+/// Assets by their hash or name.
+fn asset_of(_catalog: &Catalog, _name: &str) -> Option<AssetInfo> {
+    None
+}
+
+/// Values of a sweep: NAME=VALUE.
+fn values_of(given: &[(String, Value)]) -> BTreeMap<String, Value> {
+    given.iter().cloned().collect()
+}
+
+/// NAME=VALUE, where the value is JSON, or else a text.
+fn value(text: &str) -> Result<(String, Value), String> {
+    let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE, for example v=8")?;
+    let value = serde_json::from_str(value).unwrap_or_else(|_| Value::String(value.to_owned()));
+    Ok((name.to_owned(), value))
+}

@@ -1,0 +1,138 @@
+//! Maps from OpenDRIVE.
+//!
+//! The crate xodr computes the lanes' centre lines and widths in the file's own axes, in f32: 1 mm at 16 km from the
+//! origin. A map that reaches beyond is refused.
+
+use glam::DVec3;
+use xodr::{Direction, LaneType, RoadNetwork, SpeedLimit};
+
+use wildcity_sim::map::{Area, AreaKind, Lane, LaneKind, MapFile};
+
+use crate::{ConvertError, text_of};
+
+/// Farthest coordinate, in metres.
+pub const FARTHEST_M: f32 = 16_000.0;
+
+/// Lanes narrower than this are left out, in metres: a lane that begins or ends as a wedge has no width there.
+const NARROW_M: f32 = 0.05;
+
+/// A map, and what the reader passed over or assumed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    /// The map.
+    pub map: MapFile,
+    /// Messages for people.
+    pub warnings: Vec<String>,
+}
+
+/// Reads an OpenDRIVE file.
+///
+/// # Errors
+/// It is no OpenDRIVE, has no lanes, or reaches beyond [`FARTHEST_M`].
+pub fn read(bytes: &[u8]) -> Result<Imported, ConvertError> {
+    let text = text_of(bytes)?;
+    let (network, provenance) = xodr::load_str_with_provenance(text)
+        .map_err(|error| ConvertError::new("OpenDRIVE", error.to_string()))?;
+    let warnings = provenance.warnings.iter().map(ToString::to_string).collect();
+    let mut lanes = Vec::new();
+    for lane in network.lanes() {
+        if let Some(lane) = lane_of(&network, lane)? {
+            lanes.push(lane);
+        }
+    }
+    // Links to lanes that were left out lead nowhere.
+    let kept: std::collections::BTreeSet<String> =
+        lanes.iter().map(|lane| lane.id.clone()).collect();
+    for lane in &mut lanes {
+        lane.next.retain(|next| kept.contains(next));
+    }
+    if lanes.is_empty() {
+        return Err(ConvertError::new("OpenDRIVE", "has no lane of any width; check the file"));
+    }
+    let areas = network.junction_areas().iter().filter(|area| area.boundary.len() >= 3);
+    let areas = areas.map(|area| Area {
+        kind: AreaKind::Intersection,
+        outline: area.boundary.iter().map(|point| array(*point)).collect(),
+    });
+    let map = MapFile::of(lanes, areas.collect());
+    map.check().map_err(|error| ConvertError::new(error.path, error.message))?;
+    Ok(Imported { map, warnings })
+}
+
+fn lane_of(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, ConvertError> {
+    let Some(id) = id_of(network, lane.id) else { return Ok(None) };
+    let Some(kind) = kind_of(lane.kind) else { return Ok(None) };
+    let points = lane.center.points();
+    let tangents = lane.center.tangents();
+    let width_m =
+        |at: usize| lane.widths.get(at).or(lane.widths.last()).copied().unwrap_or(lane.width);
+    let widest_m = (0..points.len()).map(width_m).fold(0.0, f32::max);
+    if points.len() < 2 || widest_m < NARROW_M {
+        return Ok(None);
+    }
+    let mut center = Vec::with_capacity(points.len());
+    let mut left = Vec::with_capacity(points.len());
+    let mut right = Vec::with_capacity(points.len());
+    for (at, point) in points.iter().enumerate() {
+        let is_near = [point.x, point.y, point.z].iter().all(|axis| axis.abs() <= FARTHEST_M);
+        if !is_near {
+            let message = format!(
+                "reaches ({:?}, {:?}); at most {FARTHEST_M} m from the origin is exact: move the map with its \
+                 header's offset",
+                point.x, point.y
+            );
+            return Err(ConvertError::new(format!("lane {id}"), message));
+        }
+        let middle = DVec3::from_array(array(*point));
+        let tangent = tangents.get(at).map_or(DVec3::X, |tangent| {
+            DVec3::new(f64::from(tangent.x), f64::from(tangent.y), 0.0).normalize_or_zero()
+        });
+        let aside_m = DVec3::new(-tangent.y, tangent.x, 0.0) * f64::from(width_m(at)) * 0.5;
+        // The edge that superelevation raises.
+        let raised_m =
+            f64::from(lane.bank.get(at).copied().unwrap_or(0.0)).tan() * aside_m.length();
+        center.push(middle.to_array());
+        left.push((middle + aside_m + raised_m * DVec3::Z).to_array());
+        right.push((middle - aside_m - raised_m * DVec3::Z).to_array());
+    }
+    if lane.direction == Direction::Backward {
+        center.reverse();
+        left.reverse();
+        right.reverse();
+        std::mem::swap(&mut left, &mut right);
+    }
+    let limit_mps = network.speed_limit_at(lane.id, 0.0).and_then(|limit| match limit {
+        SpeedLimit::Max(mps) if mps > 0.1 => Some(f64::from(mps)),
+        _ => None,
+    });
+    let road = network.road_lane(lane.id).and_then(|of| network.road(of.road));
+    let intersection = road.is_some_and(|road| road.junction().is_some());
+    let next = lane.successors.iter().filter_map(|next| id_of(network, *next)).collect();
+    Ok(Some(Lane { id, kind, center, left, right, next, intersection, limit_mps }))
+}
+
+/// `ROAD/SECTION/LANE`, as the file numbers them.
+fn id_of(network: &RoadNetwork, lane: xodr::LaneId) -> Option<String> {
+    let of = network.road_lane(lane)?;
+    let road = network.road(of.road)?;
+    Some(format!("{}/{}/{}", road.od_id(), of.section, of.od_id))
+}
+
+/// The kind of a lane; `None` for what is no surface to move on.
+fn kind_of(kind: LaneType) -> Option<LaneKind> {
+    use LaneType as From;
+    if kind.is_drivable() {
+        return Some(LaneKind::Driving);
+    }
+    match kind {
+        From::None | From::Median | From::Curb => None,
+        From::Biking => Some(LaneKind::Bicycle),
+        From::Sidewalk => Some(LaneKind::Sidewalk),
+        From::Parking => Some(LaneKind::Parking),
+        _ => Some(LaneKind::Other),
+    }
+}
+
+fn array(point: xodr::Point) -> [f64; 3] {
+    [point.x, point.y, point.z].map(f64::from)
+}

@@ -1,0 +1,95 @@
+//! Recorded drives.
+
+use serde_json::Value;
+
+use wildcity_protocol::message::{Drive, DrivePose, DriveSection};
+use wildcity_scene::route::{Route, RouteError, RouteSection};
+use wildcity_session::SessionError;
+use wildcity_twin::store::Version;
+
+use super::answer::pose;
+use crate::fault::Fault;
+
+/// A part of a recorded drive.
+#[derive(Clone, Debug)]
+pub(crate) struct DriveRequest {
+    name: String,
+    section: RouteSection,
+}
+
+impl From<DriveSection> for DriveRequest {
+    fn from(section: DriveSection) -> Self {
+        let DriveSection { name, from_m, to_m, every_m } = section;
+        Self { name, section: RouteSection { from_m, to_m, every_m } }
+    }
+}
+
+/// A part of a drive of a version. `prefix` is the path of the section's fields in the request, with its dot.
+pub(crate) fn drive(
+    version: &Version,
+    request: &DriveRequest,
+    prefix: &str,
+) -> Result<Drive, Fault> {
+    let DriveRequest { name, section } = request;
+    let drives = &version.manifest.trajectories;
+    let recorded = drives.iter().find(|drive| drive.name == *name).ok_or_else(|| {
+        let known = drives.iter().map(|drive| drive.name.clone()).collect();
+        Fault::UnknownTrajectory { field: format!("{prefix}name"), name: name.clone(), known }
+    })?;
+    let route = Route::new(recorded).map_err(SessionError::from)?;
+    let poses = route.section(*section).map_err(|error| match error {
+        RouteError::Value { field, value, must } => Fault::OutOfRange {
+            field: format!("{prefix}{field}"),
+            must: format!("{value}; {must}"),
+        },
+        other => SessionError::from(other).into(),
+    })?;
+    let poses = poses.into_iter().map(|at| DrivePose {
+        station_m: at.station_m,
+        time_us: at.time_us,
+        pose: pose(&at.world_from_rig),
+    });
+    Ok(Drive {
+        name: name.clone(),
+        version: version.number,
+        version_hash: version.hash.clone(),
+        length_m: route.length_m(),
+        poses: poses.collect(),
+    })
+}
+
+/// The answer to `GET /v1/twins/{twin}/trajectories/{name}`.
+pub(crate) fn drive_body(version: &Version, request: &DriveRequest) -> Result<Value, Fault> {
+    Ok(serde_json::json!(drive(version, request, "")?))
+}
+
+/// The query of that request: `version`, `from_m`, `to_m` and `every_m`, each at most once.
+pub(crate) fn drive_query(name: String, query: &str) -> Result<(Option<u64>, DriveRequest), Fault> {
+    let mut section = RouteSection::default();
+    let mut version = None;
+    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
+        let (field, text) = pair.split_once('=').unwrap_or((pair, ""));
+        let invalid = |reason: &str| Fault::InvalidRequest {
+            field: Some(field.to_owned()),
+            reason: format!("{field}: {reason}"),
+        };
+        if field == "version" {
+            let number = text.parse().map_err(|_| invalid("not the number of a version"))?;
+            if version.replace(number).is_some() {
+                return Err(invalid("given twice"));
+            }
+            continue;
+        }
+        let target = match field {
+            "from_m" => &mut section.from_m,
+            "to_m" => &mut section.to_m,
+            "every_m" => &mut section.every_m,
+            _ => return Err(invalid("unknown; there are version, from_m, to_m and every_m")),
+        };
+        let metres = text.parse().map_err(|_| invalid("not a number of metres"))?;
+        if target.replace(metres).is_some() {
+            return Err(invalid("given twice"));
+        }
+    }
+    Ok((version, DriveRequest { name, section }))
+}

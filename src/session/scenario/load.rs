@@ -1,0 +1,294 @@
+//! Reads scenarios, and what they name, from one directory.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use wildcity_scene::Manifest;
+use wildcity_scene::rig::is_name;
+use wildcity_sim::limits::{MAP_BYTES, SCENARIO_BYTES};
+use wildcity_sim::map::{Map, MapFile};
+use wildcity_sim::scenario::{
+    AssetInfo, Document, FileError, Scenario, ScenarioFile, Surroundings, TracksFile,
+};
+
+/// A directory of scenarios: `NAME.json`, and the tracks and maps that they name.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Scenarios {
+    dir: PathBuf,
+}
+
+/// Which scenario.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ScenarioSource {
+    /// A file of the server's directory, by its name without `.json`.
+    Named(String),
+    /// The scenario itself, as JSON.
+    Inline(Value),
+}
+
+/// A scenario that was read for a seed and a version of its twin.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LoadedScenario {
+    /// The scenario.
+    pub scenario: Scenario,
+    /// Its lanes, if it names a map.
+    pub map: Option<Map>,
+    /// BLAKE3 of the resolved scenario's JSON, in hex: the identity of its episodes.
+    pub hash: String,
+    /// Hashes that differ from those that the scenario names; always empty unless they are ignored.
+    pub unpinned: Vec<String>,
+}
+
+/// Why a scenario cannot be used.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ScenarioError {
+    /// There is no file of this name.
+    #[error("there is no scenario {name:?}; there is {}", joined(known))]
+    Unknown {
+        /// The requested name.
+        name: String,
+        /// The names of the directory.
+        known: Vec<String>,
+    },
+    /// A file cannot be read.
+    #[error("{field}: cannot read {file:?}: {reason}")]
+    Read {
+        /// The field of the scenario that names it.
+        field: &'static str,
+        /// The name of the file.
+        file: String,
+        /// What the operating system says.
+        reason: String,
+    },
+    /// A mistake in a file.
+    #[error("{file}: {cause}")]
+    File {
+        /// Which file: `scenario`, or its name.
+        file: String,
+        /// The place and the mistake.
+        cause: FileError,
+    },
+    /// Something is not what the scenario was made for.
+    #[error(
+        "{field} is {wanted}, and there is {found}: take what the scenario names, correct the hash, or use \
+         --latest"
+    )]
+    Hash {
+        /// The field that names the hash.
+        field: &'static str,
+        /// The hash that the scenario names.
+        wanted: String,
+        /// The hash that was found.
+        found: String,
+    },
+    /// The scenario plays in another twin.
+    #[error("the scenario plays in twin {wanted:?}, and {requested:?} was opened: open {wanted:?}")]
+    Twin {
+        /// The scenario's twin.
+        wanted: String,
+        /// The opened twin.
+        requested: String,
+    },
+}
+
+impl ScenarioError {
+    /// The field at fault, from the scenario on.
+    pub fn field(&self) -> String {
+        match self {
+            Self::Unknown { .. } => "scenario".to_owned(),
+            Self::Read { field, .. } | Self::Hash { field, .. } => format!("scenario.{field}"),
+            Self::File { file, cause } if file == "scenario" => format!("scenario.{}", cause.path),
+            Self::File { .. } => "scenario".to_owned(),
+            Self::Twin { .. } => "scenario.twin.name".to_owned(),
+        }
+    }
+}
+
+impl Scenarios {
+    /// The scenarios of a directory, which need not exist.
+    pub fn in_dir(dir: impl Into<PathBuf>) -> Self {
+        Self { dir: dir.into() }
+    }
+
+    /// The names of the scenarios, in order.
+    pub fn names(&self) -> Vec<String> {
+        let entries = std::fs::read_dir(&self.dir).into_iter().flatten().flatten();
+        let files = entries.map(|entry| entry.path());
+        let scenarios = files.filter(|path| path.extension().is_some_and(|name| name == "json"));
+        let is_scenario = |path: &PathBuf| {
+            // Tracks and maps are JSON too. A prefix tells them apart without reading them whole.
+            let mut head = vec![0; 4096];
+            let read = File::open(path).and_then(|mut file| file.read(&mut head));
+            read.is_ok_and(|count| {
+                String::from_utf8_lossy(&head[..count]).contains(ScenarioFile::FORMAT)
+            })
+        };
+        let stem = |path: PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
+        let mut names: Vec<String> = scenarios.filter(is_scenario).filter_map(stem).collect();
+        names.sort();
+        names
+    }
+
+    /// Reads a scenario with its sweep.
+    ///
+    /// # Errors
+    /// There is no such file, or it is malformed.
+    pub fn document(&self, source: &ScenarioSource) -> Result<Document, ScenarioError> {
+        let parsed = match source {
+            ScenarioSource::Inline(value) => Document::from_json(value.clone()),
+            ScenarioSource::Named(name) => {
+                let file = format!("{name}.json");
+                let unknown = || ScenarioError::Unknown { name: name.clone(), known: self.names() };
+                let path = self.dir.join(&file);
+                if !is_name(name) || !path.is_file() {
+                    return Err(unknown());
+                }
+                Document::parse(&self.read("scenario", &file, SCENARIO_BYTES)?)
+            }
+        };
+        parsed.map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })
+    }
+
+    /// Resolves a scenario in a version of its twin. With `latest`, hashes that differ are noted and not refused.
+    ///
+    /// # Errors
+    /// A mistake in the scenario or in a file that it names, or a hash that differs.
+    pub fn resolve(
+        &self,
+        mut file: ScenarioFile,
+        seed: u64,
+        (manifest, version_hash): (&Manifest, &str),
+        latest: bool,
+        asset: &dyn Fn(&str) -> Option<AssetInfo>,
+    ) -> Result<LoadedScenario, ScenarioError> {
+        if file.twin.name != manifest.twin {
+            return Err(ScenarioError::Twin {
+                wanted: file.twin.name,
+                requested: manifest.twin.clone(),
+            });
+        }
+        let mut pins = Pins { latest, unpinned: Vec::new() };
+        pins.check("twin.version_hash", &mut file.twin.version_hash, version_hash)?;
+        let wrong = |file: &str| {
+            let file = file.to_owned();
+            move |cause| ScenarioError::File { file, cause }
+        };
+        let map = match &mut file.map {
+            None => None,
+            Some(pin) => {
+                let bytes = self.read("map.file", &pin.file, MAP_BYTES)?;
+                pins.check("map.hash", &mut pin.hash, &hash_of(&bytes))?;
+                let map = MapFile::parse(&bytes).and_then(Map::new);
+                Some(map.map_err(wrong(&pin.file))?)
+            }
+        };
+        let tracks = match &mut file.tracks {
+            None => None,
+            Some(section) => {
+                let bytes = self.read("tracks.file", &section.file, MAP_BYTES)?;
+                pins.check("tracks.hash", &mut section.hash, &hash_of(&bytes))?;
+                Some(TracksFile::parse(&bytes).map_err(wrong(&section.file))?)
+            }
+        };
+        let around = Surroundings {
+            drives: &manifest.trajectories,
+            tracks: tracks.as_ref(),
+            map: map.as_ref(),
+            asset,
+        };
+        let scenario = Scenario::resolve(file, seed, &around).map_err(wrong("scenario"))?;
+        // Serializing plain values into memory cannot fail. If it did, only the hash would differ.
+        let json = serde_json::to_vec(&scenario.file).unwrap_or_default();
+        Ok(LoadedScenario { hash: hash_of(&json), scenario, map, unpinned: pins.unpinned })
+    }
+
+    /// Reads and resolves a scenario with the first value of each of its sweep's names.
+    ///
+    /// # Errors
+    /// As [`Self::document`] and [`Self::resolve`].
+    pub fn load(
+        &self,
+        source: &ScenarioSource,
+        values: &BTreeMap<String, Value>,
+        seed: u64,
+        version: (&Manifest, &str),
+        asset: &dyn Fn(&str) -> Option<AssetInfo>,
+    ) -> Result<LoadedScenario, ScenarioError> {
+        let document = self.document(source)?;
+        let mut chosen = document.first_values();
+        chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
+        let file = document.with(&chosen);
+        let file =
+            file.map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })?;
+        self.resolve(file, seed, version, false, asset)
+    }
+
+    fn read(
+        &self,
+        field: &'static str,
+        file: &str,
+        limit_bytes: usize,
+    ) -> Result<Vec<u8>, ScenarioError> {
+        let failed = |reason: String| ScenarioError::Read { field, file: file.to_owned(), reason };
+        // A name has no slash, so it stays within the directory.
+        if !is_name(file) {
+            return Err(failed("write the name of a file in the scenario's directory".to_owned()));
+        }
+        read_at_most(&self.dir.join(file), limit_bytes).map_err(failed)
+    }
+}
+
+/// Compares hashes with those that a scenario names, and fills in those that it does not.
+struct Pins {
+    latest: bool,
+    unpinned: Vec<String>,
+}
+
+impl Pins {
+    fn check(
+        &mut self,
+        field: &'static str,
+        wanted: &mut Option<String>,
+        found: &str,
+    ) -> Result<(), ScenarioError> {
+        match wanted {
+            Some(hash) if hash != found && self.latest => {
+                self.unpinned.push(format!("{field} is {hash}, and {found} was used"));
+            }
+            Some(hash) if hash != found => {
+                let wanted = hash.clone();
+                return Err(ScenarioError::Hash { field, wanted, found: found.to_owned() });
+            }
+            _ => {}
+        }
+        *wanted = Some(found.to_owned());
+        Ok(())
+    }
+}
+
+fn hash_of(bytes: &[u8]) -> String {
+    blake3::hash(bytes).to_hex().to_string()
+}
+
+fn read_at_most(path: &Path, limit_bytes: usize) -> Result<Vec<u8>, String> {
+    let file = File::open(path).map_err(|error| error.to_string())?;
+    let metadata = file.metadata().map_err(|error| error.to_string())?;
+    if !metadata.is_file() {
+        return Err("it is not a file".to_owned());
+    }
+    let mut bytes = Vec::new();
+    let read = file.take(limit_bytes as u64 + 1).read_to_end(&mut bytes);
+    read.map_err(|error| error.to_string())?;
+    if bytes.len() > limit_bytes {
+        return Err(format!("it has more than {limit_bytes} bytes"));
+    }
+    Ok(bytes)
+}
+
+fn joined(names: &[String]) -> String {
+    if names.is_empty() { "none".to_owned() } else { names.join(", ") }
+}

@@ -1,0 +1,251 @@
+//! The traffic of an episode: what a step of the ego does to it, and what the agent learns of it.
+
+use std::sync::Arc;
+
+use wildcity_scene::ActorClass;
+use wildcity_sim::contact::{Body, Contact, Detector, LanePosition};
+use wildcity_sim::map::Map;
+use wildcity_sim::route::{NavigationRoute, RouteProgress, RouteView};
+use wildcity_sim::scenario::{ContactRule, EndInput, EndReason, Stuck};
+use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox, EgoMotion, EgoState, World};
+use wildcity_sim::{Ego, EgoModel};
+
+use super::load::LoadedScenario;
+use crate::limits;
+
+/// The traffic of an episode between two steps. A copy continues exactly as the original does.
+#[derive(Clone, Debug)]
+pub struct EpisodeTraffic {
+    loaded: Arc<LoadedScenario>,
+    specs: Arc<Vec<ActorSpec>>,
+    world: World,
+    detector: Detector,
+    progress: Option<RouteProgress>,
+    stuck: Stuck,
+    events: Vec<Event>,
+    ended: Option<EndReason>,
+}
+
+/// Something that happened in the last step, or at the start.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Event {
+    /// When, in microseconds since the episode's start.
+    pub time_us: i64,
+    /// What.
+    pub kind: EventKind,
+}
+
+/// What happened.
+#[derive(Clone, Debug, PartialEq)]
+pub enum EventKind {
+    /// The ego began to touch an actor.
+    Contact(Contact),
+    /// A trigger of an actor's script fired.
+    Trigger {
+        /// Index of the actor.
+        actor: u16,
+        /// Index of the trigger within the actor's script.
+        trigger: usize,
+    },
+    /// An actor appeared.
+    Appeared {
+        /// Its index.
+        actor: u16,
+    },
+    /// An actor disappeared.
+    Left {
+        /// Its index.
+        actor: u16,
+    },
+    /// A rule of the scenario ended the episode.
+    End(EndReason),
+}
+
+impl EpisodeTraffic {
+    /// The traffic at the start of an episode.
+    pub(crate) fn at_start(loaded: Arc<LoadedScenario>, ego: &Ego) -> Self {
+        let traffic = &loaded.scenario.traffic;
+        let specs: Arc<Vec<ActorSpec>> =
+            Arc::new(traffic.actors.iter().map(|actor| actor.spec.clone()).collect());
+        let world = World::new(traffic.clone());
+        let state = ego_state(ego);
+        let (detector, contacts) =
+            Detector::at_start(traffic.ego_box, &specs, &state, world.states());
+        let route = loaded.scenario.route.as_ref();
+        let progress = route.map(|route| route.begin(&ego.world_from_rig()));
+        let contact = |contact: Contact| Event {
+            time_us: contact.time_us,
+            kind: EventKind::Contact(contact),
+        };
+        Self {
+            specs,
+            world,
+            detector,
+            progress,
+            stuck: Stuck::default(),
+            events: contacts.into_iter().map(contact).collect(),
+            ended: None,
+            loaded,
+        }
+    }
+
+    /// The traffic after a step of `dt_us` in which the ego went from one state to another.
+    pub(crate) fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64) -> Self {
+        let mut next = self.clone();
+        next.events.clear();
+        let motion = EgoMotion {
+            from: ego_state(from),
+            to: ego_state(to),
+            smooth: to.dynamics().model != EgoModel::Teleport,
+        };
+        let ego_box = self.loaded.scenario.traffic.ego_box;
+        let map = self.loaded.map.as_ref();
+        let specs = &self.specs;
+        let mut contacts: Vec<Contact> = Vec::new();
+        let mut presence: Vec<Event> = Vec::new();
+        let before: Vec<Vec<Option<i64>>> = next.fired_us();
+        next.world.step(dt_us, &motion, &mut |sub_step| {
+            let lanes = map.map(|map| lane_position(map, &sub_step.ego[1], &ego_box));
+            contacts.extend(next.detector.advance(sub_step, specs, lanes));
+            for (before, after) in sub_step.before.iter().zip(sub_step.after) {
+                let kind = match (before.present, after.present) {
+                    (false, true) => EventKind::Appeared { actor: after.index },
+                    (true, false) => EventKind::Left { actor: after.index },
+                    _ => continue,
+                };
+                presence.push(Event { time_us: sub_step.end_us, kind });
+            }
+        });
+
+        // The events of the step, by time; at one time triggers first, since they cause the others.
+        for (actor, (before, after)) in before.iter().zip(next.fired_us()).enumerate() {
+            for (trigger, (before, after)) in before.iter().zip(after).enumerate() {
+                if let (None, Some(time_us)) = (before, after) {
+                    let kind = EventKind::Trigger { actor: actor as u16, trigger };
+                    next.events.push(Event { time_us, kind });
+                }
+            }
+        }
+        next.events.append(&mut presence);
+        let has_contact = contacts.iter().any(|contact| self.ends_episode(contact));
+        next.events.extend(
+            contacts.into_iter().map(|contact| Event {
+                time_us: contact.time_us,
+                kind: EventKind::Contact(contact),
+            }),
+        );
+        next.events.sort_by_key(|event| event.time_us);
+        next.events.truncate(limits::EVENTS);
+        next.end(to, has_contact);
+        next
+    }
+
+    /// Moves on along the route, and ends the episode if a rule says so.
+    fn end(&mut self, ego: &Ego, has_contact: bool) {
+        let world_from_rig = ego.world_from_rig();
+        let route = self.loaded.scenario.route.clone();
+        if let (Some(route), Some(progress)) = (&route, &mut self.progress) {
+            *progress = route.after(progress, &world_from_rig);
+        }
+        let input = EndInput {
+            time_us: self.world.time_us(),
+            velocity_mps: ego.velocity_m_s(),
+            off_route_m: self.progress.map(|progress| progress.off_m),
+            is_route_done: route
+                .zip(self.progress)
+                .is_some_and(|(route, progress)| route.is_done(&progress, &world_from_rig)),
+            has_contact,
+        };
+        self.ended = self.loaded.scenario.end.ended(&input, &mut self.stuck);
+        if let Some(reason) = self.ended {
+            let event = Event { time_us: input.time_us, kind: EventKind::End(reason) };
+            self.events.push(event);
+        }
+    }
+
+    /// Whether the scenario's rule is about such a contact. Boxes that overlapped from the start are not judged.
+    fn ends_episode(&self, contact: &Contact) -> bool {
+        let class = self.specs[usize::from(contact.actor)].class;
+        let is_meant = match self.loaded.scenario.end.contact {
+            Some(ContactRule::Any) => true,
+            Some(ContactRule::AtFault) => contact.ego_at_fault,
+            Some(ContactRule::Pedestrian) => class == ActorClass::Pedestrian,
+            Some(ContactRule::Static) | None => false,
+        };
+        is_meant && !contact.at_start
+    }
+
+    fn fired_us(&self) -> Vec<Vec<Option<i64>>> {
+        let actors = self.world.traffic().actors.iter().enumerate();
+        actors
+            .map(|(actor, setup)| {
+                (0..setup.script.len()).map(|trigger| self.world.fired_us(actor, trigger)).collect()
+            })
+            .collect()
+    }
+
+    /// The scenario, with this episode's seed.
+    pub fn loaded(&self) -> &LoadedScenario {
+        &self.loaded
+    }
+
+    /// What does not change about the actors, by their index.
+    pub fn specs(&self) -> &[ActorSpec] {
+        &self.specs
+    }
+
+    /// The actors now, by their index.
+    pub fn states(&self) -> &[ActorState] {
+        self.world.states()
+    }
+
+    /// What happened in the last step, by time; at most [`limits::EVENTS`].
+    pub fn events(&self) -> &[Event] {
+        &self.events
+    }
+
+    /// The name of a trigger; empty if it has none.
+    pub fn trigger_name(&self, actor: u16, trigger: usize) -> &str {
+        let names = self.loaded.scenario.trigger_names.get(usize::from(actor));
+        names.and_then(|names| names.get(trigger)).map_or("", String::as_str)
+    }
+
+    /// The route as the ego sees it, if there is one.
+    pub fn route(&self, ego: &Ego) -> Option<RouteView> {
+        let (route, progress) = self.route_progress()?;
+        let speed_mps = ego.velocity_m_s().length();
+        Some(route.view(&progress, &ego.world_from_rig(), speed_mps))
+    }
+
+    /// The route, and where the ego is on it.
+    pub fn route_progress(&self) -> Option<(&NavigationRoute, RouteProgress)> {
+        Some((self.loaded.scenario.route.as_deref()?, self.progress?))
+    }
+
+    /// Why a rule ended the episode, if one did.
+    pub fn ended(&self) -> Option<EndReason> {
+        self.ended
+    }
+}
+
+/// The ego as actors see it.
+fn ego_state(ego: &Ego) -> EgoState {
+    EgoState {
+        world_from_rig: ego.world_from_rig(),
+        velocity_mps: ego.velocity_m_s(),
+        yaw_rate_radps: ego.yaw_rate_rad_s(),
+    }
+}
+
+/// Where the corners of the ego lie in the lanes of a map.
+fn lane_position(map: &Map, ego: &EgoState, ego_box: &EgoBox) -> LanePosition {
+    let body = Body::new(&ego.world_from_rig, &ego_box.box_, ego_box.center_x_m);
+    let corners_m = body.footprint.corners_m();
+    let lanes = corners_m.map(|corner_m| map.lanes_at(corner_m).collect::<Vec<_>>());
+    let has_common = lanes[0].iter().any(|lane| lanes[1..].iter().all(|of| of.contains(lane)));
+    let in_any = lanes.iter().any(|of| !of.is_empty());
+    LanePosition {
+        in_multiple_lanes: in_any && !has_common,
+        off_drivable: corners_m.iter().any(|corner_m| !map.is_drivable(*corner_m)),
+    }
+}

@@ -1,0 +1,232 @@
+//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a recorded
+//! episode. A branch that is driven as its original was gives the same bytes.
+
+use std::sync::Arc;
+
+use wildcity_scene::rig::overlay_bytes;
+
+use super::Session;
+use super::open::{rig_extent, training_coverage};
+use super::recording::scenario_hash;
+use crate::blocking::run_blocking;
+use crate::engine::Engine;
+use crate::episode::Outcome;
+use crate::error::SessionError;
+use crate::observe::layout::ObservationLayout;
+use crate::observe::observation::Observation;
+use crate::options::PixelMaps;
+use crate::record::continuation::{Continuation, KeptFrames};
+use crate::record::error::BranchError;
+use crate::record::format::{FrameRequest, Line, RecordedOrigin, RecordedSettings};
+use crate::snapshot::Snapshot;
+use crate::start::EpisodeStart;
+use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
+
+/// Name of the snapshot of the state in which a branch was opened.
+const FIRST_SNAPSHOT: &str = "start";
+
+impl Session {
+    /// Stores the present state under a name, in place of an earlier snapshot of that name.
+    ///
+    /// # Errors
+    /// There are too many snapshots.
+    pub fn take_snapshot(&self, name: String) -> Result<(), SessionError> {
+        self.snapshots.store(name, self.present())
+    }
+
+    /// The present state.
+    fn present(&self) -> Snapshot {
+        let step = self.state.episode.step();
+        let recorded = self.recorder.as_ref().map(|_| RecordedOrigin {
+            episode: format!("{}-{}", self.name, self.episode_number),
+            step,
+        });
+        Snapshot {
+            settings: self.settings.clone(),
+            version: self.version.clone(),
+            state: self.state.clone(),
+            origin: recorded.or_else(|| self.origin.clone()),
+        }
+    }
+
+    /// Returns to a snapshot, and renders it. From here on the session is as it was then: version of the twin,
+    /// ego, time, frames of bundles. Its steps go into a new file.
+    ///
+    /// # Errors
+    /// There is no such snapshot; otherwise as [`Session::step`].
+    pub async fn restore(&mut self, name: &str) -> Result<Observation, SessionError> {
+        let snapshot = self.snapshots.find("name", name)?;
+        let Snapshot { version, state, origin, .. } = &*snapshot;
+        let mut episode = state.episode.clone();
+
+        // The frames of the present are rendered again, since the history has only those of them that later
+        // observations show.
+        let layout = &self.settings.layout;
+        let earlier = state.frame_history.before(episode.time_us());
+        let captures = layout.captures(&episode, &earlier);
+        let rendered = self.render(version, &episode, captures, Some(earlier)).await?;
+        let mut bytes = None;
+        if !version.is_version_of(&self.version) {
+            let resident = version.resident.clone();
+            let extent = rig_extent(layout.cameras());
+            bytes = Some(Engine::worst_case_bytes(resident, extent, version.profile).await?);
+        }
+
+        let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
+        let line = Line::Frame(record);
+        let scenario = scenario_hash(state.traffic.as_ref());
+        let file = self.create_file(version, origin.clone(), scenario, &episode, line).await?;
+        if let Some(bytes) = bytes
+            && let Err(error) = self.reservation.exchange(version.resident.clone(), bytes)
+        {
+            file.recorder.discard();
+            return Err(error.into());
+        }
+        self.version = version.clone();
+        self.end_recording(Outcome::Completed).await;
+
+        episode.add_trusts(rendered.trusts());
+        self.begin(file, origin.clone());
+        // After a switch of version, the frames of the present are as the original has them.
+        let frame_history = state.frame_history.clone().or(&rendered.frame_history);
+        self.state = EpisodeState { episode, frame_history, traffic: state.traffic.clone() };
+        self.look_ahead();
+        Ok(rendered.observation)
+    }
+
+    /// Opens a session in the state of another one's snapshot, with its settings. The new session has that state
+    /// as its snapshot `start`.
+    ///
+    /// # Errors
+    /// There is not enough memory for its worst frame.
+    pub async fn branch(
+        engine: Arc<Engine>,
+        name: String,
+        from: &Snapshot,
+    ) -> Result<Self, SessionError> {
+        let Snapshot { settings, version, state, origin } = from;
+        let extent = rig_extent(settings.layout.cameras());
+        let reservation =
+            Engine::reserve(version.resident.clone(), extent, version.profile).await?;
+        let (settings, version, state) = (settings.clone(), version.clone(), state.clone());
+        let mut session = Self::assembled(engine, name, settings, reservation, version, state);
+        session.origin.clone_from(origin);
+        session.take_snapshot(FIRST_SNAPSHOT.to_owned())?;
+        Ok(session)
+    }
+
+    /// Reads the record of an episode up to its step `step`, for [`Session::continued`]. The caller has checked the
+    /// name with [`is_episode_name`](crate::is_episode_name).
+    ///
+    /// # Errors
+    /// There is no such record, it is damaged, or it has fewer steps.
+    pub async fn recorded(
+        engine: &Engine,
+        episode: &str,
+        step: u64,
+    ) -> Result<Continuation, SessionError> {
+        let path = engine.episodes().join(format!("{episode}.jsonl"));
+        let origin = RecordedOrigin { episode: episode.to_owned(), step };
+        run_blocking(move || Continuation::read(&path, origin)).await?
+    }
+
+    /// Opens a session in the state that a recorded episode had after one of its steps, with its settings. The
+    /// new session has that state as its snapshot `start`.
+    ///
+    /// Drives the recorded commands again, and renders the frames that coming bundles show.
+    ///
+    /// # Errors
+    /// The poses and frames of the record are not those of this build, twin and backend.
+    pub async fn continued(
+        engine: Arc<Engine>,
+        name: String,
+        mut continuation: Continuation,
+    ) -> Result<Self, SessionError> {
+        let deadline = engine.step_timeout();
+        let origin = continuation.origin().clone();
+        for number in continuation.versions() {
+            let twin = continuation.twin().to_owned();
+            continuation.add_version(engine.open_version(twin, Some(number)).await?)?;
+        }
+
+        // The settings of the recorded session.
+        let header = continuation.header().clone();
+        if header.scenario.is_some() {
+            return Err(BranchError::Scenario.into());
+        }
+        let cameras = header.rig.cameras;
+        let recorded = match header.settings {
+            Some(settings) => settings,
+            None => RecordedSettings::default_of(cameras.len(), header.dt_us),
+        };
+        recorded.schedule.check(cameras.len(), header.dt_us)?;
+        let overlays = engine.answer_budget().reserve(overlay_bytes(&cameras))?;
+        let extent = rig_extent(&cameras);
+        let outputs = header.outputs;
+        let maps =
+            PixelMaps { depth: outputs.depth, opacity: outputs.opacity, normals: outputs.normals };
+        let layout = ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
+        let layout = Arc::new(layout);
+        let settings = SessionSettings {
+            profile_overrides: recorded.profile_overrides,
+            rig_name: header.rig.name,
+            layout: layout.clone(),
+            _overlays: overlays,
+            dynamics: header.dynamics,
+            start: EpisodeStart::recorded(header.start, header.state.as_ref()),
+            warm_up_us: recorded.warm_up_us,
+            dt_us: header.dt_us,
+            deadline,
+            drive: None,
+            scenario: None,
+            tells_actors: false,
+        };
+
+        // The state after the step, and the frames that coming observations show again.
+        let driven = run_blocking(move || continuation.drive(&layout)).await??;
+        Engine::bake_sky(driven.version.clone(), driven.profile).await?;
+        let coverage = match recorded.trust {
+            true => Some(training_coverage(&driven.version).await?),
+            false => None,
+        };
+        let reservation = Engine::reserve(driven.version.clone(), extent, driven.profile).await?;
+        let version = PinnedVersion::new(driven.version.clone(), driven.profile, coverage);
+        let state = EpisodeState::at_start(driven.episode.clone());
+        let mut session =
+            Self::assembled(engine, name, Arc::new(settings), reservation, version, state);
+        session.origin = Some(origin);
+        session.render_kept(driven.kept, &header.backend).await?;
+        session.take_snapshot(FIRST_SNAPSHOT.to_owned())?;
+        Ok(session)
+    }
+
+    /// Renders the frames of a recorded episode that coming observations show again.
+    async fn render_kept(
+        &mut self,
+        kept: Vec<KeptFrames>,
+        recorded_by: &str,
+    ) -> Result<(), SessionError> {
+        for KeptFrames { episode, version, profile, frames } in kept {
+            Engine::bake_sky(version.clone(), profile).await?;
+            let coverage = match &self.version.coverage {
+                Some(_) => Some(training_coverage(&version).await?),
+                None => None,
+            };
+            let version = PinnedVersion::new(version, profile, coverage);
+            let history = Some(self.state.frame_history.clone());
+            let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
+            let rendered = self.render(&version, &episode, captures, history).await?;
+            for (frame, now) in frames.iter().zip(&rendered.hashes) {
+                if now.to_hex().as_str() != frame.hash {
+                    let camera = self.cameras()[frame.camera].name.clone();
+                    let time_us = frame.capture.time_us;
+                    let recorded_by = recorded_by.to_owned();
+                    let backend = self.backend().to_owned();
+                    return Err(BranchError::Image { camera, time_us, recorded_by, backend }.into());
+                }
+            }
+            self.state.frame_history = rendered.frame_history;
+        }
+        Ok(())
+    }
+}

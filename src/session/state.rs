@@ -1,0 +1,86 @@
+//! The parts of a session: what stays the same from opening to closing, and what steps change.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use wildcity_scene::{ProfileOverrides, RenderProfile};
+use wildcity_sim::Dynamics;
+use wildcity_twin::residency::Resident;
+
+use crate::engine::answer_budget::BudgetShare;
+use crate::episode::Episode;
+use crate::observe::frame_history::FrameHistory;
+use crate::observe::layout::ObservationLayout;
+use crate::observe::trust::TrainingCoverage;
+use crate::prefetch::recorded_drive::RecordedDrive;
+use crate::record::format::profile_hash;
+use crate::scenario::{EpisodeTraffic, SessionScenario};
+use crate::start::EpisodeStart;
+
+/// What `open` determines. Sessions that are branches of another one share its settings.
+#[derive(Debug)]
+pub(crate) struct SessionSettings {
+    /// Fields that override the profile of each version of the twin.
+    pub(crate) profile_overrides: ProfileOverrides,
+    pub(crate) rig_name: String,
+    pub(crate) layout: Arc<ObservationLayout>,
+    /// The share of the budget for answers that the cameras' overlays take.
+    pub(crate) _overlays: BudgetShare,
+    pub(crate) dynamics: Dynamics,
+    /// Where episodes start unless `reset` names another start.
+    pub(crate) start: EpisodeStart,
+    pub(crate) warm_up_us: i64,
+    pub(crate) dt_us: i64,
+    pub(crate) deadline: Duration,
+    /// The recorded drive that the ego may follow.
+    pub(crate) drive: Option<Arc<RecordedDrive>>,
+    /// The scenario of every episode.
+    pub(crate) scenario: Option<SessionScenario>,
+    /// Whether observations tell where the actors are.
+    pub(crate) tells_actors: bool,
+}
+
+/// The version of the twin that a session shows, and how.
+#[derive(Clone, Debug)]
+pub(crate) struct PinnedVersion {
+    pub(crate) resident: Arc<Resident>,
+    /// The version's profile with the session's overrides.
+    pub(crate) profile: RenderProfile,
+    pub(crate) profile_hash: blake3::Hash,
+    /// Where the twin was recorded; only if images come with their trust.
+    pub(crate) coverage: Option<Arc<TrainingCoverage>>,
+}
+
+/// What a step changes: all that the coming observations depend on, beside the settings and the version. A
+/// copy continues exactly as the original does.
+#[derive(Clone, Debug)]
+pub(crate) struct EpisodeState {
+    pub(crate) episode: Episode,
+    /// The episode's frames that later observations show again.
+    pub(crate) frame_history: FrameHistory,
+    /// The actors; only with a scenario.
+    pub(crate) traffic: Option<EpisodeTraffic>,
+}
+
+impl PinnedVersion {
+    pub(crate) fn new(
+        resident: Arc<Resident>,
+        profile: RenderProfile,
+        coverage: Option<Arc<TrainingCoverage>>,
+    ) -> Self {
+        Self { resident, profile, profile_hash: profile_hash(&profile), coverage }
+    }
+
+    /// Whether it is the same version of the same twin.
+    pub(crate) fn is_version_of(&self, other: &Self) -> bool {
+        self.resident.version.hash == other.resident.version.hash
+            && self.resident.version.number == other.resident.version.number
+    }
+}
+
+impl EpisodeState {
+    /// The state at the start of an episode.
+    pub(crate) fn at_start(episode: Episode) -> Self {
+        Self { episode, frame_history: FrameHistory::default(), traffic: None }
+    }
+}

@@ -1,0 +1,63 @@
+//! `src/sim/schema` is generated from the types. After a change run
+//! `WILDCITY_BLESS=1 cargo test -p wildcity-convert --test convert schema`, and review the difference.
+
+use schemars::transform::{RecursiveTransform, Transform};
+use schemars::{Schema, schema_for};
+use serde_json::json;
+use wildcity_sim::map::MapFile;
+use wildcity_sim::scenario::{ScenarioFile, TracksFile};
+
+use crate::root::root;
+
+#[test]
+fn schemas_of_files_are_up_to_date() {
+    let mut scenario = schema_for!(ScenarioFile);
+    RecursiveTransform(swept).transform(&mut scenario);
+    check("scenario", scenario);
+    check("tracks", schema_for!(TracksFile));
+    check("map", schema_for!(MapFile));
+}
+
+/// Every object may have a note, and every number may be a value of the sweep.
+fn swept(schema: &mut Schema) {
+    if let Some(properties) = schema.get_mut("properties").and_then(|value| value.as_object_mut()) {
+        properties
+            .insert("note".to_owned(), json!({"type": "string", "description": "A comment."}));
+    }
+    let is_number = |name: &str| matches!(name, "number" | "integer");
+    let kind = schema.get("type").cloned();
+    let numeric = match &kind {
+        Some(serde_json::Value::String(name)) => is_number(name),
+        Some(serde_json::Value::Array(names)) => {
+            names.iter().any(|name| name.as_str().is_some_and(is_number))
+        }
+        _ => false,
+    };
+    if numeric && let Some(kind) = kind {
+        let mut kinds = match kind {
+            serde_json::Value::Array(kinds) => kinds,
+            one => vec![one],
+        };
+        kinds.push(json!("string"));
+        schema.insert("type".to_owned(), kinds.into());
+        // Of a text; numbers have no pattern.
+        schema.insert("pattern".to_owned(), json!("^\\$."));
+    }
+}
+
+fn check(name: &str, schema: Schema) {
+    let path = root().join("src/sim/schema").join(format!("{name}.json"));
+    let mut text = serde_json::to_string_pretty(&schema).unwrap();
+    text.push('\n');
+    if std::env::var_os("WILDCITY_BLESS").is_some_and(|value| value == "1") {
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(&path, text).unwrap();
+        return;
+    }
+    let found = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(
+        found == text,
+        "{} differs from the types: WILDCITY_BLESS=1 cargo test -p wildcity-convert --test convert schema",
+        path.display()
+    );
+}
