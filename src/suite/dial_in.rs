@@ -72,6 +72,7 @@ fn open_json(session: &str, case: &Case) -> serde_json::Value {
         "seed": options.seed,
         "dt_us": options.dt_us,
         "warm_up_us": options.warm_up_us,
+        "scenario": case.line.scenario,
         "dynamics": {
             "model": options.dynamics.model.name(),
             "speed": options.dynamics.speed_m_s,

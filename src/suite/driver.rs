@@ -2,13 +2,14 @@
 
 use glam::DVec3;
 
+use wildcity_episode::pose_at;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::Episode;
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::traffic::{Idm, rolled};
 use wildcity_sim::{Command, EgoModel};
 
-use crate::case::{Case, pose_at};
+use crate::case::Case;
 
 /// Agents that come with the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -10,7 +10,7 @@ use tokio::task::JoinSet;
 use wildcity_render::Backend;
 use wildcity_scene::ProfileOverrides;
 use wildcity_server::{Config, Limits, Running};
-use wildcity_session::{Engine, EngineSettings, Outcome, Session};
+use wildcity_session::{Engine, EngineSettings, Outcome, Scenarios, Session};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
@@ -54,6 +54,8 @@ pub struct RunSettings {
     pub twins: PathBuf,
     /// The cache on disk.
     pub cache: Option<DiskCacheSettings>,
+    /// Directory of the suite, with the tracks and maps that scenarios name.
+    pub scenarios: PathBuf,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// Where the episodes are recorded; must be empty.
@@ -150,6 +152,8 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
     Ok(Engine::start(EngineSettings {
         cache: Cache::new(settings.catalog.clone()),
         episodes: settings.episodes.clone(),
+        // Scenarios come with their sessions; files that they name are beside the suite.
+        scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
     })?)
@@ -161,6 +165,7 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
         twins: settings.twins.clone(),
         cache: settings.cache.clone(),
         episodes: settings.episodes.clone(),
+        scenarios: settings.scenarios.clone(),
         uploads: settings.episodes.join(".uploads"),
         tokens: None,
         backend: settings.backend.clone(),
@@ -252,6 +257,10 @@ async fn steps(session: &mut Session, case: &Case, agent: BuiltIn) -> Result<(),
     for step in 1..=case.steps {
         let command = agent.command(case, session.episode()).map_err(Technical::server)?;
         session.step(command, step == case.steps).await.map_err(failed)?;
+        // A rule of the scenario may end the episode earlier.
+        if session.episode().terminated() {
+            break;
+        }
     }
     Ok(())
 }

@@ -119,6 +119,7 @@ impl Bench {
             catalog: self.catalog(),
             twins: self.path("twins"),
             cache: None,
+            scenarios: self.dir.path().to_owned(),
             backend: Arc::new(cpu()),
             episodes: self.path(out),
             progress: Box::new(|_| {}),

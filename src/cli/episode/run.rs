@@ -111,6 +111,7 @@ impl Run {
             catalog: catalog.clone(),
             twins: self.twins.dir()?,
             cache: self.twins.cache(),
+            scenarios: self.suite.parent().unwrap_or(Path::new(".")).to_owned(),
             backend: backend.clone(),
             episodes: episodes.clone(),
             progress: Box::new(move |_| counted.inc(1)),
