@@ -46,7 +46,16 @@ pub struct Case {
     pub version_hash: String,
 }
 
-/// All cases of a suite, in order of their names. With `latest`, versions that scenarios name are ignored.
+/// What of the scenarios is left out.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct CaseOptions {
+    /// Versions that scenarios name: the latest ones are taken.
+    pub latest: bool,
+    /// All actors: what is left is the twin, on which the agent `log` must pass.
+    pub bare: bool,
+}
+
+/// All cases of a suite, in order of their names.
 ///
 /// # Errors
 /// Names the file and the place of the first mistake, or the version that is missing.
@@ -54,8 +63,9 @@ pub fn cases(
     suite: &SuiteFile,
     scenarios: &[SuiteScenario],
     catalog: &Catalog,
-    latest: bool,
+    options: CaseOptions,
 ) -> Result<Vec<Case>, SuiteError> {
+    let CaseOptions { latest, bare } = options;
     let mut versions: BTreeMap<(String, Option<String>), Arc<Version>> = BTreeMap::new();
     let mut cases = Vec::new();
     let mut names = BTreeSet::new();
@@ -63,7 +73,11 @@ pub fn cases(
         let wrong = |cause| SuiteError::File { path: scenario.path.clone(), cause };
         let mut combinations: Vec<BTreeMap<String, Value>> = Vec::new();
         for case in seeded(suite, scenario) {
-            let file = scenario.document.with(&case.values).map_err(wrong)?;
+            let mut file = scenario.document.with(&case.values).map_err(wrong)?;
+            if bare {
+                file.actors.clear();
+                file.tracks = None;
+            }
             let pin = file.twin.version_hash.clone().filter(|_| !latest);
             let key = (file.twin.name.clone(), pin.clone());
             let version = match versions.get(&key) {

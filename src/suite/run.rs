@@ -255,7 +255,7 @@ async fn steps(session: &mut Session, case: &Case, agent: BuiltIn) -> Result<(),
     let failed = |error: wildcity_session::SessionError| Technical::server(error.to_string());
     session.reset(case.seed, None).await.map_err(failed)?;
     for step in 1..=case.steps {
-        let command = agent.command(case, session.episode()).map_err(Technical::server)?;
+        let command = agent.command(case, session).map_err(Technical::server)?;
         session.step(command, step == case.steps).await.map_err(failed)?;
         // A rule of the scenario may end the episode earlier.
         if session.episode().terminated() {
