@@ -13,15 +13,17 @@ use wildcity_sim::ego::EgoModel;
 use crate::file::EpisodeFile;
 use crate::lines::{ActorsLine, Event, ScenarioLine};
 
-/// The numbers of an episode that scores are made of; `None` if it has no frame.
+/// The numbers of an episode that scores are made of; `None` if it has no frame, or if a request followed a plan for
+/// several steps: the record has no poses of the steps between.
 pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
     let frames = episode.driven();
     let poses: Vec<Pose> = frames.iter().filter_map(|frame| frame.poses.last().copied()).collect();
-    if poses.is_empty() {
+    let steps: Vec<u64> = frames.iter().map(|frame| frame.step).collect();
+    let is_gapless = steps.windows(2).all(|pair| pair[1] == pair[0] + 1);
+    if poses.is_empty() || !is_gapless {
         return None;
     }
     let scenario = episode.scenario.as_ref();
-    let steps: Vec<u64> = frames.iter().map(|frame| frame.step).collect();
     let contacts = episode.events.iter().filter_map(|line| match &line.event {
         Event::Contact(event) => Some(event.contact(line.time_us)),
         _ => None,

@@ -9,6 +9,7 @@
 //! | `file` | reading an episode's file |
 //! | `drive` | an episode as the scores see it |
 //! | `outcome` | the result of an episode |
+//! | `scenario` | the line of a scenario |
 //! | `diff` | where two episodes part |
 //! | `export` | an episode as MCAP |
 //! | `listing` | the episodes of a directory |
@@ -22,6 +23,7 @@ pub mod limits;
 mod lines;
 mod listing;
 mod outcome;
+mod scenario;
 
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
@@ -33,3 +35,4 @@ pub use lines::{
 };
 pub use listing::{Listed, list, text};
 pub use outcome::result;
+pub use scenario::{DriveStart, pose_at, scenario_line};

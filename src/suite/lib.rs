@@ -35,7 +35,7 @@ mod run;
 mod technical;
 mod verify;
 
-pub use case::{Case, cases};
+pub use case::{Case, CaseOptions, cases};
 pub use driver::BuiltIn;
 pub use error::SuiteError;
 pub use file::{SuiteFile, SuiteScenario};

@@ -251,6 +251,8 @@ impl<W: Write + Seek> McapFile<W> {
             Event::Triggered { actor, trigger } => {
                 (INFO, format!("{} fires trigger {trigger}", name(*actor)))
             }
+            Event::Appeared { actor } => (INFO, format!("{} appears", name(*actor))),
+            Event::Left { actor } => (INFO, format!("{} leaves", name(*actor))),
             Event::Ended { rule } => (INFO, format!("ended by the rule {rule}")),
         };
         let timestamp = Some(timestamp(line.time_us));

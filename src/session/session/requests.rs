@@ -13,7 +13,7 @@ use wildcity_sim::{Command, Ground};
 use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
-use super::recording::scenario_hash;
+use super::recording::traffic_lines;
 use crate::blocking::run_blocking;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -84,7 +84,7 @@ impl Session {
             record.steps = steps as u64;
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
-        self.record(record).await?;
+        self.record(record, traffic.as_ref()).await?;
 
         next.add_trusts(rendered.trusts());
         let frame_history = rendered.frame_history;
@@ -125,7 +125,8 @@ impl Session {
         let episode = self.state.episode.clone();
         let captures = self.settings.layout.captures_at(&episode, poses);
         let rendered = self.render(&self.version, &episode, captures, None).await?;
-        self.record(self.frame_record(FrameRequest::Observe, &episode, &rendered)).await?;
+        let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
+        self.record(record, None).await?;
         Ok(rendered.observation)
     }
 
@@ -185,9 +186,10 @@ impl Session {
         let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let scenario = scenario_hash(traffic.as_ref());
-        let line = Line::Frame(record);
-        let file = self.create_file(&self.version, None, scenario, &next, line).await?;
+        let before = traffic.as_ref();
+        let mut lines = before.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record));
+        lines.push(Line::Frame(record));
+        let file = self.create_file(&self.version, None, before, &next, lines).await?;
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());
