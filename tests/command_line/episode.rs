@@ -63,6 +63,12 @@ fn a_suite_is_driven_and_its_records_are_read() {
     let error = String::from_utf8(other.stderr).unwrap();
     assert!(error.contains("step 1: ego"), "{error}");
 
+    let video = ["video", &files[0], "--out", "frames", "--twins", twins, "--backend", "cpu"];
+    let text = stdout(&wildcity(&video, dir.path()));
+    assert!(text.contains("9 pictures") && text.contains("ffmpeg -framerate 10 "), "{text}");
+    assert!(!text.contains("differs"), "{text}");
+    assert!(dir.path().join("frames/000008.png").is_file());
+
     let exported = wildcity(&["export", &files[0], "--mcap", "log.mcap"], dir.path());
     assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
     let bytes = std::fs::read(dir.path().join("log.mcap")).unwrap();

@@ -6,6 +6,7 @@ mod list;
 mod run;
 mod score;
 mod show;
+mod video;
 
 use std::path::{Path, PathBuf};
 
@@ -30,6 +31,7 @@ enum Command {
     Score(score::Score),
     Diff(diff::Diff),
     Export(export::Export),
+    Video(Box<video::Video>),
 }
 
 impl Episode {
@@ -41,6 +43,7 @@ impl Episode {
             Command::Score(command) => command.run(),
             Command::Diff(command) => command.run(),
             Command::Export(command) => command.run(),
+            Command::Video(command) => command.run(),
         }
     }
 }
