@@ -61,9 +61,8 @@ impl Video {
 
         let bar = progress::count("rendering");
         bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
-        let mut open = |version| cache.open(&header.twin, Some(version));
         let mut written = 0_usize;
-        let report = recording.replay(&mut open, &*backend, ReplayUntil::End, &mut |image| {
+        let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut |image| {
             bar.inc(1);
             let path = self.out.join(format!("{written:06}.png"));
             written += 1;

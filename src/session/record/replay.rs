@@ -6,7 +6,7 @@ use wildcity_render::{Backend, Frame, RenderError, Target};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::rig::RigCamera;
 use wildcity_sim::Ground;
-use wildcity_twin::residency::{ResidencyError, Resident};
+use wildcity_twin::residency::{Cache, Resident};
 
 use super::ego_replay::EgoReplay;
 use super::format::{BUILD, FrameRecord, RecordedVersion, profile_hash};
@@ -17,25 +17,23 @@ use super::replay_report::{
 use super::values;
 use crate::viewpoint::viewpoints;
 
-/// Opens a version of the episode's twin, by its number.
-type OpenVersion<'a> = dyn FnMut(u64) -> Result<Arc<Resident>, ResidencyError> + 'a;
-
 /// What the caller does with each image, before it is compared with the record.
 type VisitImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
 
 impl RecordedEpisode {
-    /// Drives and renders the episode again, on the versions of its twin that `open` returns.
+    /// Drives and renders the episode again, on the recorded versions of its twin.
     ///
     /// # Errors
     /// A version cannot be opened, a command cannot be executed, the backend refuses a frame, or `visit`
     /// fails.
     pub fn replay(
         &self,
-        open: &mut OpenVersion<'_>,
+        cache: &Cache,
         backend: &dyn Backend,
         until: ReplayUntil,
         visit: &mut VisitImage<'_>,
     ) -> Result<ReplayReport, ReplayError> {
+        let open = |version: u64| cache.open(&self.header.twin, Some(version));
         let mut replay = Replay::new(self, open(self.header.version)?, backend);
         let mut switches = self.versions.iter().peekable();
         for (index, frame) in self.frames.iter().enumerate() {
