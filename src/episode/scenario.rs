@@ -4,7 +4,7 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_sim::map::{AreaKind, LaneKind, Map};
-use wildcity_sim::scenario::{EgoStart, Scenario};
+use wildcity_sim::scenario::{ContactRule, EgoStart, Scenario};
 
 use crate::lines::{ActorLine, EgoLine, LaneLine, RoutePoint, ScenarioLine};
 
@@ -39,7 +39,7 @@ pub fn scenario_line(
         route,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
-        checks_static: false,
+        checks_static: resolved.end.contact == Some(ContactRule::Static),
     }
 }
 

@@ -7,10 +7,8 @@ use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_sim::contact::{SolidPoint, Solids, solid_area_m2};
 use wildcity_sim::traffic::EgoBox;
 
-const EGO: EgoBox = EgoBox {
-    box_: ActorBox { length_m: 4.0, width_m: 2.0, height_m: 1.5 },
-    center_x_m: 1.3,
-};
+const EGO: EgoBox =
+    EgoBox { box_: ActorBox { length_m: 4.0, width_m: 2.0, height_m: 1.5 }, center_x_m: 1.3 };
 
 /// A place as far from the origin as the coordinates of a twin may be.
 const FAR_M: DVec3 = DVec3::new(4.5e6, -4.5e6, 120.0);
@@ -21,7 +19,10 @@ fn pose(x_m: f64, y_m: f64, yaw_rad: f64) -> Pose {
 }
 
 fn drive() -> Trajectory {
-    let keyframe = |k: i64| Keyframe { time_us: 1_000_000 * k, world_from_rig: pose(10.0 * k as f64, 0.0, 0.0) };
+    let keyframe = |k: i64| Keyframe {
+        time_us: 1_000_000 * k,
+        world_from_rig: pose(10.0 * k as f64, 0.0, 0.0),
+    };
     Trajectory { name: "log".to_owned(), keyframes: (0..=4).map(keyframe).collect() }
 }
 
@@ -56,8 +57,9 @@ fn the_cells_find_what_a_test_of_every_point_finds() {
         let to_center_m = DVec3::new(EGO.center_x_m, 0.0, 0.0);
         let center = Pose { position_m: pose.transform_point(to_center_m), ..pose };
         let box_from_world = center.inverse();
-        let of_ego = wall().into_iter().map(|point| {
-            SolidPoint { mean_m: box_from_world.transform_point(point.mean_m), ..point }
+        let of_ego = wall().into_iter().map(|point| SolidPoint {
+            mean_m: box_from_world.transform_point(point.mean_m),
+            ..point
         });
         let wanted_m2 = solid_area_m2(of_ego, DVec3::new(4.0, 2.0, 1.5));
         let met_m2 = solids.area_m2(&pose, &EGO);

@@ -57,3 +57,35 @@ async fn the_session_records_actors_events_and_result() {
     assert_eq!(contacts.count(), 1, "{:?}", episode.events);
     assert_eq!(episode.result, result(&episode), "live and from the record");
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_driver_that_leaves_the_road_meets_the_twin() {
+    let bench = Bench::new();
+    let mut value = scenario("posts", &json!({ "model": "kinematic", "speed": 10.0 }));
+    value["end"] = json!({ "time_s": 4.0, "contact": "static" });
+    // Onto the posts, which stand 5 m beside the drive.
+    let points = [[20.0, 0.0, 0.0], [30.0, 0.0, 0.0], [45.0, 5.0, 0.0], [90.0, 5.0, 0.0]];
+    value["route"] = json!({ "points": points });
+    let path = bench.write("posts.json", &value);
+    let drive = async |agent: BuiltIn, out: &str| {
+        let cases = bench.cases(&path).unwrap();
+        run(bench.settings(AgentChoice::BuiltIn(agent), 1, out), cases).await.unwrap()
+    };
+    // `idm` follows the route, `log` the drive: what the drive meets is free.
+    let off_road = drive(BuiltIn::Idm, "idm").await;
+    let episode = &off_road.episodes[0];
+    assert_eq!(episode.faults[0].fault, "contact.static", "{}", off_road.to_json());
+    assert!((1_000_000..3_500_000).contains(&episode.faults[0].time_us), "{:?}", episode.faults);
+    assert!(episode.steps < 40, "the contact ends the episode");
+    let record = EpisodeFile::read(&bench.path("idm").join(&episode.record)).unwrap();
+    let met = record.events.iter().find_map(|line| match line.event {
+        Event::StaticContact { area_m2, impact_mps } => Some((area_m2, impact_mps)),
+        _ => None,
+    });
+    let (area_m2, impact_mps) = met.unwrap();
+    // A post has 0.374 m².
+    assert!(area_m2 > 0.3 && (5.0..11.0).contains(&impact_mps), "{area_m2} m², {impact_mps} m/s");
+    let log = drive(BuiltIn::Log, "log").await;
+    assert_eq!(log.counts.passed, 1, "{}", log.to_json());
+    assert!(!log.episodes[0].not_judged.iter().any(|reason| reason.contains("twin")));
+}

@@ -130,6 +130,11 @@ impl Engine {
         Ok(run_blocking(move || leases.renew()).await??)
     }
 
+    /// The twins in memory.
+    pub(crate) fn cache(&self) -> &Cache {
+        &self.cache
+    }
+
     /// Frames that wait for the renderer.
     pub fn queued_frames(&self) -> usize {
         self.queue.len()

@@ -1,6 +1,7 @@
 //! Scenarios: files by name with the tracks and maps beside them, and the traffic of a session's episodes.
 
 pub(crate) mod load;
+mod solids;
 mod traffic;
 
 use std::collections::BTreeMap;
@@ -8,12 +9,15 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use wildcity_sim::scenario::{ContactRule, EgoStart, FileError, ScenarioFile};
-use wildcity_twin::store::Version;
+use wildcity_sim::contact::Solids;
+use wildcity_sim::scenario::{EgoStart, ScenarioFile};
+use wildcity_twin::store::{Catalog, Version};
 
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
+use self::solids::solids_of;
+use crate::error::SessionError;
 use crate::options::Start;
 
 /// The scenario of a session, from which each episode is set up with its own seed.
@@ -24,6 +28,8 @@ pub(crate) struct SessionScenario {
     file: ScenarioFile,
     /// Whether episodes start where the scenario says: the request named no start.
     gives_start: bool,
+    /// The twin's solid Gaussians; only if a contact with them ends an episode.
+    solids: Option<Arc<Solids>>,
 }
 
 impl SessionScenario {
@@ -39,12 +45,7 @@ impl SessionScenario {
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
         let wrong = |cause| ScenarioError::File { file: "scenario".to_owned(), cause };
         let file = document.with(&chosen).map_err(wrong)?;
-        if file.end.contact == Some(ContactRule::Static) {
-            let path = "end.contact".to_owned();
-            let message = "\"static\" is not known to a session; write any, at_fault or pedestrian";
-            return Err(wrong(FileError { path, message: message.to_owned() }));
-        }
-        Ok(Self { scenarios, file, gives_start })
+        Ok(Self { scenarios, file, gives_start, solids: None })
     }
 
     /// The scenario of an episode with a seed.
@@ -56,6 +57,22 @@ impl SessionScenario {
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
         self.scenarios.resolve(file, seed, pinned, false, &|_| None).map(Arc::new)
+    }
+
+    /// Looks for the twin's solid Gaussians, if a contact with them ends an episode. Blocks.
+    pub(crate) fn find_solids(
+        &mut self,
+        first: &LoadedScenario,
+        catalog: &Catalog,
+        version: &Version,
+    ) -> Result<(), SessionError> {
+        self.solids = solids_of(&first.scenario, catalog, version)?;
+        Ok(())
+    }
+
+    /// The solid Gaussians that were found.
+    pub(crate) fn solids(&self) -> Option<Arc<Solids>> {
+        self.solids.clone()
     }
 
     /// Where an episode starts, if the scenario says.

@@ -23,7 +23,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
-use crate::scenario::{EpisodeTraffic, ScenarioError, SessionScenario};
+use crate::scenario::{EpisodeTraffic, SessionScenario};
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -54,16 +54,18 @@ impl Session {
         let scenario = match scenario {
             None => None,
             Some(asked) => {
-                let scenarios = engine.scenarios().clone();
+                let engine = engine.clone();
                 let version = resident.version.clone();
                 let seed = options.seed;
                 let gives_start = options.start.is_none();
                 let (asked, scenario, found) = run_blocking(move || {
+                    let scenarios = engine.scenarios().clone();
                     let read =
                         SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start);
-                    let scenario = read?;
+                    let mut scenario = read?;
                     let found = scenario.of_episode(seed, &version)?;
-                    Ok::<_, ScenarioError>((asked, scenario, found))
+                    scenario.find_solids(&found, engine.cache().catalog(), &version)?;
+                    Ok::<_, SessionError>((asked, scenario, found))
                 })
                 .await??;
                 options.start = options.start.or_else(|| scenario.start_of(&found));
@@ -153,7 +155,10 @@ impl Session {
             tells_actors,
         };
         let version = PinnedVersion::new(resident, profile, coverage);
-        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, episode.ego()));
+        let traffic = loaded.map(|loaded| {
+            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
+            EpisodeTraffic::at_start(loaded, episode.ego()).with_solids(solids, episode.ego())
+        });
         let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
         Ok(Self::assembled(engine, name, Arc::new(settings), reservation, version, state))
     }

@@ -173,6 +173,9 @@ pub(super) fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord) -> Ve
     let event = |happened: &Event| {
         let event = match &happened.kind {
             EventKind::Contact(contact) => return EventLine::contact(step, contact),
+            EventKind::StaticContact { area_m2, impact_mps } => {
+                episode::Event::StaticContact { area_m2: *area_m2, impact_mps: *impact_mps }
+            }
             EventKind::Trigger { actor, trigger } => {
                 episode::Event::Triggered { actor: *actor, trigger: *trigger as u32 }
             }

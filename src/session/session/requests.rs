@@ -27,7 +27,7 @@ use crate::observe::observation::Observation;
 use crate::options::{ResetOptions, Start, StepOptions};
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
-use crate::scenario::EpisodeTraffic;
+use crate::scenario::{EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
@@ -179,7 +179,10 @@ impl Session {
             .map_err(|error| error.of_reset(Some(start)))?,
         };
         let mut next = start.episode(seed, dynamics, settings.dt_us);
-        let traffic = loaded.map(|loaded| EpisodeTraffic::at_start(loaded, next.ego()));
+        let traffic = loaded.map(|loaded| {
+            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
+            EpisodeTraffic::at_start(loaded, next.ego()).with_solids(solids, next.ego())
+        });
 
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);

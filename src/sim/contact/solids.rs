@@ -46,8 +46,10 @@ impl Solids {
         for point in points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY) {
             let cell = cell_at(point.mean_m.truncate());
             let from_corner_m = point.mean_m - corner_m(cell).extend(0.0);
-            let solid =
-                Solid { mean_m: from_corner_m.as_vec3().to_array(), area_m2: point.area_m2() as f32 };
+            let solid = Solid {
+                mean_m: from_corner_m.as_vec3().to_array(),
+                area_m2: point.area_m2() as f32,
+            };
             cells.entry(cell).or_default().push(solid);
         }
         let mut solids = Self { cells, limit: StaticLimit { most_on_drive_m2: 0.0 } };
