@@ -74,7 +74,7 @@ fn all_views_at_once_and_region_by_region() {
         let truth = render_one(&Reference, &scene, &profile, *view);
         agree(image, &truth).unwrap();
     }
-    let small = gpu_with_limits(bindings(256 << 10));
+    let small = gpu_with_limits(bindings(512 << 10));
     let in_regions = render(&small, &scene, &profile, &views);
     for (image, truth) in in_regions.iter().zip(&together) {
         agree(image, truth).unwrap();

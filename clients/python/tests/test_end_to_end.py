@@ -257,7 +257,7 @@ def test_observe_does_not_move(connect: Connect, server: Server) -> None:
         ({"rig": PAIR, "outputs": Outputs(("left",))}, "unknown_camera", "outputs.cameras[0]"),
         ({"start": Station("nowhere")}, "unknown_trajectory", "start.trajectory"),
         ({"start": Pose(q=(2, 0, 0, 0))}, "pose_invalid", "start.pose.q"),
-        ({"seed": -1}, "invalid_request", "seed"),
+        ({"seed": -1}, "out_of_range", "seed"),
     ],
 )
 def test_invalid_open_requests_are_refused_without_effect(
@@ -308,8 +308,11 @@ def test_a_killed_agents_session_lives_on(connect: Connect, server: Server) -> N
         assert again.frame == seen.frame
         assert session.step(Pose((2.0, 0.0, 0.0))).metadata.step == 2
         session.close()
+    # The answer to `close` is lost with a connection as other answers are, and is there again.
+    with connect(server.url) as client:
+        client.resume(name, seen.metadata.seq + 1).close()
     with connect(server.url) as client, pytest.raises(Refused) as refused:
-        client.resume(name, seen.metadata.seq)
+        client.resume(f"never-{name}", 1)
     assert refused.value.code == "unknown_session"
 
 
