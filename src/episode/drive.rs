@@ -1,5 +1,7 @@
 //! An episode as the scores see it.
 
+use std::collections::BTreeMap;
+
 use glam::{DVec2, DVec3};
 
 use wildcity_scene::geometry::Pose;
@@ -115,8 +117,8 @@ where
 }
 
 fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<Track> {
-    // Where a session went back, the last line of a step holds.
-    let at_step = |step: u64| lines.iter().rev().find(|line| line.step == step);
+    // Where a session went back, and in a warm-up, the last line of a step holds.
+    let of_step: BTreeMap<u64, &ActorsLine> = lines.iter().map(|line| (line.step, line)).collect();
     let mut tracks: Vec<Track> = scenario
         .actors
         .iter()
@@ -126,11 +128,8 @@ fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<T
             samples: vec![None; steps.len()],
         })
         .collect();
-    let by_order = lines.len() == steps.len()
-        && lines.iter().zip(steps).all(|(line, &step)| line.step == step);
-    for (k, &step) in steps.iter().enumerate() {
-        let line = if by_order { lines.get(k) } else { at_step(step) };
-        let Some(line) = line else { continue };
+    for (k, step) in steps.iter().enumerate() {
+        let Some(line) = of_step.get(step) else { continue };
         for state in line.actors.iter().filter_map(|state| state.state()) {
             let index = usize::from(state.index);
             let (Some(track), Some(actor)) = (tracks.get_mut(index), scenario.actors.get(index))

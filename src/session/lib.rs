@@ -63,6 +63,7 @@ pub use record::replay_report::{
 };
 pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
+    asset_info,
 };
 pub use session::Session;
 pub use snapshot::{Snapshot, Snapshots};

@@ -52,8 +52,9 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     }
     let judged = result(&episode).ok_or_else(|| Technical {
         kind: "agent_error",
-        message: "a verdict needs every step: nothing was driven, or several steps with one request"
-            .to_owned(),
+        message:
+            "a verdict needs every step: nothing was driven, or several steps with one request"
+                .to_owned(),
     })?;
     let mut frames = blake3::Hasher::new();
     for frame in &episode.frames {

@@ -23,12 +23,16 @@ pub(crate) struct Bench {
 }
 
 pub(crate) fn bench(cache: Cache) -> Bench {
+    bench_with(cache, Arc::new(crate::images::cpu()))
+}
+
+pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend>) -> Bench {
     let episodes = tempfile::tempdir().unwrap();
     let engine = Engine::start(EngineSettings {
         cache,
         episodes: episodes.path().to_owned(),
         scenarios: Scenarios::in_dir(""),
-        backend: Arc::new(crate::images::cpu()),
+        backend,
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
     });
     Bench { engine: engine.unwrap(), _episodes: episodes }

@@ -1,4 +1,4 @@
-//! Sessions and episodes: what they render, prefetch and keep, and the trust of their images.
+//! Sessions and episodes: what they render, prefetch and keep, the actors and the trust of their images.
 
 #[path = "../support/images.rs"]
 mod images;
@@ -7,6 +7,7 @@ mod source;
 #[path = "../support/streaming.rs"]
 mod streaming;
 
+mod actors;
 mod driving;
 mod fairness;
 mod long;

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use anyhow::Context;
 
-use super::{asset_of, opened};
+use super::opened;
 use crate::cli::directories::Twins;
+use wildcity_session::asset_info;
 
 /// Check scenarios against their twins, with every combination of their sweeps.
 ///
@@ -43,7 +44,7 @@ impl Check {
             for case in &cases {
                 let file = opened.document.with(&case.values).with_context(context)?;
                 let version = (&opened.version.manifest, opened.version.hash.as_str());
-                let asset = |name: &str| asset_of(&catalog, name);
+                let asset = |name: &str| asset_info(&catalog, name);
                 let loaded = opened
                     .scenarios
                     .resolve(file, case.seed, version, self.latest, &asset)

@@ -11,7 +11,7 @@ use anyhow::Context;
 use serde_json::Value;
 
 use wildcity_session::{ScenarioSource, Scenarios};
-use wildcity_sim::scenario::{AssetInfo, Document};
+use wildcity_sim::scenario::Document;
 use wildcity_twin::store::{Catalog, Version};
 
 /// Check scenarios, show what they come to, and read those of other formats.
@@ -89,11 +89,6 @@ fn version_of(
         }
     }
     Ok(latest)
-}
-
-/// Assets by their hash or name.
-fn asset_of(_catalog: &Catalog, _name: &str) -> Option<AssetInfo> {
-    None
 }
 
 /// Values of a sweep: NAME=VALUE.

@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use serde_json::Value;
 
-use super::{asset_of, opened, value, values_of};
+use super::{opened, value, values_of};
 use crate::cli::directories::Twins;
+use wildcity_session::asset_info;
 
 /// Show a scenario as an episode runs it: with a seed's jitter, the values of its sweep, and all hashes.
 ///
@@ -45,7 +46,7 @@ impl Show {
         values.extend(values_of(&self.values));
         let file = opened.document.with(&values)?;
         let version = (&opened.version.manifest, opened.version.hash.as_str());
-        let asset = |name: &str| asset_of(&catalog, name);
+        let asset = |name: &str| asset_info(&catalog, name);
         let loaded = opened.scenarios.resolve(file, self.seed, version, self.latest, &asset)?;
         let shown = serde_json::json!({
             "hash": loaded.hash,

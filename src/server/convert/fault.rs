@@ -330,6 +330,7 @@ fn of_store(error: &StoreError) -> WireFault {
 fn of_residency(error: &ResidencyError) -> WireFault {
     match error {
         ResidencyError::NoRoom { .. } | ResidencyError::TooLarge { .. } => at(Code::Busy, "twin"),
+        ResidencyError::NoRoomForActor { .. } => at(Code::Busy, "scenario"),
         ResidencyError::TimedOut { .. } => plain(Code::DeadlineExceeded),
         ResidencyError::Load { .. } | ResidencyError::Sky { .. } | ResidencyError::Store(_) => {
             at(Code::TwinDamaged, "twin")

@@ -130,7 +130,7 @@ impl Engine {
         Ok(run_blocking(move || leases.renew()).await??)
     }
 
-    /// The twins in memory.
+    /// The twins and assets in memory.
     pub(crate) fn cache(&self) -> &Cache {
         &self.cache
     }

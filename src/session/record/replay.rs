@@ -8,6 +8,7 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_sim::Ground;
 use wildcity_twin::residency::{Cache, Resident};
 
+use super::actor_replay::ActorReplay;
 use super::ego_replay::EgoReplay;
 use super::format::{BUILD, FrameRecord, RecordedVersion, profile_hash};
 use super::recorded_episode::RecordedEpisode;
@@ -15,6 +16,7 @@ use super::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
 use super::values;
+use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::viewpoints;
 
 /// What the caller does with each image, before it is compared with the record.
@@ -34,13 +36,15 @@ impl RecordedEpisode {
         visit: &mut VisitImage<'_>,
     ) -> Result<ReplayReport, ReplayError> {
         let open = |version: u64| cache.open(&self.header.twin, Some(version));
-        let mut replay = Replay::new(self, open(self.header.version)?, backend);
+        let actors = ActorReplay::new(self, cache)?;
+        let mut replay = Replay::new(self, open(self.header.version)?, actors, backend);
         let mut switches = self.versions.iter().peekable();
         for (index, frame) in self.frames.iter().enumerate() {
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
             {
                 replay.switch_version(open(to.version)?, to);
             }
+            replay.actors.advance(index);
             replay.drive(frame, index)?;
             if until == ReplayUntil::FirstDifference && replay.report.diverged.is_some() {
                 return Ok(replay.report);
@@ -66,6 +70,7 @@ struct Replay<'a> {
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
     ego: EgoReplay,
+    actors: ActorReplay<'a>,
     /// Lines of the file, from 1, at which the frames are.
     frame_lines: &'a [usize],
     /// The RGB buffer of each camera.
@@ -83,6 +88,7 @@ impl<'a> Replay<'a> {
     fn new(
         episode: &'a RecordedEpisode,
         resident: Arc<Resident>,
+        actors: ActorReplay<'a>,
         backend: &'a dyn Backend,
     ) -> Self {
         let header = &episode.header;
@@ -101,6 +107,7 @@ impl<'a> Replay<'a> {
             resident,
             profile: &header.profile,
             ego: EgoReplay::new(header),
+            actors,
             frame_lines: &episode.frame_lines,
             pixels: cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect(),
             report: ReplayReport {
@@ -202,10 +209,13 @@ impl<'a> Replay<'a> {
         let step = frame.step;
         let taken_us = frame.taken_us(pose);
         let views = self.ego.episode().views(self.cameras, selected, frame.poses[pose], taken_us);
-        let scene = self
+        let viewpoints = viewpoints(&views);
+        let mut scene = self
             .resident
-            .scene(&viewpoints(&views), self.profile)
+            .scene(&viewpoints, self.profile)
             .map_err(|cause| ReplayError::Residency { step, cause })?;
+        let detail = FrameDetail { viewpoints: &viewpoints, profile: self.profile };
+        scene.place(self.actors.placed(taken_us, detail));
 
         let all = self.pixels.iter_mut().zip(self.cameras).enumerate();
         let mut targets: Vec<Target<'_>> = all

@@ -1,24 +1,37 @@
 //! Scenarios: files by name with the tracks and maps beside them, and the traffic of a session's episodes.
 
+pub(crate) mod assets;
 pub(crate) mod load;
+pub(crate) mod past;
 mod solids;
 mod traffic;
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use serde_json::Value;
 
 use wildcity_sim::contact::Solids;
-use wildcity_sim::scenario::{EgoStart, ScenarioFile};
+use wildcity_sim::scenario::{AssetInfo, EgoStart, ScenarioFile};
+use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
 
+pub use assets::asset_info;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
+use self::assets::ActorAssets;
 use self::solids::solids_of;
 use crate::error::SessionError;
 use crate::options::Start;
+
+/// The scenario of an episode, and the assets of its actors.
+#[derive(Clone, Debug)]
+pub(crate) struct EpisodeScenario {
+    pub(crate) loaded: Arc<LoadedScenario>,
+    pub(crate) assets: ActorAssets,
+}
 
 /// The scenario of a session, from which each episode is set up with its own seed.
 #[derive(Clone, Debug)]
@@ -48,15 +61,33 @@ impl SessionScenario {
         Ok(Self { scenarios, file, gives_start, solids: None })
     }
 
-    /// The scenario of an episode with a seed.
+    /// The scenario of an episode with a seed, and the assets of its actors, in memory.
     pub(crate) fn of_episode(
         &self,
         seed: u64,
         version: &Version,
-    ) -> Result<Arc<LoadedScenario>, ScenarioError> {
+        cache: &Cache,
+    ) -> Result<EpisodeScenario, SessionError> {
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
-        self.scenarios.resolve(file, seed, pinned, false, &|_| None).map(Arc::new)
+        // Many actors have the same asset.
+        let known: RefCell<BTreeMap<String, Option<AssetInfo>>> = RefCell::default();
+        let asset = |name: &str| {
+            let mut known = known.borrow_mut();
+            let found = known.entry(name.to_owned());
+            found.or_insert_with(|| asset_info(cache.catalog(), name)).clone()
+        };
+        let loaded = self.scenarios.resolve(file, seed, pinned, false, &asset)?;
+        let actors = loaded.scenario.traffic.actors.iter();
+        let assets = ActorAssets::load(cache, actors.map(|actor| actor.spec.asset.as_deref()))?;
+        Ok(EpisodeScenario { loaded: Arc::new(loaded), assets })
+    }
+
+    /// Takes the assets of an episode for all that follow: a name may stand for another asset later.
+    pub(crate) fn pin_assets(&mut self, first: &LoadedScenario) {
+        for (actor, pinned) in self.file.actors.iter_mut().zip(&first.scenario.file.actors) {
+            actor.asset.clone_from(&pinned.asset);
+        }
     }
 
     /// Looks for the twin's solid Gaussians, if a contact with them ends an episode. Blocks.

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use wildcity_scene::ActorClass;
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_sim::contact::{Body, Contact, Detector, LanePosition, Solids};
 use wildcity_sim::map::Map;
 use wildcity_sim::route::{NavigationRoute, RouteProgress, RouteView};
@@ -10,7 +11,9 @@ use wildcity_sim::scenario::{ContactRule, EndInput, EndReason, Stuck};
 use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox, EgoMotion, EgoState, World};
 use wildcity_sim::{Ego, EgoModel};
 
+use super::assets::{ActorAssets, FrameDetail, exposure_start_us};
 use super::load::LoadedScenario;
+use super::past::{ActorPast, poses};
 use crate::limits;
 
 /// The traffic of an episode between two steps. A copy continues exactly as the original does.
@@ -28,6 +31,11 @@ pub struct EpisodeTraffic {
     solids: Option<Arc<Solids>>,
     /// Whether the ego meets them now.
     meets_twin: bool,
+    assets: ActorAssets,
+    /// The longest exposure of a camera, in microseconds.
+    exposure_us: i64,
+    /// Reaches back to the last observation and an exposure farther: the frames since then are drawn from it.
+    past: ActorPast,
 }
 
 /// Something that happened in the last step, or at the start.
@@ -73,8 +81,13 @@ pub enum EventKind {
 }
 
 impl EpisodeTraffic {
-    /// The traffic at the start of an episode.
-    pub(crate) fn at_start(loaded: Arc<LoadedScenario>, ego: &Ego) -> Self {
+    /// The traffic at the start of an episode. `exposure_us` is the longest exposure of a camera, in microseconds.
+    pub(crate) fn at_start(
+        loaded: Arc<LoadedScenario>,
+        assets: ActorAssets,
+        ego: &Ego,
+        exposure_us: i64,
+    ) -> Self {
         let traffic = &loaded.scenario.traffic;
         let specs: Arc<Vec<ActorSpec>> =
             Arc::new(traffic.actors.iter().map(|actor| actor.spec.clone()).collect());
@@ -88,6 +101,8 @@ impl EpisodeTraffic {
             time_us: contact.time_us,
             kind: EventKind::Contact(contact),
         };
+        let mut past = ActorPast::default();
+        past.push(world.time_us(), world.states());
         Self {
             specs,
             world,
@@ -98,6 +113,9 @@ impl EpisodeTraffic {
             ended: None,
             solids: None,
             meets_twin: false,
+            assets,
+            exposure_us,
+            past,
             loaded,
         }
     }
@@ -170,6 +188,7 @@ impl EpisodeTraffic {
                 kind: EventKind::Contact(contact),
             }),
         );
+        next.past.push(next.world.time_us(), next.world.states());
         next.events.sort_by_key(|event| event.time_us);
         next.events.truncate(limits::EVENTS);
         next.end(to, has_contact);
@@ -180,6 +199,7 @@ impl EpisodeTraffic {
     /// those of all steps.
     pub(crate) fn followed(&self, from: &Ego, egos: &[Ego], dt_us: i64) -> Self {
         let mut next = self.clone();
+        next.past.drop_before(self.world.time_us() - self.exposure_us);
         let mut from = from;
         let mut events = Vec::new();
         for ego in egos {
@@ -252,6 +272,30 @@ impl EpisodeTraffic {
     /// The actors now, by their index.
     pub fn states(&self) -> &[ActorState] {
         self.world.states()
+    }
+
+    /// The actors at the end of each of the last `steps` steps, with its time in microseconds; those of the last
+    /// request, or fewer.
+    pub(crate) fn last_steps(&self, steps: usize) -> impl Iterator<Item = (i64, &[ActorState])> {
+        self.past.last(steps)
+    }
+
+    /// The actors at a time of the warm-up, in microseconds, which is below 0.
+    pub(crate) fn states_before(&self, time_us: i64) -> Vec<ActorState> {
+        self.world.states_before(time_us)
+    }
+
+    /// What a frame of a time since the last observation, or in the warm-up, draws of the actors.
+    pub(crate) fn placed(&self, taken_us: i64, frame: FrameDetail<'_>) -> Vec<PlacedChunk> {
+        if self.assets.is_empty() {
+            return Vec::new();
+        }
+        let poses_at = |time_us: i64| match time_us < 0 {
+            true => poses(&self.world.states_before(time_us)),
+            false => self.past.poses_at(time_us),
+        };
+        let at_start = poses_at(exposure_start_us(taken_us, self.exposure_us));
+        self.assets.placed(&poses_at(taken_us), &at_start, frame)
     }
 
     /// What happened in the last step, by time; at most [`limits::EVENTS`].

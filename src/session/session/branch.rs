@@ -8,6 +8,7 @@ use wildcity_scene::rig::overlay_bytes;
 use super::Session;
 use super::open::{rig_extent, training_coverage};
 use super::recording::traffic_lines;
+use super::requests::Moment;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::episode::Outcome;
@@ -64,7 +65,8 @@ impl Session {
         let layout = &self.settings.layout;
         let earlier = state.frame_history.before(episode.time_us());
         let captures = layout.captures(&episode, &earlier);
-        let rendered = self.render(version, &episode, captures, Some(earlier)).await?;
+        let moment = Moment { episode: &episode, traffic: state.traffic.as_ref() };
+        let rendered = self.render(version, moment, captures, Some(earlier)).await?;
         let mut bytes = None;
         if !version.is_version_of(&self.version) {
             let resident = version.resident.clone();
@@ -217,7 +219,8 @@ impl Session {
             let version = PinnedVersion::new(version, profile, coverage);
             let history = Some(self.state.frame_history.clone());
             let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
-            let rendered = self.render(&version, &episode, captures, history).await?;
+            let moment = Moment { episode: &episode, traffic: None };
+            let rendered = self.render(&version, moment, captures, history).await?;
             for (frame, now) in frames.iter().zip(&rendered.hashes) {
                 if now.to_hex().as_str() != frame.hash {
                     let camera = self.cameras()[frame.camera].name.clone();

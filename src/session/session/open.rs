@@ -23,7 +23,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
-use crate::scenario::{EpisodeTraffic, SessionScenario};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -63,16 +63,18 @@ impl Session {
                     let read =
                         SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start);
                     let mut scenario = read?;
-                    let found = scenario.of_episode(seed, &version)?;
-                    scenario.find_solids(&found, engine.cache().catalog(), &version)?;
+                    let found = scenario.of_episode(seed, &version, engine.cache())?;
+                    scenario.pin_assets(&found.loaded);
+                    scenario.find_solids(&found.loaded, engine.cache().catalog(), &version)?;
                     Ok::<_, SessionError>((asked, scenario, found))
                 })
                 .await??;
-                options.start = options.start.or_else(|| scenario.start_of(&found));
-                if let (true, Some(dynamics)) = (asked.dynamics, found.scenario.dynamics) {
+                let resolved = &found.loaded.scenario;
+                options.start = options.start.or_else(|| scenario.start_of(&found.loaded));
+                if let (true, Some(dynamics)) = (asked.dynamics, resolved.dynamics) {
                     options.dynamics = dynamics;
                 }
-                if let (true, Some(warm_up_us)) = (asked.warm_up, found.scenario.warm_up_us) {
+                if let (true, Some(warm_up_us)) = (asked.warm_up, resolved.warm_up_us) {
                     options.warm_up_us = warm_up_us;
                 }
                 loaded = Some(found);
@@ -105,8 +107,8 @@ impl Session {
         )?;
         let mut layout =
             ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
-        if let Some(loaded) = &loaded {
-            let actors = loaded.scenario.traffic.actors.len();
+        if let Some(found) = &loaded {
+            let actors = found.loaded.scenario.traffic.actors.len();
             layout.reserve_header(if tells_actors { actors } else { 0 })?;
         }
 
@@ -155,9 +157,11 @@ impl Session {
             tells_actors,
         };
         let version = PinnedVersion::new(resident, profile, coverage);
-        let traffic = loaded.map(|loaded| {
+        let exposure_us = View::longest_exposure_us(settings.layout.cameras());
+        let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
-            EpisodeTraffic::at_start(loaded, episode.ego()).with_solids(solids, episode.ego())
+            EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
+                .with_solids(solids, episode.ego())
         });
         let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
         Ok(Self::assembled(engine, name, Arc::new(settings), reservation, version, state))

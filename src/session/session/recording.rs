@@ -166,10 +166,17 @@ impl Session {
     }
 }
 
-/// The lines before the frame of a step: where the actors are, and what happened.
+/// The lines before the frame of a request: where the actors are at each frame of a warm-up and after each step, and
+/// what happened.
 pub(super) fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord) -> Vec<Line> {
-    let FrameRecord { step, time_us, .. } = *frame;
-    let actors = Line::Actors(ActorsLine::new(step, time_us, traffic.states()));
+    let FrameRecord { step, steps, .. } = *frame;
+    let warm_up_us = frame.times_us.iter().copied().filter(|time_us| *time_us < 0);
+    let warm_up =
+        warm_up_us.map(|time_us| ActorsLine::new(step, time_us, &traffic.states_before(time_us)));
+    let before = (step + 1).saturating_sub(steps);
+    let of_steps = (before..).zip(traffic.last_steps(steps as usize));
+    let of_steps = of_steps.map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
+    let actors = warm_up.chain(of_steps).map(Line::Actors);
     let event = |happened: &Event| {
         let event = match &happened.kind {
             EventKind::Contact(contact) => return EventLine::contact(step, contact),
@@ -186,7 +193,7 @@ pub(super) fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord) -> Ve
         EventLine { step, time_us: happened.time_us, event }
     };
     let events = traffic.events().iter().map(|happened| Line::Event(event(happened)));
-    std::iter::once(actors).chain(events).collect()
+    actors.chain(events).collect()
 }
 
 /// The settings that the header does not have otherwise; `None` if all are the defaults.

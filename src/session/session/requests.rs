@@ -7,7 +7,7 @@ use serde_json::Value;
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
 
-use wildcity_render::{Backend, Frame};
+use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::{Command, Ground};
 use wildcity_twin::residency::{PinnedScene, Viewpoint};
@@ -27,10 +27,18 @@ use crate::observe::observation::Observation;
 use crate::options::{ResetOptions, Start, StepOptions};
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
-use crate::scenario::{EpisodeTraffic, SessionScenario};
+use crate::scenario::assets::FrameDetail;
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
+
+/// What a frame shows beside the twin: the ego and its past, and the actors.
+#[derive(Clone, Copy)]
+pub(super) struct Moment<'a> {
+    pub(super) episode: &'a Episode,
+    pub(super) traffic: Option<&'a EpisodeTraffic>,
+}
 
 impl Session {
     /// Moves the ego by one step of `dt_us` and renders.
@@ -75,7 +83,8 @@ impl Session {
 
         let frame_history = self.state.frame_history.clone();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
+        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
+        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = RecordedCommand::of(&command);
@@ -124,7 +133,8 @@ impl Session {
         }
         let episode = self.state.episode.clone();
         let captures = self.settings.layout.captures_at(&episode, poses);
-        let rendered = self.render(&self.version, &episode, captures, None).await?;
+        let moment = Moment { episode: &episode, traffic: self.state.traffic.as_ref() };
+        let rendered = self.render(&self.version, moment, captures, None).await?;
         let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
         self.record(record, None).await?;
         Ok(rendered.observation)
@@ -159,12 +169,14 @@ impl Session {
             Some(scenario) => {
                 let scenario = scenario.clone();
                 let version = self.resident().version.clone();
-                Some(run_blocking(move || scenario.of_episode(seed, &version)).await??)
+                let engine = self.engine.clone();
+                let find = move || scenario.of_episode(seed, &version, engine.cache());
+                Some(run_blocking(find).await??)
             }
         };
         let start = start
             .or_else(|| settings.random_start.clone().map(Start::Random))
-            .or_else(|| settings.scenario.as_ref()?.start_of(loaded.as_ref()?));
+            .or_else(|| settings.scenario.as_ref()?.start_of(&loaded.as_ref()?.loaded));
         let start = match &start {
             // Dynamics decide whether a start is placed on the ground.
             None if dynamics.model == settings.dynamics.model => settings.start.clone(),
@@ -179,17 +191,24 @@ impl Session {
             .map_err(|error| error.of_reset(Some(start)))?,
         };
         let mut next = start.episode(seed, dynamics, settings.dt_us);
-        let traffic = loaded.map(|loaded| {
+        let exposure_us = View::longest_exposure_us(settings.layout.cameras());
+        let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
-            EpisodeTraffic::at_start(loaded, next.ego()).with_solids(solids, next.ego())
+            EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
+                .with_solids(solids, next.ego())
         });
 
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let rendered = self.render(&self.version, &next, captures, Some(frame_history)).await?;
+        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
+        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
-        let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
+        let mut record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let before = traffic.as_ref();
+        if before.is_some() && rendered.captures.len() > 1 {
+            // Where the actors are in the warm-up depends on the time.
+            record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
+        }
         let mut lines = before.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record));
         lines.push(Line::Frame(record));
         let file = self.create_file(&self.version, None, before, &next, lines).await?;
@@ -224,10 +243,11 @@ impl Session {
     pub(super) async fn render(
         &self,
         version: &PinnedVersion,
-        episode: &Episode,
+        moment: Moment<'_>,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
     ) -> Result<RenderedObservation, SessionError> {
+        let Moment { episode, traffic } = moment;
         let layout = &self.settings.layout;
         let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(
@@ -243,10 +263,16 @@ impl Session {
                 continue;
             }
             let views = layout.views(episode, &capture);
-            // Load before the job is queued, so that no render thread waits for a disk.
-            let pinned = pin(version, deadline, viewpoints(&views)).await?;
-            builder.add_load(pinned.waited_for, pinned.waited);
+            let viewpoints = viewpoints(&views);
             let profile = version.profile;
+            let placed = traffic.map(|traffic| {
+                let detail = FrameDetail { viewpoints: &viewpoints, profile: &profile };
+                traffic.placed(capture.time_us, detail)
+            });
+            // Load before the job is queued, so that no render thread waits for a disk.
+            let mut pinned = pin(version, deadline, viewpoints).await?;
+            pinned.place(placed.unwrap_or_default());
+            builder.add_load(pinned.waited_for, pinned.waited);
             let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
             let cost = FrameCost { session: self.number, pixels };
             let work = move |scratch: &mut Scratch, backend: &dyn Backend| {

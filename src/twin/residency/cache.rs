@@ -9,6 +9,7 @@ use crate::store::{Catalog, Version};
 use wildcity_scene::manifest::SkyRef;
 use wildcity_scene::{Manifest, Sky};
 
+use super::actors::{ActorPool, ResidentActor};
 use super::budget::{Budget, default_memory_bytes};
 use super::pager::Pager;
 use super::resident::Shared;
@@ -23,6 +24,8 @@ pub struct Cache {
     slots: Mutex<BTreeMap<(String, u64), VersionSlot>>,
     /// The skies of the open versions.
     skies: Mutex<Vec<(SkyKey, Weak<Sky>)>>,
+    /// The assets of actors in memory.
+    actors: ActorPool,
     /// The version that was opened last stays open for the next session, because its table has
     /// megabytes.
     last: Mutex<Option<Arc<Resident>>>,
@@ -62,6 +65,7 @@ impl Cache {
             shared: Arc::new(Shared { pager, budget }),
             slots: Mutex::default(),
             skies: Mutex::default(),
+            actors: ActorPool::default(),
             last: Mutex::default(),
         }
     }
@@ -91,6 +95,15 @@ impl Cache {
         *held = Arc::downgrade(&resident);
         *self.last.lock() = Some(resident.clone());
         Ok(resident)
+    }
+
+    /// The asset of a hash, 64 lower-case hex digits, in memory until its last copy is dropped. Reads it unless it is
+    /// in memory already; blocks meanwhile.
+    ///
+    /// # Errors
+    /// As [`Catalog::actor`]; [`ResidencyError::NoRoomForActor`].
+    pub fn actor(&self, hash: &str) -> Result<Arc<ResidentActor>, ResidencyError> {
+        self.actors.get(&self.catalog, &self.shared, hash)
     }
 
     /// Counts since the start, and what is in memory now.

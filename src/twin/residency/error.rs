@@ -27,6 +27,21 @@ pub enum ResidencyError {
         /// Bytes that all twins together may use.
         limit_bytes: u64,
     },
+    /// The memory for an asset of an actor does not fit beside that of the open sessions.
+    #[error(
+        "actor {actor:?} needs {needed_bytes} bytes of memory; {held_bytes} of {limit_bytes} are reserved for open \
+         sessions: close some, allow more with --memory-gib, or import the actor with fewer Gaussians"
+    )]
+    NoRoomForActor {
+        /// The asset's name.
+        actor: String,
+        /// Bytes of all its levels of detail.
+        needed_bytes: u64,
+        /// Bytes that are reserved for sessions.
+        held_bytes: u64,
+        /// Bytes that all twins and actors together may use.
+        limit_bytes: u64,
+    },
     /// One frame needs more than all the memory that twins may use.
     #[error(
         "this frame of twin {twin:?} needs {needed_bytes} bytes of memory, and all twins \

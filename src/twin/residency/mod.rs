@@ -8,6 +8,7 @@
 //! table               which sections are in memory, and which may be evicted
 //! reservation         a session's share of the memory, and what it prefetches
 //! budget, worst_case  which sessions may open: the most that one frame of a session can need
+//! actors              assets of scenarios, which are in memory as long as these are open
 //! ```
 //!
 //! # Decisions
@@ -54,6 +55,7 @@
 //! There are no watermarks (such as 90 % and 80 %): a load evicts as much as it needs. The GPU's
 //! pages are not tied to this table: the GPU copy of the chunks has a budget of its own.
 
+mod actors;
 mod budget;
 mod cache;
 mod demand;
@@ -69,6 +71,7 @@ mod stats;
 mod table;
 mod worst_case;
 
+pub use actors::ResidentActor;
 pub use budget::default_memory_bytes;
 pub use cache::Cache;
 pub use demand::{SectionRef, Viewpoint};

@@ -142,7 +142,7 @@ impl<C> Requests<C> {
         notifications: &mut Notifications<C>,
     ) -> Result<u64, ResidencyError> {
         let needed_bytes: u64 = requested.ids.iter().map(|&id| self.table.bytes(id)).sum();
-        let limit_bytes = self.table.limit_bytes();
+        let limit_bytes = self.table.limit_of_sections_bytes();
         if needed_bytes > limit_bytes {
             let twin = requested.version.manifest.twin.clone();
             return Err(ResidencyError::TooLarge { twin, needed_bytes, limit_bytes });

@@ -26,6 +26,8 @@ pub(super) struct SectionTable {
     limit_bytes: u64,
     held_bytes: u64,
     held_sections: u64,
+    /// Bytes of the limit that are used for other things than sections: assets of actors.
+    outside_bytes: u64,
     ids: HashMap<Key, SlotId>,
     slots: Vec<Slot>,
     vacant: Vec<SlotId>,
@@ -73,6 +75,7 @@ impl SectionTable {
             limit_bytes,
             held_bytes: 0,
             held_sections: 0,
+            outside_bytes: 0,
             ids: HashMap::new(),
             slots: Vec::new(),
             vacant: Vec::new(),
@@ -171,12 +174,12 @@ impl SectionTable {
     /// changes.
     pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
-        let free_bytes = self.limit_bytes - self.held_bytes;
+        let wanted_bytes = self.held_bytes() + bytes;
         let mut victims = Vec::new();
         let mut gained_bytes = 0;
         let mut next = self.oldest;
         // From the least recently used section to the most recently used one.
-        while free_bytes + gained_bytes < bytes {
+        while self.limit_bytes + gained_bytes < wanted_bytes {
             if next == NONE {
                 return None;
             }
@@ -216,14 +219,29 @@ impl SectionTable {
         self.release_if_unused(id);
     }
 
-    /// Bytes of memory in use, including sections that are being loaded.
+    /// Bytes of memory in use, including sections that are being loaded, and assets.
     pub(super) fn held_bytes(&self) -> u64 {
-        self.held_bytes
+        self.held_bytes + self.outside_bytes
     }
 
-    /// Bytes of memory that sections may use.
+    /// Bytes of memory that sections and assets may use.
     pub(super) fn limit_bytes(&self) -> u64 {
         self.limit_bytes
+    }
+
+    /// Bytes of memory that sections may use: what assets leave of the limit.
+    pub(super) fn limit_of_sections_bytes(&self) -> u64 {
+        self.limit_bytes.saturating_sub(self.outside_bytes)
+    }
+
+    /// An asset was loaded, which takes memory from the sections. They are evicted with the next load.
+    pub(super) fn add_outside_bytes(&mut self, bytes: u64) {
+        self.outside_bytes += bytes;
+    }
+
+    /// An asset was dropped.
+    pub(super) fn remove_outside_bytes(&mut self, bytes: u64) {
+        self.outside_bytes -= bytes;
     }
 
     /// Sections in memory.

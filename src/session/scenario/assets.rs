@@ -1,0 +1,92 @@
+//! The assets of an episode's actors, and what of them a frame draws.
+
+use std::sync::Arc;
+
+use wildcity_scene::RenderProfile;
+use wildcity_scene::actor::{ActorViewpoint, ContactShadow, PlacedChunk};
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::scenario::AssetInfo;
+use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
+use wildcity_twin::store::Catalog;
+
+/// The asset of each actor, by its index; `None` for one that is not drawn. Copies share them.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct ActorAssets(Arc<[Option<Arc<ResidentActor>>]>);
+
+/// What a frame needs to know to choose the levels of detail of its actors.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FrameDetail<'a> {
+    pub(crate) viewpoints: &'a [Viewpoint],
+    pub(crate) profile: &'a RenderProfile,
+}
+
+/// What a scenario needs to know about an asset, by its hash or its name; `None` unless there is exactly one.
+pub fn asset_info(catalog: &Catalog, name: &str) -> Option<AssetInfo> {
+    let actor = catalog.find_actor(name).ok()?;
+    let description = actor.description;
+    Some(AssetInfo { hash: actor.hash, class: description.class, box_: description.box_ })
+}
+
+impl ActorAssets {
+    /// Brings assets into memory, given by their hashes.
+    ///
+    /// # Errors
+    /// One cannot be read, or there is no room for it.
+    pub(crate) fn load<'a>(
+        cache: &Cache,
+        hashes: impl Iterator<Item = Option<&'a str>>,
+    ) -> Result<Self, ResidencyError> {
+        let assets: Result<Arc<[_]>, _> =
+            hashes.map(|hash| hash.map(|hash| cache.actor(hash)).transpose()).collect();
+        Ok(Self(assets?))
+    }
+
+    /// Whether no actor is drawn.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.0.iter().all(Option::is_none)
+    }
+
+    /// What a frame draws of its actors, given the pose of each at the frame's time and at the start of the longest
+    /// exposure.
+    ///
+    /// An actor that was absent then appears during the exposure: it is drawn at rest.
+    pub(crate) fn placed(
+        &self,
+        poses: &[Option<Pose>],
+        poses_at_start: &[Option<Pose>],
+        frame: FrameDetail<'_>,
+    ) -> Vec<PlacedChunk> {
+        let viewpoint = |seen: &Viewpoint| ActorViewpoint {
+            position_m: seen.position_m,
+            focal_px: seen.focal_px,
+        };
+        let viewpoints: Vec<ActorViewpoint> = frame.viewpoints.iter().map(viewpoint).collect();
+        let RenderProfile { tau_px, reach_m, .. } = *frame.profile;
+        let actors = self.0.iter().zip(poses).enumerate();
+        let placed = actors.filter_map(|(index, (actor, pose))| {
+            let asset = actor.as_ref()?.asset();
+            let world_from_actor = (*pose)?;
+            let chunk = asset.level(&world_from_actor, &viewpoints, tau_px, reach_m)?;
+            let box_ = asset.description.box_;
+            let at_start = poses_at_start.get(index).copied().flatten();
+            Some(PlacedChunk {
+                world_from_actor_at_start: at_start.unwrap_or(world_from_actor),
+                shadow: Some(ContactShadow {
+                    length_m: box_.length_m as f32,
+                    width_m: box_.width_m as f32,
+                }),
+                ..PlacedChunk::at_rest(chunk.clone(), world_from_actor, index as u16)
+            })
+        });
+        placed.collect()
+    }
+}
+
+/// When the exposure of a frame begins, in microseconds. In a warm-up and before the start of an episode nothing moves
+/// during the exposure, neither the rig nor actors.
+pub(crate) fn exposure_start_us(taken_us: i64, exposure_us: i64) -> i64 {
+    match taken_us < 0 {
+        true => taken_us,
+        false => taken_us.saturating_sub(exposure_us).max(0),
+    }
+}

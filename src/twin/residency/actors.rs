@@ -1,0 +1,89 @@
+//! Assets of actors in memory: one copy for all sessions.
+//!
+//! A scenario's assets are in memory from when it opens, with all levels of detail, until its last episode ends: no
+//! frame waits for an actor. They count against the memory of twins, and sections get what is left.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Weak};
+
+use parking_lot::Mutex;
+
+use super::ResidencyError;
+use super::budget::Claim;
+use super::resident::Shared;
+use crate::store::Catalog;
+use wildcity_scene::actor::ActorAsset;
+
+/// The assets in memory, by their hash.
+#[derive(Debug, Default)]
+pub(super) struct ActorPool(Mutex<BTreeMap<String, Weak<ResidentActor>>>);
+
+/// An asset in memory, until its last copy is dropped.
+#[derive(Debug)]
+pub struct ResidentActor {
+    hash: String,
+    asset: ActorAsset,
+    claim: Claim,
+    shared: Arc<Shared>,
+}
+
+impl ResidentActor {
+    /// BLAKE3 of the asset, 64 lower-case hex digits.
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    /// The asset.
+    pub fn asset(&self) -> &ActorAsset {
+        &self.asset
+    }
+}
+
+impl ActorPool {
+    /// The asset of a hash, read from the catalog unless it is in memory already.
+    ///
+    /// # Errors
+    /// As [`Catalog::actor`]; [`ResidencyError::NoRoomForActor`].
+    pub(super) fn get(
+        &self,
+        catalog: &Catalog,
+        shared: &Arc<Shared>,
+        hash: &str,
+    ) -> Result<Arc<ResidentActor>, ResidencyError> {
+        // Locked while reading, so that sessions that open at once do not read an asset twice.
+        let mut actors = self.0.lock();
+        actors.retain(|_, actor| actor.strong_count() > 0);
+        if let Some(actor) = actors.get(hash).and_then(|actor| actor.upgrade()) {
+            return Ok(actor);
+        }
+        let asset = catalog.actor(hash)?;
+        let bytes = asset.bytes();
+        let name = asset.description.name.clone();
+        let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes };
+        shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
+        shared.pager.with_table(|table| table.add_outside_bytes(bytes));
+        let shared = shared.clone();
+        let actor = Arc::new(ResidentActor { hash: hash.to_owned(), asset, claim, shared });
+        actors.insert(hash.to_owned(), Arc::downgrade(&actor));
+        Ok(actor)
+    }
+}
+
+impl ResidencyError {
+    /// The error of an asset for which there is no room.
+    fn of_actor(self) -> Self {
+        match self {
+            Self::NoRoom { twin, needed_bytes, held_bytes, limit_bytes } => {
+                Self::NoRoomForActor { actor: twin, needed_bytes, held_bytes, limit_bytes }
+            }
+            other => other,
+        }
+    }
+}
+
+impl Drop for ResidentActor {
+    fn drop(&mut self) {
+        self.shared.pager.with_table(|table| table.remove_outside_bytes(self.claim.bytes));
+        self.shared.budget.lock().release(&self.claim);
+    }
+}

@@ -1,0 +1,367 @@
+//! Sessions with actors: each frame draws them where they are at its time, and nothing else changes.
+
+use std::sync::{Arc, OnceLock};
+
+use glam::{DVec3, EulerRot};
+use serde_json::{Value, json};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::actor::{
+    ActorAsset, ActorViewpoint, AssetDescription, ContactShadow, PlacedChunk,
+};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::{Shutter, ShutterDirection};
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
+use wildcity_session::{
+    Encoding, Engine, Observation, Outputs, RigChoice, ScenarioError, ScenarioOptions,
+    ScenarioSource, Session, SessionError, SessionOptions, Start, StepOptions,
+};
+use wildcity_sim::ego::Action;
+use wildcity_sim::{Command, Dynamics, EgoModel};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::StoredActor;
+
+use crate::driving::{Bench, bench, bench_with};
+use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
+
+/// Where the ego stands, along the street.
+const EGO_M: f64 = 100.0;
+/// Longest exposure of the rig with rolling shutters, in microseconds.
+const EXPOSURE_US: i64 = 60_000;
+
+/// A coloured box of 400 Gaussians, 4 m long, in the store of the demo street.
+fn car() -> &'static StoredActor {
+    static CAR: OnceLock<StoredActor> = OnceLock::new();
+    CAR.get_or_init(|| {
+        let mut gaussians = Gaussians::with_capacity(0, 400);
+        for i in 0..400 {
+            let at = |k: usize| (i * k % 397) as f64 / 397.0;
+            gaussians.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
+            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            gaussians.ln_scales.push([0.15_f32.ln(); 3]);
+            gaussians.logit_opacities.push(4.0);
+            gaussians.sh.extend([1.5, -1.2 + (i % 5) as f32 * 0.3, -1.5]);
+        }
+        let description = AssetDescription {
+            name: "red-box".to_owned(),
+            class: ActorClass::Vehicle,
+            box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
+            provenance: Provenance::of("test".to_owned()),
+        };
+        let asset = ActorAsset::new(&gaussians, description).unwrap();
+        demo().catalog().put_actor(&asset, RecordFormat::F32).unwrap()
+    })
+}
+
+/// The cameras of the other tests.
+fn rig(shutters: bool) -> Vec<RigCamera> {
+    let cameras = views(Pose::IDENTITY).into_iter().zip([("front", 60_000), ("left", 30_000)]);
+    let camera = |(view, (name, duration_us)): (View, (&str, i64))| RigCamera {
+        shutter: shutters
+            .then_some(Shutter { direction: ShutterDirection::TopToBottom, duration_us }),
+        ..RigCamera::new(name, view.camera, view.world_from_camera)
+    };
+    cameras.map(camera).collect()
+}
+
+/// A point of the road that is seen from the ego: so far ahead and to the left, in metres.
+fn ahead(ahead_m: f64, left_m: f64) -> [f64; 3] {
+    demo().at(EGO_M).transform_point(DVec3::new(ahead_m, left_m, 0.0)).to_array()
+}
+
+/// A car that drives away from the ego, and one that stands beside it.
+fn actors(asset: &Value) -> Value {
+    json!([
+        {"name": "away", "asset": asset, "path": {"points": [ahead(12.0, 0.5), ahead(80.0, 0.5)], "speed": 9}},
+        {"name": "parked", "asset": asset, "stand": {"xyz": ahead(3.0, 6.0), "yaw_rad": 0.7}}
+    ])
+}
+
+fn options(actors: &Value, shutters: bool) -> SessionOptions {
+    let scenario = json!({
+        "format": "wildcity.scenario/1", "name": "test", "twin": {"name": "demo"}, "actors": actors,
+    });
+    let options = ScenarioOptions {
+        source: ScenarioSource::Inline(scenario),
+        values: Default::default(),
+        dynamics: true,
+        warm_up: true,
+        actors: false,
+    };
+    SessionOptions {
+        start: Some(Start::Pose(demo().at(EGO_M))),
+        rig: Some(RigChoice::Full(Rig { name: "pair".to_owned(), cameras: rig(shutters) })),
+        scenario: Some(options),
+        ..SessionOptions::twin("demo", Outputs::colour(Encoding::Raw))
+    }
+}
+
+async fn open(bench: &Bench, name: &str, options: SessionOptions) -> Session {
+    Session::open(bench.engine.clone(), name.to_owned(), options).await.unwrap()
+}
+
+fn hashes(frame: &Observation) -> Vec<blake3::Hash> {
+    frame.images.iter().map(|image| image.hash).collect()
+}
+
+/// The hashes of an episode in which the ego stands: of the start and of some steps.
+async fn standing(session: &mut Session, steps: u32) -> Vec<Vec<blake3::Hash>> {
+    let mut seen = vec![hashes(&session.reset(0, None).await.unwrap())];
+    for _ in 0..steps {
+        seen.push(hashes(&session.step(demo().at(EGO_M), false).await.unwrap()));
+    }
+    seen
+}
+
+/// What the images of an ego that stands must be, with actors at their poses now and at the start of the exposure.
+fn expected(placed: &[(u16, Pose, Pose)], shutters: bool) -> Vec<blake3::Hash> {
+    let views = View::of_rig(&rig(shutters), demo().at(EGO_M));
+    let resident = unlimited().open("demo", None).unwrap();
+    let mut scene = resident.scene(&eyes(&views), &PROFILE).unwrap();
+    let asset = demo().catalog().actor(&car().hash).unwrap();
+    let eyes: Vec<ActorViewpoint> = eyes(&views)
+        .iter()
+        .map(|eye| ActorViewpoint { position_m: eye.position_m, focal_px: eye.focal_px })
+        .collect();
+    let place = |&(actor, now, at_start): &(u16, Pose, Pose)| PlacedChunk {
+        world_from_actor_at_start: at_start,
+        shadow: Some(ContactShadow { length_m: 4.0, width_m: 1.8 }),
+        ..PlacedChunk::at_rest(
+            asset.level(&now, &eyes, PROFILE.tau_px, PROFILE.reach_m).unwrap().clone(),
+            now,
+            actor,
+        )
+    };
+    scene.place(placed.iter().map(place).collect());
+    let mut images: Vec<Vec<u8>> =
+        views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
+    let mut targets: Vec<Target<'_>> =
+        images.iter_mut().map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() }).collect();
+    let frame = Frame { scene: &scene, profile: &PROFILE, views: &views };
+    crate::images::cpu().render(&frame, &mut targets, &|_, _| {}).unwrap();
+    images.iter().map(|rgb8| blake3::hash(rgb8)).collect()
+}
+
+fn poses(session: &Session) -> Vec<Pose> {
+    let states = session.traffic().unwrap().states();
+    states.iter().filter(|state| state.present).map(|state| state.world_from_actor).collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_frame_draws_the_actors_of_its_time() {
+    let bench = bench(unlimited());
+    let asset = Value::from(&*car().hash);
+    for shutters in [false, true] {
+        let mut session = open(&bench, "a", options(&actors(&asset), shutters)).await;
+        let first = hashes(&session.reset(0, None).await.unwrap());
+        let mut before = poses(&session);
+        assert_eq!(
+            first,
+            expected(&[(0, before[0], before[0]), (1, before[1], before[1])], shutters)
+        );
+        for step in 1..=3 {
+            let seen = hashes(&session.step(demo().at(EGO_M), false).await.unwrap());
+            let now = poses(&session);
+            assert!((now[0].position_m.distance(before[0].position_m) - 0.9).abs() < 1e-6);
+            // 60 of the step's 100 ms before its end.
+            let since = 1.0 - EXPOSURE_US as f64 * 1e-5;
+            let at_start = match shutters {
+                true => before[0].interpolate(&now[0], since),
+                false => now[0],
+            };
+            let drawn = [(0, now[0], at_start), (1, now[1], now[1])];
+            assert_eq!(seen, expected(&drawn, shutters), "step {step}, shutters {shutters}");
+            if shutters {
+                let at_rest = [(0, now[0], now[0]), (1, now[1], now[1])];
+                assert_ne!(seen, expected(&at_rest, shutters), "the shutter must be seen");
+            }
+            before = now;
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_asset_may_be_named_and_one_that_is_missing_is_refused() {
+    let bench = bench(unlimited());
+    car();
+    let mut named = open(&bench, "a", options(&actors(&"red-box".into()), false)).await;
+    let mut hashed = open(&bench, "b", options(&actors(&Value::from(&*car().hash)), false)).await;
+    let hash = |session: &Session| session.traffic().unwrap().loaded().hash.clone();
+    assert_eq!(hash(&named), hash(&hashed));
+    assert_eq!(standing(&mut named, 1).await, standing(&mut hashed, 1).await);
+    for missing in ["blue-box", &"0".repeat(64)] {
+        let opened = Session::open(
+            bench.engine.clone(),
+            "c".to_owned(),
+            options(&actors(&Value::from(missing)), false),
+        );
+        let Err(SessionError::Scenario(error)) = opened.await else {
+            panic!("{missing} was opened")
+        };
+        assert!(matches!(error, ScenarioError::File { .. }), "{error}");
+        assert_eq!(error.field(), "scenario.actors[0].asset");
+        assert!(error.to_string().contains("wildcity actor list"), "{error}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_actors_nothing_changes() {
+    let bench = bench(unlimited());
+    let bare = SessionOptions { scenario: None, ..options(&json!([]), true) };
+    let wanted = standing(&mut open(&bench, "bare", bare).await, 2).await;
+    let none = options(&json!([]), true);
+    assert_eq!(standing(&mut open(&bench, "none", none).await, 2).await, wanted);
+    // Actors without an asset move and are told, and are not drawn.
+    let boxes = options(&actors(&Value::Null), true);
+    assert_eq!(standing(&mut open(&bench, "boxes", boxes).await, 2).await, wanted);
+    let drawn = options(&actors(&Value::from(&*car().hash)), true);
+    assert_ne!(standing(&mut open(&bench, "drawn", drawn).await, 2).await, wanted);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_removed_actor_leaves_no_trace() {
+    let bench = bench(unlimited());
+    let asset = Value::from(&*car().hash);
+    let mut removed = actors(&asset);
+    removed[0]["script"] = json!([{"when": {"time_s": 0.15}, "do": [{"remove": {}}]}]);
+    let mut never = actors(&asset);
+    never.as_array_mut().unwrap().remove(0);
+    // With bundles, the frames from before the removal still show it.
+    let bundled = |actors: &Value| {
+        let mut options = options(actors, true);
+        options.outputs.frames = Some(3);
+        options
+    };
+    let mut with = open(&bench, "with", bundled(&removed)).await;
+    let mut without = open(&bench, "without", bundled(&never)).await;
+    with.reset(0, None).await.unwrap();
+    without.reset(0, None).await.unwrap();
+    let mut shown: Vec<Vec<blake3::Hash>> = Vec::new();
+    for step in 1..=5_usize {
+        let pose = demo().at(EGO_M);
+        let [seen, bare] =
+            [with.step(pose, false).await.unwrap(), without.step(pose, false).await.unwrap()];
+        // Whole observations: the header's room is empty, so only pixels and the ego history differ.
+        assert_eq!(hashes(&seen) == hashes(&bare), step >= 2, "step {step}");
+        let is_gone = step >= 4;
+        assert_eq!(seen.buffer.bytes() == bare.buffer.bytes(), is_gone, "step {step}");
+        // The earlier frames of the front camera are those that were shown then.
+        for past in seen.history.iter().filter(|past| past.camera == 0 && step > past.back) {
+            assert_eq!(past.hash, shown[step - 1 - past.back][0], "step {step}, {}", past.back);
+        }
+        shown.push(hashes(&seen));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn actors_are_the_same_on_any_number_of_threads_and_beside_others() {
+    let asset = Value::from(&*car().hash);
+    let mut all = Vec::new();
+    for threads in [1, 2] {
+        let cpu = Cpu::new(threads, Simd::Best).unwrap();
+        let bench = bench_with(unlimited(), Arc::new(cpu));
+        let mut session = open(&bench, "a", options(&actors(&asset), true)).await;
+        let mut other = open(&bench, "b", options(&actors(&asset), true)).await;
+        if threads == 2 {
+            let busy = tokio::spawn(async move { standing(&mut other, 4).await });
+            all.push(standing(&mut session, 4).await);
+            all.push(busy.await.unwrap());
+        } else {
+            all.push(standing(&mut session, 4).await);
+        }
+    }
+    assert_eq!(all[0], all[1]);
+    assert_eq!(all[0], all[2]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_restored_snapshot_draws_the_actors_of_its_time() {
+    let bench = bench(unlimited());
+    let mut session = open(&bench, "a", options(&actors(&Value::from(&*car().hash)), true)).await;
+    let pose = demo().at(EGO_M);
+    session.reset(0, None).await.unwrap();
+    session.step(pose, false).await.unwrap();
+    let there = hashes(&session.step(pose, false).await.unwrap());
+    session.take_snapshot("there".to_owned()).unwrap();
+    let next = hashes(&session.step(pose, false).await.unwrap());
+    session.step(pose, false).await.unwrap();
+    assert_eq!(hashes(&session.restore("there").await.unwrap()), there);
+    assert_eq!(hashes(&session.observe(vec![pose]).await.unwrap()), there);
+    assert_eq!(hashes(&session.step(pose, false).await.unwrap()), next);
+    let snapshot = session.snapshots().find("name", "there").unwrap();
+    let mut branch =
+        Session::branch(bench.engine.clone(), "b".to_owned(), &snapshot).await.unwrap();
+    assert_eq!(hashes(&branch.step(pose, false).await.unwrap()), next);
+}
+
+/// A plan of several steps shows frames of times within it, a warm-up those of before the start.
+#[tokio::test(flavor = "multi_thread")]
+async fn plans_and_warm_ups_draw_the_actors_of_each_frame() {
+    let bench = bench(unlimited());
+    let asset = Value::from(&*car().hash);
+    let mut bundled = options(&actors(&asset), true);
+    bundled.outputs.frames = Some(4);
+    bundled.dynamics = Dynamics { model: EgoModel::Kinematic, ..Dynamics::default() };
+    let mut slow = open(&bench, "slow", bundled.clone()).await;
+    let mut fast = open(&bench, "fast", bundled).await;
+    slow.reset(0, None).await.unwrap();
+    fast.reset(0, None).await.unwrap();
+    let still = Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.0 });
+    let mut last = None;
+    for _ in 0..4 {
+        last = Some(slow.step(still.clone(), false).await.unwrap());
+    }
+    let until = StepOptions { until_us: Some(400_000), ..StepOptions::default() };
+    let planned = fast.follow(still, until).await.unwrap();
+    let last = last.unwrap();
+    assert_eq!(hashes(&planned), hashes(&last));
+    let history = |seen: &Observation| -> Vec<_> {
+        seen.history.iter().map(|past| (past.camera, past.time_us, past.hash)).collect()
+    };
+    assert_eq!(history(&planned), history(&last));
+    assert_eq!(history(&last).len(), 6);
+}
+
+/// Assets take their room from the twins, once for all sessions, and give it back.
+#[tokio::test(flavor = "multi_thread")]
+async fn assets_count_against_the_memory_of_twins() {
+    let bytes = demo().catalog().actor(&car().hash).unwrap().bytes();
+    let bench_ = bench(unlimited());
+    let stats = |engine: &Arc<Engine>| engine.residency();
+    let options = options(&actors(&Value::from(&*car().hash)), false);
+    let bare = SessionOptions { scenario: None, ..options.clone() };
+    let first = open(&bench_, "bare", bare).await;
+    let reserved_bytes = stats(&bench_.engine).reserved_bytes;
+    let second = open(&bench_, "a", options.clone()).await;
+    let third = open(&bench_, "b", options.clone()).await;
+    let with = stats(&bench_.engine).reserved_bytes;
+    let sessions = first.reserved_bytes() * 3;
+    let whole = first.resident().total_bytes();
+    assert_eq!(reserved_bytes, first.reserved_bytes().min(whole));
+    assert_eq!(with, sessions.min(whole) + bytes, "one copy for two sessions of two actors");
+    drop((second, third));
+    assert_eq!(stats(&bench_.engine).reserved_bytes, reserved_bytes);
+
+    // Without room for it, the scenario does not open.
+    let limit_bytes = first.reserved_bytes() + bytes - 1;
+    let small = bench(Cache::limited(demo().catalog(), Some(limit_bytes)));
+    let _held = open(&small, "held", SessionOptions { scenario: None, ..options.clone() }).await;
+    let opened = Session::open(small.engine.clone(), "a".to_owned(), options).await;
+    let error = opened.err().map(|error| error.to_string()).unwrap_or_default();
+    assert!(error.contains("red-box") && error.contains("--memory-gib"), "{error}");
+}
+
+/// The oracle of these tests places what it is given.
+#[test]
+fn the_tests_see_the_car() {
+    let at = |yaw_rad: f64, x_m: f64| Pose {
+        position_m: DVec3::from_array(ahead(x_m, 0.5)),
+        rotation: glam::DQuat::from_euler(EulerRot::ZYX, yaw_rad, 0.0, 0.0),
+    };
+    let seen = |pose: Pose| expected(&[(0, pose, pose)], false);
+    assert_ne!(seen(at(0.0, 12.0)), expected(&[], false));
+    assert_ne!(seen(at(0.0, 12.0)), seen(at(0.0, 12.1)));
+    assert_ne!(seen(at(0.0, 12.0)), seen(at(0.1, 12.0)));
+}
