@@ -113,6 +113,7 @@ def free_port() -> int:
 
 def test_the_demo_suite_tells_drivers_apart(reader: dict[str, str], tmp_path: Path) -> None:
     suite = ROOT / "scenes" / "suites" / "street" / "suite.json"
+    run(["wildcity", "actor", "generate"], tmp_path, reader)
 
     def drive(agent: str, code: int, *options: str) -> dict[str, list[str]]:
         """The faults of each episode of the suite."""
