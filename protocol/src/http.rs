@@ -333,33 +333,6 @@ pub struct SessionInfo {
     pub connected: bool,
 }
 
-/// A recorded episode: an entry of `GET /v1/episodes`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-pub struct EpisodeInfo {
-    /// Name of the episode: that of its session and a number.
-    pub episode: String,
-    /// Name of the twin.
-    pub twin: String,
-    /// Its version when the episode began.
-    pub version: u64,
-    /// Seed of the episode.
-    pub seed: u64,
-    /// Steps done.
-    pub steps: u64,
-    /// Size of the record, in bytes.
-    pub bytes: u64,
-    /// Why the episode ended. Absent while it runs, and if the server was killed.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub outcome: Option<String>,
-    /// Name of the scenario, if there was one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub scenario: Option<String>,
-    /// The verdict, if there was a scenario: `passed`, `failed`, `off_model` or `not_judged`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub verdict: Option<String>,
-}
-
 /// Body of the answer to a refused request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -389,4 +362,44 @@ fn one() -> f64 {
 
 fn identity() -> String {
     "identity".to_owned()
+}
+
+/// `POST /v1/tickets`: stands for the request's token in the address of one WebSocket, as `?ticket=`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Ticket {
+    /// The ticket.
+    pub ticket: String,
+    /// How long it can be used, in milliseconds.
+    pub expires_ms: u64,
+}
+
+/// A recorded episode: an entry of `GET /v1/episodes`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct EpisodeInfo {
+    /// Name of the episode.
+    pub episode: String,
+    /// Name of the twin.
+    pub twin: String,
+    /// The version that it began with.
+    pub version: u64,
+    /// Steps done.
+    pub steps: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// Size of the record, in bytes.
+    pub bytes: u64,
+    /// When the record was last written, in microseconds since 1970.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub modified_us: Option<u64>,
+    /// Name of the scenario, if there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<String>,
+    /// Why it ended; absent while it is driven, and if the server was killed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub outcome: Option<String>,
+    /// The judgement of the drive, if it had a scenario.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<String>,
 }

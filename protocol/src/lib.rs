@@ -35,3 +35,6 @@ pub mod observation;
 
 /// Name of the WebSocket subprotocol. It is also the only protocol version so far.
 pub const PROTOCOL: &str = "wildcity.v1";
+
+/// The WebSocket subprotocol of clients that watch a session: they receive its observations, and send nothing.
+pub const WATCH_PROTOCOL: &str = "wildcity.watch.v1";

@@ -42,6 +42,7 @@ mod sky_source;
 mod stress;
 mod time;
 mod twin;
+mod view;
 
 use clap::{Parser, Subcommand};
 
@@ -56,6 +57,7 @@ struct Arguments {
 const EXAMPLES: &str = "\
 Examples:
   wildcity demo                                   (build a street, drive through it, look at images)
+  wildcity demo --view                            (drive through it by hand, in the browser)
   wildcity import street.ply --twin street --axes y-down-z-forward
   wildcity serve                                  (then an agent can open the twin \"street\")
   wildcity help import                            (options and examples of one command)";
@@ -64,6 +66,7 @@ Examples:
 enum Command {
     Demo(demo::Demo),
     Serve(serve::Serve),
+    View(view::View),
     Import(import::Import),
     Inspect(inspect::Inspect),
     Push(push::Push),
@@ -92,6 +95,7 @@ pub fn main() -> ExitCode {
     let result = match arguments.command {
         Command::Demo(command) => command.run(),
         Command::Serve(command) => command.run(),
+        Command::View(command) => command.run(),
         Command::Import(command) => command.run(),
         Command::Inspect(command) => command.run(),
         Command::Push(command) => command.run(),

@@ -33,6 +33,6 @@ pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list, text};
+pub use listing::{Listed, list, read_text};
 pub use outcome::result;
 pub use scenario::{DriveStart, pose_at, scenario_line};

@@ -51,10 +51,17 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
     Ok(listed)
 }
 
-/// The text of an episode's file.
+/// The text of an episode's file; none if it has more than `most` bytes. An incomplete last line, which a session may be
+/// writing, is left out.
 ///
 /// # Errors
 /// The file cannot be read.
-pub fn text(path: &Path) -> io::Result<Vec<u8>> {
-    fs::read(path)
+pub fn read_text(path: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
+    if fs::metadata(path)?.len() > most {
+        return Ok(None);
+    }
+    let mut text = fs::read(path)?;
+    let complete = text.iter().rposition(|&byte| byte == b'\n').map_or(0, |last| last + 1);
+    text.truncate(complete);
+    Ok(Some(text))
 }

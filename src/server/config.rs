@@ -13,6 +13,8 @@ use wildcity_twin::store::DiskCacheSettings;
 
 use crate::auth::Tokens;
 use crate::limits;
+use crate::origins::Origins;
+use crate::tls::TlsFiles;
 
 /// The configuration of a server.
 #[derive(Clone)]
@@ -32,6 +34,10 @@ pub struct Config {
     pub uploads: PathBuf,
     /// The tokens of clients; without tokens every client may do everything.
     pub tokens: Option<Tokens>,
+    /// Web pages of other sites that may send requests.
+    pub origins: Origins,
+    /// Certificate and key; without them the server speaks plain HTTP.
+    pub tls: Option<TlsFiles>,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// Changes of the render profile of every twin; a session may change more.
@@ -143,6 +149,8 @@ impl std::fmt::Debug for Config {
             scenarios,
             uploads,
             tokens,
+            origins,
+            tls,
             backend,
             profile,
             limits,
@@ -155,6 +163,8 @@ impl std::fmt::Debug for Config {
             .field("scenarios", scenarios)
             .field("uploads", uploads)
             .field("tokens", &tokens.is_some())
+            .field("origins", origins)
+            .field("tls", tls)
             .field("backend", &backend.name())
             .field("profile", profile)
             .field("limits", limits)

@@ -151,6 +151,7 @@ impl Connection {
         // Stores the answer in the slot too, where it survives the connection.
         if let Some(slot) = &self.slot {
             slot.update_view();
+            slot.show(&answer);
         }
         if !is_resume {
             self.last = Some(AnsweredRequest { seq, answer: answer.clone() });

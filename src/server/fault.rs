@@ -89,12 +89,6 @@ pub(crate) enum Fault {
         /// The names of the twin's trajectories.
         known: Vec<String>,
     },
-    /// There is no recorded episode of this name.
-    #[error("there is no recorded episode {name:?}; `GET /v1/episodes` lists them")]
-    UnknownEpisode {
-        /// The name asked for.
-        name: String,
-    },
     /// Another session has the name.
     #[error("there is a session {name:?} already; resume it, or choose another name")]
     SessionExists {
@@ -166,6 +160,29 @@ pub(crate) enum Fault {
     /// The request has no token, or one that the server does not know.
     #[error("a token is needed that this server knows: send Authorization: Bearer TOKEN")]
     Unauthorized,
+    /// The ticket is not good.
+    #[error(
+        "the ticket was used already, is older than 30 s, or was never issued: POST /v1/tickets"
+    )]
+    UnknownTicket,
+    /// There is no session to watch, or another token's.
+    #[error("there is no session {name:?} of this token to watch; GET /v1/sessions lists them")]
+    NothingToWatch {
+        /// The name asked for.
+        name: String,
+    },
+    /// The watched session ended.
+    #[error("the session ended")]
+    SessionEnded,
+    /// A watcher sent something.
+    #[error("a watcher sends nothing")]
+    WatcherSent,
+    /// There is no recorded episode of this name.
+    #[error("there is no recorded episode {name:?}; GET /v1/episodes lists them")]
+    NoEpisode {
+        /// The name asked for.
+        name: String,
+    },
     /// The token's role or twins do not allow the request.
     #[error("this token may not do that: {reason}")]
     Forbidden {
@@ -175,7 +192,9 @@ pub(crate) enum Fault {
         reason: String,
     },
     /// A web page of another machine sent the request.
-    #[error("pages from {origin} are refused; only those of this machine are accepted")]
+    #[error(
+        "pages from {origin} are refused; only those of this machine and of --origin are accepted"
+    )]
     ForbiddenOrigin {
         /// The header `Origin`.
         origin: String,

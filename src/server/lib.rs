@@ -4,17 +4,22 @@
 //! config         the configuration of a server, and its limits
 //! start          starts a server
 //! shutdown       a running server, and stopping it without losing running steps
+//! stream         a connection, with or without TLS
+//! tls            certificate and key, and reading them again
 //! state          what all connections share
 //! listen         accepts connections, a bounded number
 //! newcomers      the slots of connections, before and after authentication
 //! idle_deadline  closes HTTP connections that make no progress
 //! routes         HTTP routes, and the upgrade to WebSocket
 //! auth           tokens, their roles and twins
+//! tickets        one-time tickets, which stand for a token in the address of a WebSocket
+//! origins        which web pages and which host names are served
 //! spool          uploads on disk
 //! metrics        counters for Prometheus
 //! socket         WebSocket messages, with a time-out on every wait
 //! inbox          what a client sends while its last request is carried out
 //! connection     one agent, in lock step: read a request, answer it
+//! watchers       clients that look at a session without taking part in it
 //! sessions       the sessions of the server: connected, or waiting to be resumed
 //! fault          why a request is refused
 //! convert        conversion between wire and session types; wire code and HTTP status of each fault
@@ -34,6 +39,7 @@ pub mod limits;
 mod listen;
 mod metrics;
 mod newcomers;
+mod origins;
 mod routes;
 mod sessions;
 mod shutdown;
@@ -41,8 +47,14 @@ mod socket;
 mod spool;
 mod start;
 mod state;
+mod stream;
+mod tickets;
+mod tls;
+mod watchers;
 
 pub use auth::{Role, Tokens, TokensError};
 pub use config::{Config, Limits, SpoolLimits};
+pub use origins::{OriginError, Origins};
 pub use shutdown::{Running, stop_signal};
 pub use start::{ServerError, start};
+pub use tls::{TlsError, TlsFiles};

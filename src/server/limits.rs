@@ -92,6 +92,21 @@ pub const UPLOAD_WRITE_BYTES: usize = 1 << 20;
 /// Largest file of tokens: 200 B each.
 pub const TOKENS_FILE_BYTES: u64 = 1 << 20;
 
+/// How long a ticket is good: a page uses it at once.
+pub const TICKET_AGE: Duration = Duration::from_secs(30);
+
+/// Tickets that were not used yet: one for each connection, and some for pages that were closed meanwhile.
+pub const TICKETS: usize = 2 * CONNECTIONS;
+
+/// Time between two observations that a watcher is sent; it misses those in between.
+pub const WATCH_PERIOD: Duration = Duration::from_millis(100);
+
+/// Recorded episodes that are listed over HTTP: each file is read for it.
+pub const LISTED_EPISODES: usize = 100;
+
+/// Largest file of an episode that is sent over HTTP: an hour at 10 Hz with six cameras has 30 MB.
+pub const EPISODE_BYTES: u64 = 64 << 20;
+
 // A client accepts every answer of a session, and waits for it long enough.
 const _: () = {
     use wildcity_protocol::limits as wire;
@@ -101,6 +116,3 @@ const _: () = {
     assert!(session::HISTORY_POSES == wire::HISTORY_POSES);
     assert!(session::STEP_TIMEOUT.as_millis() == wire::STEP_TIMEOUT.as_millis());
 };
-
-/// Episodes of one list over HTTP, the newest. Reading one of 30 s takes some 10 ms: a second for all.
-pub const LISTED_EPISODES: usize = 100;

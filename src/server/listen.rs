@@ -14,9 +14,11 @@ use crate::limits;
 use crate::newcomers::Newcomers;
 use crate::routes;
 use crate::state::ServerState;
+use crate::stream::Stream;
+use crate::tls::Tls;
 
 /// Serves connections until the server stops.
-pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
+pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: Option<Arc<Tls>>) {
     let newcomers = Newcomers::new(state.limits.connections + limits::SPARE_CONNECTIONS);
     let app = routes::router(state.clone());
     loop {
@@ -44,16 +46,26 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener) {
             .clone()
             .layer(axum::Extension(slot.clone()))
             .layer(axum::Extension(deadline.clone()));
-        let connection = http1::Builder::new()
-            .timer(TokioTimer::new())
-            .header_read_timeout(state.limits.hello)
-            .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
-            .with_upgrades();
         let state = state.clone();
+        let tls = tls.clone();
+        let connection = {
+            let hello = state.limits.hello;
+            async move {
+                let Some(stream) = Stream::accept(stream, tls.as_deref(), hello).await else {
+                    return;
+                };
+                // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
+                let _ = http1::Builder::new()
+                    .timer(TokioTimer::new())
+                    .header_read_timeout(hello)
+                    .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
+                    .with_upgrades()
+                    .await;
+            }
+        };
         tokio::spawn(async move {
             tokio::select! {
-                // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
-                _ = connection => {}
+                () = connection => {}
                 () = deadline.passed() => {}
                 () = slot.closed() => {}
                 () = state.stopped() => {}

@@ -12,7 +12,9 @@ use wildcity_scene::geometry::Pose;
 use wildcity_session::{EpisodeSummary, Observation, Outcome, Session, Snapshots};
 use wildcity_twin::residency::Viewpoint;
 
+use crate::auth::{Grant, Role};
 use crate::fault::Fault;
+use crate::watchers::{Newest, Watch};
 
 /// How long one attempt to take over a session waits before it asks the old connection again.
 const TAKEOVER_ATTEMPT: Duration = Duration::from_millis(100);
@@ -46,6 +48,8 @@ struct Entry {
     snapshots: Snapshots,
     /// The session after its last request; none before the first.
     view: Option<SessionView>,
+    /// Where watchers see the session's observations.
+    newest: Newest,
     /// Asks the connection that holds the slot to release it.
     release: Arc<Notify>,
     /// Set while no connection holds the slot.
@@ -115,6 +119,7 @@ pub(crate) struct SlotGuard {
     pub(crate) outcome: Outcome,
     /// Notified when another connection wants to resume the session.
     pub(crate) release: Arc<Notify>,
+    newest: Newest,
     slot: OwnedMutexGuard<SessionSlot>,
 }
 
@@ -139,18 +144,38 @@ impl SessionRegistry {
         let release = Arc::new(Notify::new());
         let guard = slot.clone().try_lock_owned();
         let guard = guard.map_err(|_| Fault::Internal("a new slot is locked".to_owned()))?;
+        let newest = Newest::new();
         let entry = Entry {
             slot,
             owner: owner.to_owned(),
             snapshots: Snapshots::default(),
             view: None,
+            newest: newest.clone(),
             release: release.clone(),
             parked: None,
         };
         entries.insert(name.clone(), entry);
         drop(entries);
         self.closed.lock().remove(&name);
-        Ok(self.guard(name, release, guard))
+        Ok(self.guard(name, release, newest, guard))
+    }
+
+    /// Watches a session: of the client's own token, or any as an administrator.
+    ///
+    /// # Errors
+    /// There is no such session that the client may see.
+    pub(crate) fn watch(&self, name: &str, grant: &Grant) -> Result<Watch, Fault> {
+        let entries = self.entries.lock();
+        let may_see = |entry: &&Entry| {
+            let is_own = entry.owner == grant.name;
+            let twin = entry.view.as_ref().map(|view| view.twin.as_str());
+            (is_own || grant.require(Role::Admin).is_ok())
+                && twin.is_none_or(|twin| grant.allows_twin(twin))
+        };
+        // Other clients must not learn that the session exists.
+        let entry = entries.get(name).filter(may_see);
+        let unknown = || Fault::NothingToWatch { name: name.to_owned() };
+        Ok(entry.ok_or_else(unknown)?.newest.watch())
     }
 
     /// The snapshots of a session, whichever connection holds it.
@@ -224,8 +249,9 @@ impl SessionRegistry {
                 let entry = entries.get_mut(name).ok_or_else(unknown)?;
                 entry.release = release.clone();
                 entry.parked = None;
+                let newest = entry.newest.clone();
                 drop(entries);
-                return Ok(self.guard(name.to_owned(), release, guard));
+                return Ok(self.guard(name.to_owned(), release, newest, guard));
             }
             if Instant::now() >= give_up {
                 return Err(Fault::SessionState("the session's last step is still running"));
@@ -237,9 +263,11 @@ impl SessionRegistry {
         self: &Arc<Self>,
         name: String,
         release: Arc<Notify>,
+        newest: Newest,
         slot: OwnedMutexGuard<SessionSlot>,
     ) -> SlotGuard {
-        SlotGuard { registry: self.clone(), name, outcome: Outcome::AgentLost, release, slot }
+        let registry = self.clone();
+        SlotGuard { registry, name, outcome: Outcome::AgentLost, release, newest, slot }
     }
 
     /// Number of sessions, connected and parked.
@@ -326,6 +354,13 @@ impl SlotGuard {
     pub(crate) fn share_snapshots(&self, session: &Session) {
         if let Some(entry) = self.registry.entries.lock().get_mut(&self.name) {
             entry.snapshots = session.snapshots().clone();
+        }
+    }
+
+    /// Shows an answer to the watchers of the session, if it is an observation and there are any.
+    pub(crate) fn show(&self, answer: &Answer) {
+        if let Answer::Observation(observation) = answer {
+            self.newest.show(observation);
         }
     }
 

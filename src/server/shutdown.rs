@@ -11,11 +11,13 @@ use tokio::time::timeout;
 
 use crate::listen::listen;
 use crate::state::ServerState;
+use crate::tls::{self, Tls};
 
 /// A server that listens. Dropping it stops it without waiting.
 pub struct Running {
     state: Arc<ServerState>,
     address: SocketAddr,
+    has_tls: bool,
     stop: watch::Sender<bool>,
     listening: JoinHandle<()>,
 }
@@ -48,20 +50,24 @@ impl Running {
     pub(crate) fn new(
         state: Arc<ServerState>,
         listener: TcpListener,
+        tls: Option<Arc<Tls>>,
         address: SocketAddr,
         stop: watch::Sender<bool>,
     ) -> Self {
-        let listening = tokio::spawn(listen(state.clone(), listener));
+        let has_tls = tls.is_some();
+        let reloading = tls::reload(tls.clone());
+        let listening = tokio::spawn(listen(state.clone(), listener, tls));
         let periodic = state.clone();
         tokio::spawn(async move {
             tokio::select! {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
                 () = renew_leases(&periodic) => {}
+                () = reloading => {}
                 () = periodic.stopped() => {}
             }
         });
-        Self { state, address, stop, listening }
+        Self { state, address, has_tls, stop, listening }
     }
 
     /// The address that the server listens on.
@@ -71,7 +77,14 @@ impl Running {
 
     /// The URL that agents connect to.
     pub fn url(&self) -> String {
-        format!("ws://{}/v1/session", self.address)
+        let scheme = if self.has_tls { "wss" } else { "ws" };
+        format!("{scheme}://{}/v1/session", self.address)
+    }
+
+    /// The URL of the viewer.
+    pub fn page(&self) -> String {
+        let scheme = if self.has_tls { "https" } else { "http" };
+        format!("{scheme}://{}/", self.address)
     }
 
     /// Number of sessions at this moment: connected, and waiting to be resumed.

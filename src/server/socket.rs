@@ -5,7 +5,6 @@ use std::time::Duration;
 
 use futures_util::{SinkExt as _, StreamExt as _};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-use tokio::net::TcpStream;
 use tokio::time::timeout;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::error::{CapacityError, ProtocolError};
@@ -14,10 +13,11 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 
 use crate::fault::Fault;
 use crate::limits;
+use crate::stream::Stream;
 
 /// A client's WebSocket.
 pub(crate) struct Socket {
-    stream: WebSocketStream<TcpStream>,
+    stream: WebSocketStream<Stream>,
     send_timeout: Duration,
     /// Whether the client has sent its Close frame, after which it reads nothing.
     peer_closed: bool,
@@ -53,11 +53,7 @@ pub(crate) enum Disconnect {
 
 impl Socket {
     /// Takes over a connection from HTTP; `read_ahead` has the bytes that HTTP has already read from it.
-    pub(crate) async fn new(
-        stream: TcpStream,
-        read_ahead: Vec<u8>,
-        send_timeout: Duration,
-    ) -> Self {
+    pub(crate) async fn new(stream: Stream, read_ahead: Vec<u8>, send_timeout: Duration) -> Self {
         let config = WebSocketConfig::default()
             .max_message_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
             .max_frame_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))

@@ -20,6 +20,8 @@ use crate::sessions::SessionRegistry;
 use crate::shutdown::Running;
 use crate::spool::Spool;
 use crate::state::ServerState;
+use crate::tickets::Tickets;
+use crate::tls::{Tls, TlsError};
 
 /// Why a server did not start.
 #[derive(Debug, thiserror::Error)]
@@ -50,6 +52,9 @@ pub enum ServerError {
         /// What the operating system says.
         cause: io::Error,
     },
+    /// The certificate or the key cannot be used.
+    #[error(transparent)]
+    Tls(#[from] TlsError),
     /// The directory of twins cannot be read.
     #[error(transparent)]
     Twins(#[from] StoreError),
@@ -73,6 +78,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         scenarios,
         uploads,
         tokens,
+        origins,
+        tls,
         backend,
         profile,
         limits,
@@ -85,10 +92,11 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     std::fs::create_dir_all(&episodes)
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
     let catalog = Catalog::open_cached(&twins, cache.as_ref())?;
+    let tls = tls.map(Tls::load).transpose()?;
     let cache = Cache::limited(catalog, limits.resident_bytes);
     let engine = Engine::start(EngineSettings {
         cache,
-        episodes,
+        episodes: episodes.clone(),
         scenarios: Scenarios::in_dir(scenarios),
         backend,
         step_timeout: limits.step,
@@ -117,8 +125,11 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         limits,
         profile,
         tokens,
+        tickets: Tickets::default(),
+        origins,
+        episodes,
         spool,
         pushes: PushQueue::new(limits.queue()),
     });
-    Ok(Running::new(state, listener, address, stop))
+    Ok(Running::new(state, listener, tls, address, stop))
 }

@@ -1,5 +1,6 @@
 //! What all connections of a server share.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use tokio::sync::{Semaphore, watch};
@@ -12,8 +13,10 @@ use crate::auth::Tokens;
 use crate::config::Limits;
 use crate::fault::Fault;
 use crate::metrics::Metrics;
+use crate::origins::Origins;
 use crate::sessions::SessionRegistry;
 use crate::spool::Spool;
+use crate::tickets::Tickets;
 
 /// What all connections of a server share.
 pub(crate) struct ServerState {
@@ -27,6 +30,10 @@ pub(crate) struct ServerState {
     /// Changes of the render profile of every twin.
     pub(crate) profile: ProfileOverrides,
     pub(crate) tokens: Option<Tokens>,
+    pub(crate) tickets: Tickets,
+    pub(crate) origins: Origins,
+    /// Directory where episodes are recorded.
+    pub(crate) episodes: PathBuf,
     /// The spool, or why there is none.
     pub(crate) spool: Result<Arc<Spool>, String>,
     pub(crate) pushes: PushQueue,

@@ -168,6 +168,8 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
         scenarios: settings.scenarios.clone(),
         uploads: settings.episodes.join(".uploads"),
         tokens: None,
+        origins: wildcity_server::Origins::default(),
+        tls: None,
         backend: settings.backend.clone(),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),

@@ -29,6 +29,8 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         scenarios: twins.path().join(".scenarios"),
         uploads: twins.path().join(".uploads"),
         tokens: None,
+        origins: wildcity_server::Origins::default(),
+        tls: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),

@@ -10,7 +10,7 @@ use wildcity_server::{Config, Limits, ServerError};
 use crate::support::{TEST_TIMEOUT, TestServer};
 
 /// Sends a request as it is, and reads until the server closes or the answer is there.
-async fn request(server: &TestServer, text: &str) -> (u16, String) {
+pub(crate) async fn request(server: &TestServer, text: &str) -> (u16, String) {
     let mut stream = TcpStream::connect(server.address()).await.unwrap();
     stream.write_all(text.replace('\n', "\r\n").as_bytes()).await.unwrap();
     let mut answer = vec![0; 65536];
@@ -235,6 +235,8 @@ async fn public_addresses_are_refused() {
         scenarios: server.twins.path().join(".scenarios"),
         uploads: server.twins.path().join(".uploads"),
         tokens: None,
+        origins: wildcity_server::Origins::default(),
+        tls: None,
         backend: server.painter.clone(),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),

@@ -29,3 +29,5 @@ mod scenarios;
 mod shutdown;
 mod socket;
 mod starts;
+mod tls;
+mod viewer;

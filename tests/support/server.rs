@@ -181,6 +181,8 @@ impl TestServer {
             scenarios: twins.path().join(".scenarios"),
             uploads: twins.path().join(".uploads"),
             tokens: None,
+            origins: wildcity_server::Origins::default(),
+            tls: None,
             backend: painter.clone(),
             profile: ProfileOverrides::default(),
             limits: Limits::default(),

@@ -15,7 +15,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("fearless_simd", &["src/render/cpu", "src/scene/sky"]),
     ("wgpu", &["src/render/gpu"]),
     ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
-    ("rustls", &["src/twin/store/remote", "clients/rust"]),
+    ("rustls", &["src/twin/store/remote", "src/server/tls.rs", "clients/rust"]),
     ("flate2", &["src/twin/ingest"]),
     ("zip", &["src/twin/ingest/archive.rs"]),
     ("image_webp", &["src/twin/ingest/sog"]),
@@ -33,6 +33,7 @@ const FILES: &[&str] = &[
     "src/suite",
     "src/server/start.rs",
     "src/server/spool",
+    "src/server/tls.rs",
     "clients/rust/src/upload.rs",
     "src/cli",
 ];

@@ -23,13 +23,14 @@ use wildcity_twin::store::{
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
-use super::{output, progress};
+use super::{output, progress, view};
 
 /// Build a demo street, drive through it as an agent, and write images of the drive.
 ///
 /// Builds the street on first use, serves it on a free loopback port, and drives along its recorded
 /// trajectory through the WebSocket, as any agent would. Writes a mosaic of the six cameras for every tenth
-/// step, the recorded episode, and report.json with the time of every step.
+/// step, the recorded episode, and report.json with the time of every step. With --view it opens the viewer
+/// instead, where the street can be driven by hand.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {
@@ -41,6 +42,10 @@ pub(super) struct Demo {
     #[arg(long, value_name = "DIR", default_value = "wildcity-demo")]
     out: PathBuf,
 
+    /// Open the street in the viewer of a browser, instead of driving through it as an agent.
+    #[arg(long, conflicts_with = "steps")]
+    view: bool,
+
     #[command(flatten)]
     twins: Twins,
 
@@ -51,6 +56,7 @@ pub(super) struct Demo {
 const EXAMPLES: &str = "\
 Examples:
   wildcity demo
+  wildcity demo --view
   wildcity demo --steps 20 --out /tmp/look
   wildcity serve            (then an agent can open the twin \"demo\")";
 
@@ -78,10 +84,15 @@ impl Demo {
             scenarios: self.out.join("scenarios"),
             uploads: self.out.join("uploads"),
             tokens: None,
+            origins: wildcity_server::Origins::default(),
+            tls: None,
             backend: Arc::from(self.backend.backend()?),
             profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };
+        if self.view {
+            return view::serve(config, Some(TWIN), true);
+        }
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let drive = runtime.block_on(async {
             let running = wildcity_server::start(config).await?;

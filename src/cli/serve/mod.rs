@@ -11,7 +11,7 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use tracing_subscriber::EnvFilter;
 
-use wildcity_server::Tokens;
+use wildcity_server::{Origins, TlsFiles, Tokens};
 use wildcity_twin::ingest;
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DamagedTwin;
@@ -57,6 +57,21 @@ pub(super) struct Serve {
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
 
+    /// Certificate of the server in PEM, followed by those of its authorities: then it speaks HTTPS, with the key of
+    /// --tls-key. Both files are read again at SIGHUP.
+    #[arg(long, value_name = "FILE")]
+    tls_cert: Option<PathBuf>,
+
+    /// Key of the certificate, in PEM.
+    #[arg(long, value_name = "FILE")]
+    tls_key: Option<PathBuf>,
+
+    /// Web pages of other sites that may send requests, separated by commas, for example
+    /// https://sim.example.org; pages of this machine always may. The server is then also called by these
+    /// hosts, by its addresses or localhost, and by no other name.
+    #[arg(long, value_name = "ORIGINS", value_parser = origins)]
+    origin: Option<Origins>,
+
     /// Address and port to listen on; port 0 takes a free one. An address that is not loopback needs
     /// --tokens.
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
@@ -90,6 +105,7 @@ Examples:
   wildcity serve --memory-gib 2
   wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
   wildcity serve --tokens tokens.json --listen 0.0.0.0:8080
+  wildcity serve --tokens tokens.json --listen 0.0.0.0:8443 --tls-cert cert.pem --tls-key key.pem
   wildcity serve --print-config > serve.toml
   wildcity serve --config serve.toml --sessions 16
   curl http://127.0.0.1:8080/v1/twins
@@ -155,6 +171,16 @@ impl Serve {
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
         let tokens = self.tokens.as_deref().map(read_tokens).transpose()?;
+        let tls = match (self.tls_cert, self.tls_key) {
+            (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
+            (None, None) => None,
+            (Some(_), None) => {
+                anyhow::bail!("--tls-cert needs --tls-key, the key of the certificate")
+            }
+            (None, Some(_)) => {
+                anyhow::bail!("--tls-key needs --tls-cert, the certificate of the key")
+            }
+        };
         let config = wildcity_server::Config {
             listen: self.listen,
             twins,
@@ -163,6 +189,8 @@ impl Serve {
             scenarios: self.scenarios.dir()?,
             uploads: self.uploads.dir()?,
             tokens,
+            origins: self.origin.unwrap_or_default(),
+            tls,
             backend: Arc::from(self.backend.backend()?),
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
             limits: self.limits.limits(self.memory_gib.map(bytes_of_gib)),
@@ -174,6 +202,7 @@ impl Serve {
             let stop = wildcity_server::stop_signal()?;
             let running = wildcity_server::start(config).await?;
             writeln!(io::stdout(), "listening on {}", running.url())?;
+            tracing::info!("viewer at {}", running.page());
             stop.await;
             tracing::info!("stopping");
             running.stop().await;
@@ -194,4 +223,9 @@ fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
 
 fn address(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| "expected an address and a port, as 127.0.0.1:8080".to_owned())
+}
+
+fn origins(text: &str) -> Result<Origins, String> {
+    let listed = text.split(',').map(|origin| origin.trim().to_owned()).collect();
+    Origins::new(listed).map_err(|error| error.to_string())
 }

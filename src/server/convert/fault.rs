@@ -48,6 +48,7 @@ pub(crate) fn http_status(fault: &Fault) -> StatusCode {
 /// The Close frame after a fault that ends the connection (RFC 6455, section 7.4.1).
 pub(crate) fn close_status(fault: &Fault) -> CloseStatus {
     let code = match fault {
+        Fault::SessionEnded => 1000,
         Fault::ShuttingDown => 1001,
         Fault::BrokenFrame(_) => 1002,
         Fault::NotUtf8 => 1007,
@@ -179,8 +180,6 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
         Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
         Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
-        // The list of codes is closed, and episodes are named by their sessions.
-        Fault::UnknownEpisode { .. } => at(Code::UnknownSession, "episode"),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
@@ -207,6 +206,11 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::TimedOut(_) => plain(Code::TimedOut),
         Fault::ShuttingDown => plain(Code::ShuttingDown),
         Fault::Unauthorized => at(Code::Unauthorized, "authorization"),
+        Fault::UnknownTicket => at(Code::Unauthorized, "ticket"),
+        Fault::NothingToWatch { .. } => at(Code::UnknownSession, "session"),
+        Fault::SessionEnded => plain(Code::UnknownSession),
+        Fault::WatcherSent => plain(Code::InvalidRequest),
+        Fault::NoEpisode { .. } => at(Code::UnknownState, "episode"),
         Fault::Forbidden { field, .. } => at(Code::Forbidden, field),
         Fault::ForbiddenOrigin { .. } => at(Code::Forbidden, "origin"),
         Fault::NoUpgrade => at(Code::InvalidRequest, "upgrade"),

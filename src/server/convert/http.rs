@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 use std::str::FromStr;
+use std::time::UNIX_EPOCH;
 
 use serde_json::{Value, json};
 
@@ -216,18 +217,35 @@ pub(crate) fn sessions(sessions: &[ListedSession]) -> Value {
     json!({ "sessions": sessions.iter().map(session).collect::<Vec<_>>() })
 }
 
-/// The body of `GET /v1/episodes`.
-pub(crate) fn episodes(episodes: &[(EpisodeFile, Listed)]) -> Value {
-    let info = |(episode, listed): &(EpisodeFile, Listed)| http::EpisodeInfo {
-        episode: listed.name.clone(),
-        twin: episode.header.twin.clone(),
-        version: episode.header.version,
-        seed: episode.header.seed,
-        steps: episode.driven().last().map_or(0, |frame| frame.step),
-        bytes: listed.bytes,
-        outcome: episode.end.as_ref().map(|end| end.outcome.clone()),
-        scenario: episode.scenario.as_ref().map(|scenario| scenario.name.clone()),
-        verdict: episode.result.as_ref().map(|result| result.verdict.clone()),
+/// A new ticket.
+pub(crate) fn ticket(ticket: String) -> Value {
+    json!(http::Ticket { ticket, expires_ms: limits::TICKET_AGE.as_millis() as u64 })
+}
+
+/// A recorded episode, and its content.
+pub(crate) struct ListedEpisode {
+    pub(crate) listed: Listed,
+    pub(crate) file: EpisodeFile,
+}
+
+/// Recorded episodes.
+pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
+    let episode = |ListedEpisode { listed, file }: &ListedEpisode| {
+        let driven = file.driven();
+        let last = driven.last();
+        let since_1970 = listed.modified.and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+        http::EpisodeInfo {
+            episode: listed.name.clone(),
+            twin: file.header.twin.clone(),
+            version: file.header.version,
+            steps: last.map_or(0, |frame| frame.step),
+            time_us: last.map_or(0, |frame| frame.time_us),
+            bytes: listed.bytes,
+            modified_us: since_1970.map(|time| time.as_micros() as u64),
+            scenario: file.scenario.as_ref().map(|scenario| scenario.name.clone()),
+            outcome: file.end.as_ref().map(|end| end.outcome.clone()),
+            verdict: file.result.as_ref().map(|result| result.verdict.clone()),
+        }
     };
-    json!({ "episodes": episodes.iter().map(info).collect::<Vec<_>>() })
+    json!({ "episodes": episodes.iter().map(episode).collect::<Vec<_>>() })
 }

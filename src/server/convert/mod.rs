@@ -27,10 +27,14 @@ pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welc
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
-    episodes, new_push, new_upload, push, rollback, sessions, upload, version, versions,
+    ListedEpisode, episodes, new_push, new_upload, push, rollback, sessions, ticket, upload,
+    version, versions,
 };
 pub(crate) use observation::observation;
 pub(crate) use request::{BranchPoint, Command, Parsed, parse};
 
 /// The WebSocket subprotocol.
 pub(crate) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;
+
+/// The WebSocket subprotocol of a watcher.
+pub(crate) const WATCH_SUBPROTOCOL: &str = wildcity_protocol::WATCH_PROTOCOL;

@@ -3,12 +3,11 @@
 use std::sync::Arc;
 
 use axum::Extension;
-use axum::extract::{Request, State};
+use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse as _;
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
-use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::auth::{Grant, Role};
@@ -18,6 +17,8 @@ use crate::fault::Fault;
 use crate::newcomers::ConnectionSlot;
 use crate::socket::Socket;
 use crate::state::ServerState;
+use crate::stream::Stream;
+use crate::watchers;
 
 use super::refusal::HttpResult;
 
@@ -27,23 +28,59 @@ pub(super) async fn upgrade(
     State(state): State<Arc<ServerState>>,
     Extension(slot): Extension<Arc<ConnectionSlot>>,
     Extension(grant): Extension<Arc<Grant>>,
-    mut request: Request,
+    request: Request,
 ) -> HttpResult {
-    let accept = derive_accept_key(check_handshake(request.headers())?);
+    let accept = accept(request.headers(), convert::SUBPROTOCOL)?;
     grant.require(Role::Drive)?;
+    let shared = state.clone();
+    hand_over(&state, slot, accept, convert::SUBPROTOCOL, request, async move |socket| {
+        connection::serve(shared, socket, grant).await;
+    })
+}
+
+/// `GET /v1/sessions/{session}/watch`: checks the handshake, and hands the socket over to a [`watchers`]' end of the
+/// session.
+pub(super) async fn watch(
+    State(state): State<Arc<ServerState>>,
+    Extension(slot): Extension<Arc<ConnectionSlot>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(session): Path<String>,
+    request: Request,
+) -> HttpResult {
+    let accept = accept(request.headers(), convert::WATCH_SUBPROTOCOL)?;
+    grant.require(Role::Drive)?;
+    let watch = state.sessions.watch(&session, &grant)?;
+    let shared = state.clone();
+    hand_over(&state, slot, accept, convert::WATCH_SUBPROTOCOL, request, async move |socket| {
+        watchers::serve(shared.stopped(), socket, watch).await;
+    })
+}
+
+/// Answers a handshake, and serves its socket once that is upgraded.
+fn hand_over<F>(
+    state: &Arc<ServerState>,
+    slot: Arc<ConnectionSlot>,
+    accept: String,
+    protocol: &'static str,
+    mut request: Request,
+    serve: impl FnOnce(Socket) -> F + Send + 'static,
+) -> HttpResult
+where
+    F: Future<Output = ()> + Send,
+{
     let Ok(websocket_permit) = state.websocket_permits.clone().try_acquire_owned() else {
         let limit = state.limits.connections;
         return Err(Fault::Busy { what: "connections", limit }.into());
     };
     let upgrade = hyper::upgrade::on(&mut request);
+    let send_timeout = state.limits.send;
     tokio::spawn(async move {
         // Both are held until the connection ends.
         let _slot = slot;
         let _websocket_permit = websocket_permit;
-        match upgrade.await.map(into_tcp) {
+        match upgrade.await.map(into_stream) {
             Ok(Ok((stream, read_ahead))) => {
-                let socket = Socket::new(stream, read_ahead, state.limits.send).await;
-                connection::serve(state, socket, grant).await;
+                serve(Socket::new(stream, read_ahead, send_timeout).await).await;
             }
             Ok(Err(_)) => tracing::error!("a WebSocket upgrade did not give back its socket"),
             Err(error) => tracing::debug!("a client left during its upgrade: {error}"),
@@ -53,19 +90,24 @@ pub(super) async fn upgrade(
         (header::CONNECTION, "Upgrade"),
         (header::UPGRADE, "websocket"),
         (header::SEC_WEBSOCKET_ACCEPT, &accept),
-        (header::SEC_WEBSOCKET_PROTOCOL, convert::SUBPROTOCOL),
+        (header::SEC_WEBSOCKET_PROTOCOL, protocol),
     ];
     Ok((StatusCode::SWITCHING_PROTOCOLS, headers).into_response())
 }
 
+/// The answer to the client's key, if the headers are those of a WebSocket handshake.
+fn accept(headers: &HeaderMap, protocol: &'static str) -> Result<String, Fault> {
+    check_handshake(headers, protocol).map(derive_accept_key)
+}
+
 /// The socket under an upgraded connection, and the bytes that were already read from it.
-fn into_tcp(upgraded: Upgraded) -> Result<(TcpStream, Vec<u8>), Upgraded> {
-    let parts = upgraded.downcast::<TokioIo<TcpStream>>()?;
+fn into_stream(upgraded: Upgraded) -> Result<(Stream, Vec<u8>), Upgraded> {
+    let parts = upgraded.downcast::<TokioIo<Stream>>()?;
     Ok((parts.io.into_inner(), parts.read_buf.into()))
 }
 
 /// The client's key, if the headers are those of a WebSocket handshake.
-fn check_handshake(headers: &HeaderMap) -> Result<&[u8], Fault> {
+fn check_handshake<'a>(headers: &'a HeaderMap, protocol: &'static str) -> Result<&'a [u8], Fault> {
     let any = |name: header::HeaderName, is_wanted: &dyn Fn(&str) -> bool| {
         let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
         values.flat_map(|value| value.split(',')).any(|value| is_wanted(value.trim()))
@@ -78,8 +120,8 @@ fn check_handshake(headers: &HeaderMap) -> Result<&[u8], Fault> {
         return Err(Fault::Handshake { header: "sec-websocket-version", must: "must be 13" });
     }
     // Unlike the values above, names of subprotocols are case-sensitive.
-    if !any(header::SEC_WEBSOCKET_PROTOCOL, &|offered| offered == convert::SUBPROTOCOL) {
-        return Err(Fault::NoSubprotocol { protocol: convert::SUBPROTOCOL });
+    if !any(header::SEC_WEBSOCKET_PROTOCOL, &|offered| offered == protocol) {
+        return Err(Fault::NoSubprotocol { protocol });
     }
     match headers.get(header::SEC_WEBSOCKET_KEY) {
         Some(key) if is_key(key.as_bytes()) => Ok(key.as_bytes()),

@@ -301,8 +301,7 @@ impl Engine {
         &self.answer_budget
     }
 
-    /// The directory of the recorded episodes.
-    pub fn episodes(&self) -> &Path {
+    pub(crate) fn episodes(&self) -> &Path {
         &self.episodes
     }
 }

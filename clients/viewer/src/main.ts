@@ -1,0 +1,44 @@
+// The page of the address: #/, #/drive/TWIN, #/fly/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME.
+
+import { byId } from "./dom";
+import { DrivePage } from "./drive";
+import { EpisodePage } from "./episode";
+import { FlyPage } from "./fly";
+import { HomePage } from "./home";
+import type { Page } from "./page";
+import { WatchPage } from "./watch";
+
+const THEME = "wildcity-theme";
+
+let page: Page | undefined;
+
+function pageOf(address: string): Page {
+  const [, kind = "", ...names] = address.split("/").map(decodeURIComponent);
+  const name = names[0] ?? "";
+  if (kind === "drive" && name) return new DrivePage(name);
+  if (kind === "fly" && name) return new FlyPage(name);
+  if (kind === "watch" && name) return new WatchPage(name);
+  if (kind === "episode" && name) return new EpisodePage(names.slice(0, 2));
+  return new HomePage();
+}
+
+function show(): void {
+  void page?.end();
+  page = pageOf(location.hash);
+  byId("page").replaceChildren(page.element);
+}
+
+function applyTheme(theme: string | null): void {
+  if (theme) document.documentElement.dataset.theme = theme;
+}
+
+byId("theme").addEventListener("click", () => {
+  const isDark = getComputedStyle(document.documentElement).colorScheme.startsWith("dark");
+  const theme = isDark ? "light" : "dark";
+  localStorage.setItem(THEME, theme);
+  applyTheme(theme);
+});
+addEventListener("hashchange", show);
+addEventListener("pagehide", () => void page?.end());
+applyTheme(localStorage.getItem(THEME));
+show();

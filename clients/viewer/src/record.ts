@@ -1,0 +1,70 @@
+// The record of an episode: a JSON object a line, as the server writes it.
+
+import type { Pose } from "./pose";
+import type { Camera } from "./protocol";
+import { getText } from "./server";
+
+export interface RecordedFrame {
+  step: number;
+  time_us: number;
+  pose: Pose;
+  /** Version of the twin that was shown. */
+  version: number;
+  /** Hash of the images of the cameras, by camera; only of those with an image at this time. */
+  images: Map<string, string>;
+}
+
+export interface RecordedEvent {
+  time_us: number;
+  text: string;
+  isBad: boolean;
+}
+
+export interface Recording {
+  name: string;
+  twin: string;
+  backend: string;
+  cameras: Camera[];
+  profile: Record<string, unknown>;
+  frames: RecordedFrame[];
+  events: RecordedEvent[];
+  outcome: string | undefined;
+}
+
+/** Loads a record. A step that was driven again after a restore replaces what followed it. */
+export async function load(name: string): Promise<Recording> {
+  const text = await getText(`v1/episodes/${encodeURIComponent(name)}`);
+  const [header, ...lines] = text.split("\n").filter(Boolean).map((line) => JSON.parse(line) as any);
+  const cameras = header.rig.cameras as Camera[];
+  const set = Object.entries(header.profile as Record<string, unknown>).filter(([, value]) => value !== null);
+  const recording: Recording = {
+    name, cameras, twin: header.twin, backend: header.backend, profile: Object.fromEntries(set), frames: [], events: [],
+    outcome: undefined,
+  };
+  let version: number = header.version;
+  for (const line of lines) {
+    if (line.kind === "version") version = line.version;
+    if (line.kind === "end") recording.outcome = line.outcome;
+    if (line.kind === "event") recording.events.push(eventOf(line));
+    if (line.kind !== "frame" || line.request === "observe" || line.poses.length === 0) continue;
+    const frames = recording.frames.filter(({ step }) => step < line.step);
+    recording.frames = frames;
+    frames.push({ step: line.step, time_us: line.time_us, pose: line.poses.at(-1), version, images: lastImages(line, cameras) });
+  }
+  return recording;
+}
+
+/** The images of the last pose: an answer may hold those of earlier poses before them. */
+function lastImages(line: any, cameras: Camera[]): Map<string, string> {
+  const rendered: number[][] = line.cameras ?? line.poses.map(() => cameras.map((_, index) => index));
+  const last = rendered.at(-1) ?? [];
+  const hashes: string[] = (line.images ?? []).slice(-last.length || Infinity);
+  return new Map(last.map((index, at) => [cameras[index]!.name, hashes[at]!]));
+}
+
+function eventOf(line: any): RecordedEvent {
+  const { kind, actor, name, at_fault: atFault } = line;
+  const parts = [kind, actor, name, atFault ? "at fault" : ""].filter((part) => typeof part === "string" && part);
+  const isEnd = kind === "end" || kind === "ended";
+  return { time_us: line.time_us ?? 0, text: parts.join(" "), isBad: kind === "contact" || (isEnd && name !== "route_done") };
+}

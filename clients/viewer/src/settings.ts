@@ -1,0 +1,74 @@
+// What the driver can choose; remembered by the browser.
+
+import { el } from "./dom";
+
+const KEY = "wildcity-settings";
+const WIDTHS = [320, 480, 640, 960, 1280, 99_999];
+
+interface Stored {
+  width?: number;
+  quality?: number;
+  pace?: boolean;
+}
+
+export class Settings {
+  readonly element: HTMLElement;
+  keepsPace: boolean;
+  scenario = "";
+  quality: number;
+  private chosenWidth: number | undefined;
+  private suitable = 480;
+  private readonly widths = el("select", { title: "Smaller images are faster" });
+
+  constructor(onChange: () => void) {
+    const stored: Stored = JSON.parse(localStorage.getItem(KEY) ?? "{}");
+    this.chosenWidth = stored.width;
+    this.quality = stored.quality ?? 85;
+    this.keepsPace = stored.pace ?? true;
+    const quality = el("input", { type: "number", min: "1", max: "100", value: String(this.quality) });
+    const pace = el("input", { type: "checkbox", checked: this.keepsPace });
+    const scenario = el("input", { type: "text", placeholder: "none", spellcheck: false });
+    const change = (then: () => void) => (): void => {
+      then();
+      this.store();
+      onChange();
+    };
+    this.widths.addEventListener("change", change(() => (this.chosenWidth = Number(this.widths.value))));
+    quality.addEventListener("change", change(() => (this.quality = Math.min(100, Math.max(1, Math.round(Number(quality.value)) || 85)))));
+    scenario.addEventListener("change", change(() => (this.scenario = scenario.value.trim())));
+    pace.addEventListener("change", () => {
+      this.keepsPace = pace.checked;
+      this.store();
+    });
+    const label = (text: string, title: string, field: HTMLElement): HTMLElement => el("label", { title }, text, field);
+    this.element = el("details.settings", {}, el("summary", {}, "Settings"),
+      label("width of the front image", "Smaller images are faster; the other cameras are smaller still", this.widths),
+      label("JPEG quality", "1 to 100", quality),
+      label("scenario", "Name of a scenario of the server", scenario),
+      label("keep pace", "On a slow server, render fewer images rather than slow time down", pace));
+    this.list();
+  }
+
+  get width(): number {
+    return this.chosenWidth ?? this.suitable;
+  }
+
+  /** Chooses a width for the renderer, unless the driver has. */
+  suit(backend: string): void {
+    this.suitable = backend === "gpu" ? 1280 : 480;
+    this.list();
+  }
+
+  private list(): void {
+    this.widths.replaceChildren(...WIDTHS.map((width) => {
+      const text = width > 9999 ? "full" : `${width} px`;
+      return el("option", { value: String(width), selected: width === this.width }, text);
+    }));
+  }
+
+  private store(): void {
+    const stored: Stored = { quality: this.quality, pace: this.keepsPace };
+    if (this.chosenWidth !== undefined) stored.width = this.chosenWidth;
+    localStorage.setItem(KEY, JSON.stringify(stored));
+  }
+}

@@ -1,0 +1,178 @@
+// The viewer in Chromium, against the real server.
+import assert from "node:assert/strict";
+import { readFile } from "node:fs/promises";
+import { join } from "node:path";
+import { after, before, test } from "node:test";
+import { behindWire, decodedByPython, home, launch, open, serve, steps, tokenFile } from "./wildcity.mjs";
+
+let place, server, browser;
+
+before(async () => {
+  place = await home();
+  [server, browser] = await Promise.all([serve(place.folder), launch()]);
+});
+
+after(async () => {
+  await browser?.close();
+  await server?.stop();
+  await place?.remove();
+});
+
+/** The hashes of the images that a page shows, by camera. */
+const hashes = (page) => page.$$eval("canvas[data-hash]", (all) =>
+  Object.fromEntries(all.map(({ dataset }) => [dataset.camera, dataset.hash])));
+
+test("the first page lists the twin, and its link opens a session", async () => {
+  const { page, complaints, close } = await open(browser, server);
+  await page.click("text=demo");
+  await steps(page, 1);
+  assert.equal(await page.$$eval("canvas[data-hash]", (all) => all.length), 6);
+  assert.match(await page.textContent("#where"), /demo v1/);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("the mosaic is what the Python client decodes", async () => {
+  const { page, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  const shown = await page.$$eval("canvas[data-hash]", (all) => all.map((canvas) => {
+    const { width, height, dataset } = canvas;
+    const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+    return { camera: dataset.camera, width, height, pixels: Array.from(data) };
+  }));
+  const sizes = Object.fromEntries(shown.map(({ camera, width, height }) => [camera, [width, height]]));
+  const folder = await decodedByPython(server.socket, "demo", sizes);
+  assert.equal(shown.length, 6);
+  for (const { camera, width, height, pixels } of shown) {
+    const expected = await readFile(join(folder, camera));
+    assert.equal(expected.length, width * height * 3);
+    let most = 0;
+    for (let at = 0; at < width * height; at++) {
+      for (let part = 0; part < 3; part++) most = Math.max(most, Math.abs(pixels[4 * at + part] - expected[3 * at + part]));
+    }
+    assert.ok(most <= 2, `${camera} differs by ${most}`);
+  }
+  await close();
+});
+
+test("keys move the car, watchers see it, and the record has its hashes", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  const view = () => page.$eval(".view", ({ dataset }) => ({ x: Number(dataset.x), session: dataset.session }));
+  const start = await view();
+  const watcher = await open(browser, server, `#/watch/${start.session}`);
+  await page.keyboard.down("KeyW");
+  await page.waitForFunction((x) => Number(document.querySelector(".view").dataset.x) > x + 1, start.x);
+  await steps(watcher.page, 1);
+  await page.keyboard.up("KeyW");
+  await page.keyboard.down("Space");
+  await page.waitForFunction(() => document.querySelector(".facts dd").textContent === "0 km/h");
+  // Standing still, every step has the same images: those that the watcher sees are the agent's.
+  const driven = await hashes(page);
+  await watcher.page.waitForFunction((front) => document.querySelector("canvas[data-camera=front]").dataset.hash === front, driven.front);
+  assert.deepEqual(await hashes(watcher.page), driven);
+  assert.deepEqual(watcher.complaints, []);
+  await watcher.close();
+
+  // Leaving the page ends the session; then its episode can be looked at.
+  await page.click("#home");
+  await page.click(`text=${start.session}-1`);
+  await page.waitForSelector(".player[data-same=true]");
+  assert.match(await page.textContent(".verdict"), /^6 of 6 images have the recorded hash$/);
+  const last = Number(await page.getAttribute(".track input", "max"));
+  assert.ok(last > 3, `${last} frames`);
+  for (const at of [last, Math.floor(last / 2)]) {
+    await page.$eval(".track input", (input, value) => {
+      input.value = String(value);
+      input.dispatchEvent(new Event("input"));
+    }, at);
+    await page.waitForFunction(() =>
+      document.querySelector(".player").dataset.timeUs === document.querySelector("output").dataset.timeUs);
+    assert.equal(await page.getAttribute(".player", "data-same"), "true");
+  }
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("the free camera moves and looks around", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/fly/demo");
+  await steps(page, 1);
+  const before = await hashes(page);
+  await page.keyboard.down("KeyW");
+  await steps(page, 3);
+  await page.keyboard.up("KeyW");
+  const after = await hashes(page);
+  assert.notDeepEqual(after, before);
+  const { x, y } = await page.locator(".mosaic canvas").boundingBox();
+  await page.mouse.move(x + 300, y + 200);
+  await page.mouse.down();
+  await page.mouse.move(x + 200, y + 200);
+  await page.mouse.up();
+  await page.waitForFunction((hash) => document.querySelector("canvas[data-hash]").dataset.hash !== hash, after.free);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("a gamepad drives", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  const pose = () => page.$eval(".view", ({ dataset }) => Number(dataset.x));
+  const start = await pose();
+  await page.evaluate(() => {
+    const buttons = Array.from({ length: 17 }, (_, at) => ({ pressed: at === 7, value: at === 7 ? 1 : 0 }));
+    navigator.getGamepads = () => [null, { connected: true, mapping: "standard", axes: [-1, 0, 0, 0], buttons }];
+  });
+  await page.waitForFunction((x) => Number(document.querySelector(".view").dataset.x) > x + 1, start);
+  // The fourth number is the steering: to the left.
+  assert.match(await page.textContent(".facts div:nth-child(4) dd"), /^[1-9][0-9.]*°$/);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("a lost connection is resumed", async () => {
+  const wire = await behindWire(server);
+  const { page, close } = await open(browser, wire, "#/drive/demo");
+  await steps(page, 2);
+  const view = () => page.$eval(".view", ({ dataset }) => ({ step: Number(dataset.step), session: dataset.session }));
+  const before = await view();
+  wire.cut();
+  await steps(page, before.step + 3);
+  assert.equal((await view()).session, before.session);
+  await close();
+  wire.stop();
+});
+
+test("nothing is wider than a phone, and the pads drive", async () => {
+  const phone = { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true };
+  const { page, complaints, close } = await open(browser, server, "", phone);
+  const fits = () => page.evaluate(() => document.documentElement.scrollWidth <= innerWidth);
+  await page.waitForSelector("text=demo");
+  assert.ok(await fits(), "the first page");
+  await page.click("text=demo");
+  await steps(page, 1);
+  assert.ok(await fits(), "the mosaic");
+  const x = Number(await page.getAttribute(".view", "data-x"));
+  await page.locator(".pad.up").dispatchEvent("pointerdown");
+  await page.waitForFunction((start) => Number(document.querySelector(".view").dataset.x) > start + 0.2, x);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("a server with tokens asks for one, and a ticket opens the session", async () => {
+  const token = "a-token-for-the-viewer";
+  const path = await tokenFile(place.folder, [{ name: "viewer", role: "drive", token }]);
+  const guarded = await serve(place.folder, "--tokens", path);
+  try {
+    const { page, close } = await open(browser, guarded);
+    await page.fill("input[type=password]", "not-this-one-at-all");
+    await page.click("text=Continue");
+    await page.fill("input[type=password]", token);
+    await page.click("text=Continue");
+    await page.click("text=demo");
+    await steps(page, 1);
+    assert.ok(!(await page.content()).includes(token));
+    await close();
+  } finally {
+    await guarded.stop();
+  }
+});

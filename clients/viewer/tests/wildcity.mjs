@@ -1,0 +1,99 @@
+// A server with the demo twin, and Chromium.
+import assert from "node:assert/strict";
+import { execFile, spawn } from "node:child_process";
+import { connect, createServer } from "node:net";
+import { mkdtemp, rm, writeFile } from "node:fs/promises";
+import { tmpdir } from "node:os";
+import { join } from "node:path";
+import { createInterface } from "node:readline";
+import { promisify } from "node:util";
+import { chromium } from "playwright-core";
+
+const run = promisify(execFile);
+const binary = process.env.WILDCITY_BIN;
+assert.ok(binary, "set WILDCITY_BIN to the built wildcity binary");
+
+/** A folder with the demo twin. */
+export async function home() {
+  const folder = await mkdtemp(join(tmpdir(), "viewer-"));
+  await run(binary, ["demo", "--steps", "1", "--out", join(folder, "demo"), "--twins", join(folder, "twins")]);
+  return { folder, remove: () => rm(folder, { recursive: true }) };
+}
+
+/** Starts `wildcity serve`; `url` is that of its page. */
+export async function serve(folder, ...options) {
+  const directories = ["twins", "episodes", "uploads", "scenarios"].flatMap((name) => [`--${name}`, join(folder, name)]);
+  const child = spawn(binary, ["serve", "--listen", "127.0.0.1:0", "--log", "warn", ...directories, ...options]);
+  let errors = "";
+  child.stderr.on("data", (text) => (errors += text));
+  for await (const line of createInterface(child.stdout)) {
+    const socket = line.match(/^listening on (ws\S+)$/)?.[1];
+    if (socket) return { socket, url: socket.replace("ws", "http").replace("v1/session", ""), stop: () => stop(child) };
+  }
+  throw new Error(`wildcity serve ended: ${errors}`);
+}
+
+function stop(child) {
+  const ended = new Promise((resolve) => child.once("exit", resolve));
+  child.kill("SIGTERM");
+  return ended;
+}
+
+/** The same server behind connections that can be cut. */
+export async function behindWire(server) {
+  const { hostname, port } = new URL(server.url);
+  const sockets = new Set();
+  const wire = createServer((near) => {
+    const far = connect(Number(port), hostname);
+    for (const socket of [near, far]) {
+      sockets.add(socket);
+      socket.on("error", () => {}).on("close", () => sockets.delete(socket));
+    }
+    near.pipe(far).pipe(near);
+  });
+  await new Promise((resolve) => wire.listen(0, "127.0.0.1", resolve));
+  const cut = () => sockets.forEach((socket) => socket.destroy());
+  const stop = () => {
+    wire.close();
+    cut();
+  };
+  return { url: `http://127.0.0.1:${wire.address().port}/`, cut, stop };
+}
+
+export async function tokenFile(folder, tokens) {
+  const path = join(folder, "tokens.json");
+  await writeFile(path, JSON.stringify({ tokens }));
+  return path;
+}
+
+/** The pixels of the twin's start, by camera, as the Python client decodes them. */
+export async function decodedByPython(socket, twin, sizes) {
+  const out = await mkdtemp(join(tmpdir(), "viewer-"));
+  const script = new URL("decode.py", import.meta.url).pathname;
+  await run(process.env.WILDCITY_PYTHON ?? "python3", [script, socket, twin, JSON.stringify(sizes), out]);
+  return out;
+}
+
+export const launch = () => chromium.launch({
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+  args: ["--no-sandbox", "--use-angle=swiftshader"],
+});
+
+/** A page that fails the test if it says anything on its console, fails, or asks another server for anything. */
+export async function open(browser, server, address = "", options = {}) {
+  const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, ...options });
+  const page = await context.newPage();
+  const complaints = [];
+  page.on("console", (message) => complaints.push(message.text()));
+  page.on("pageerror", (error) => complaints.push(error.message));
+  page.on("request", (request) => {
+    const url = request.url();
+    if (!url.startsWith(server.url) && !url.startsWith("blob:")) complaints.push(`asked for ${url}`);
+  });
+  await page.goto(`${server.url}${address}`);
+  return { page, complaints, close: () => context.close() };
+}
+
+/** Waits until the page has shown so many steps. */
+export const steps = (page, count) =>
+  page.waitForFunction((least) => Number(document.querySelector("[data-step]")?.dataset.step) >= least, count);

@@ -1,0 +1,196 @@
+//! Which web pages may send requests, and by which names the server may be called.
+//!
+//! A page of any site can send requests to 127.0.0.1, and browsers say in `Origin` which page it was. A page can also
+//! let the name of its own site stand for 127.0.0.1 (DNS rebinding): its requests then have no foreign `Origin`, but
+//! that name as `Host`. Programs send no `Origin`.
+
+use std::net::IpAddr;
+
+use axum::http::{HeaderMap, Uri, header};
+
+use crate::fault::Fault;
+
+/// The pages of other sites that are served.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Origins(Vec<String>);
+
+/// An origin that cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "{origin:?} is no origin: expected http:// or https:// and a host, as https://sim.example.org:8443"
+)]
+pub struct OriginError {
+    origin: String,
+}
+
+impl Origins {
+    /// Origins as browsers send them: scheme, host, and the port unless it is the scheme's own.
+    ///
+    /// # Errors
+    /// Names the first one that no browser would send.
+    pub fn new(origins: Vec<String>) -> Result<Self, OriginError> {
+        let is_origin = |origin: &str| {
+            let uri: Result<Uri, _> = origin.parse();
+            let Ok(uri) = uri else { return false };
+            let scheme = uri.scheme_str().filter(|scheme| ["http", "https"].contains(scheme));
+            // Nothing after the authority, and no user in it.
+            let plain =
+                scheme.zip(uri.authority()).map(|(scheme, host)| format!("{scheme}://{host}"));
+            plain.is_some_and(|plain| plain == origin && !plain.contains('@'))
+                && origin.to_ascii_lowercase() == origin
+        };
+        match origins.iter().find(|origin| !is_origin(origin)) {
+            Some(origin) => Err(OriginError { origin: origin.clone() }),
+            None => Ok(Self(origins)),
+        }
+    }
+
+    /// Whether a page of another site is listed.
+    pub(crate) fn lists(&self, origin: &[u8]) -> bool {
+        self.0.iter().any(|listed| listed.as_bytes() == origin)
+    }
+
+    /// Refuses requests of pages that are neither local, nor listed, nor (on a server with tokens, of which a foreign
+    /// page knows none) from this server itself.
+    ///
+    /// # Errors
+    /// [`Fault::ForbiddenOrigin`].
+    pub(crate) fn check_page(
+        &self,
+        headers: &HeaderMap,
+        has_tokens: bool,
+        host: Option<&str>,
+    ) -> Result<(), Fault> {
+        let Some(origin) = headers.get(header::ORIGIN) else { return Ok(()) };
+        let text = origin.to_str().unwrap_or_default();
+        let authority = text.split_once("://").map(|(_, authority)| authority);
+        let is_own = has_tokens && authority.is_some() && authority == host;
+        if is_local_origin(text) || self.lists(origin.as_bytes()) || is_own {
+            return Ok(());
+        }
+        let origin = String::from_utf8_lossy(origin.as_bytes()).into_owned();
+        Err(Fault::ForbiddenOrigin { origin })
+    }
+
+    /// Refuses requests for other hosts. Without tokens, and with a list of origins, a host is this machine or one of the
+    /// list; with tokens it may also be an address, which no site can rebind. Without a list, a server with tokens does
+    /// not know its own names, and serves all.
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`].
+    pub(crate) fn check_host(&self, has_tokens: bool, host: Option<&str>) -> Result<(), Fault> {
+        let Some(host) = host else { return Ok(()) };
+        let listed = |origin: &String| origin.split_once("://").is_some_and(|(_, own)| own == host);
+        let is_address =
+            has_tokens && name_of(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+        let knows_none = has_tokens && self.0.is_empty();
+        if knows_none || is_address || is_local_authority(host) || self.0.iter().any(listed) {
+            return Ok(());
+        }
+        let served = match has_tokens {
+            true => "the hosts of --origin, addresses and localhost are served",
+            false => "without tokens, localhost and the hosts of --origin are served",
+        };
+        let reason = format!("requests for host {host:?} are refused; {served}");
+        Err(Fault::Forbidden { field: "host", reason })
+    }
+}
+
+/// Whether an origin is a page served from this machine.
+fn is_local_origin(origin: &str) -> bool {
+    origin.split_once("://").is_some_and(|(_, authority)| is_local_authority(authority))
+}
+
+/// Whether a host, with or without a port, is this machine.
+fn is_local_authority(authority: &str) -> bool {
+    let host = name_of(authority);
+    host.eq_ignore_ascii_case("localhost") || ["127.0.0.1", "[::1]"].contains(&host)
+}
+
+/// A host without its port.
+fn name_of(authority: &str) -> &str {
+    match authority.rsplit_once(':') {
+        Some((host, port)) if port.bytes().all(|b| b.is_ascii_digit()) => host,
+        _ => authority,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn local_origins() {
+        for origin in
+            ["http://localhost", "http://127.0.0.1:8080", "https://[::1]:1", "http://[::1]"]
+        {
+            assert!(is_local_origin(origin), "{origin}");
+        }
+        for origin in [
+            "null",
+            "http://example.org",
+            "http://localhost.example.org",
+            "http://127.0.0.1.example.org:80",
+            "http://example.org:127",
+            "http://user@example.org",
+            "http://localhost:80@example.org",
+        ] {
+            assert!(!is_local_origin(origin), "{origin}");
+        }
+    }
+
+    #[test]
+    fn pages_are_local_listed_or_own() {
+        let origins = Origins::new(vec!["https://sim.example.org:8443".to_owned()]).unwrap();
+        let is_served = |origin: &str, has_tokens: bool| {
+            let headers = HeaderMap::from_iter([(header::ORIGIN, origin.parse().unwrap())]);
+            origins.check_page(&headers, has_tokens, Some("10.1.2.3:8080")).is_ok()
+        };
+        for (origin, without_tokens, with_tokens) in [
+            ("http://localhost:5173", true, true),
+            ("https://sim.example.org:8443", true, true),
+            ("http://10.1.2.3:8080", false, true),
+            ("https://sim.example.org", false, false),
+            ("http://sim.example.org:8443", false, false),
+            ("null", false, false),
+        ] {
+            assert_eq!(is_served(origin, false), without_tokens, "{origin}");
+            assert_eq!(is_served(origin, true), with_tokens, "{origin}");
+        }
+    }
+
+    #[test]
+    fn hosts_are_local_listed_or_addresses() {
+        let listed = Origins::new(vec!["https://sim.example.org".to_owned()]).unwrap();
+        let none = Origins::default();
+        for (host, open, with_list, with_tokens, with_both) in [
+            ("localhost:8080", true, true, true, true),
+            ("[::1]:8080", true, true, true, true),
+            ("sim.example.org", false, true, true, true),
+            ("10.1.2.3:8080", false, false, true, true),
+            ("[fe80::1]:8080", false, false, true, true),
+            ("evil.example.org", false, false, true, false),
+        ] {
+            let is_served =
+                |origins: &Origins, tokens| origins.check_host(tokens, Some(host)).is_ok();
+            let found = [(&none, false), (&listed, false), (&none, true), (&listed, true)]
+                .map(|(o, t)| is_served(o, t));
+            assert_eq!(found, [open, with_list, with_tokens, with_both], "{host}");
+        }
+    }
+
+    #[test]
+    fn an_origin_is_what_a_browser_sends() {
+        for wrong in [
+            "sim.example.org",
+            "https://sim.example.org/",
+            "ftp://a",
+            "https://A.org",
+            "https://u@a.org",
+            "*",
+            "",
+        ] {
+            assert!(Origins::new(vec![wrong.to_owned()]).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,46 @@
+//! Answers to pages of other sites (the Fetch standard, section 3.2: CORS), for the origins of `--origin`.
+
+use std::sync::Arc;
+
+use axum::extract::{Request, State};
+use axum::http::{HeaderValue, Method, StatusCode, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse as _, Response};
+
+use crate::state::ServerState;
+
+/// How long a browser remembers what a page may do, in seconds.
+const MAX_AGE_S: &str = "600";
+const METHODS: &str = "GET, POST, PATCH, DELETE";
+const REQUEST_HEADERS: &str = "authorization, content-type, upload-offset, content-digest";
+const ANSWER_HEADERS: &str = "upload-offset";
+
+/// Lets listed pages read answers, and answers a browser's question what they may send.
+pub(super) async fn answer(
+    State(state): State<Arc<ServerState>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let origin = request.headers().get(header::ORIGIN).cloned();
+    let Some(origin) = origin.filter(|origin| state.origins.lists(origin.as_bytes())) else {
+        return next.run(request).await;
+    };
+    let is_question = request.method() == Method::OPTIONS
+        && request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
+    let mut response = match is_question {
+        true => StatusCode::NO_CONTENT.into_response(),
+        false => next.run(request).await,
+    };
+    let headers = response.headers_mut();
+    headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);
+    headers.append(header::VARY, HeaderValue::from_static("origin"));
+    let mut say = |name, value| headers.insert(name, HeaderValue::from_static(value));
+    if is_question {
+        say(header::ACCESS_CONTROL_ALLOW_METHODS, METHODS);
+        say(header::ACCESS_CONTROL_ALLOW_HEADERS, REQUEST_HEADERS);
+        say(header::ACCESS_CONTROL_MAX_AGE, MAX_AGE_S);
+    } else {
+        say(header::ACCESS_CONTROL_EXPOSE_HEADERS, ANSWER_HEADERS);
+    }
+    response
+}
