@@ -19,6 +19,7 @@
 //! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
+//! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, twin |
 //! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, protocol, push, render, scene, session, sim, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
@@ -28,7 +29,8 @@
 //! # Invariants
 //!
 //! 1. The wire is known to `protocol`, `client` and `server::convert` only.
-//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum.
+//! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum;
+//!    only `alpasim` names tonic and prost.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
 //! 5. An image is a function of scene version, render profile, poses, cameras and actors. Caches change

@@ -12,12 +12,14 @@
 use std::process::ExitCode;
 
 mod actor;
+mod alpasim;
 mod backend_options;
 mod bench;
 mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod drive;
 mod episode;
 mod exit;
 mod import;
@@ -74,6 +76,8 @@ enum Command {
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),
+    Drive(drive::Drive),
+    Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
     Episode(episode::Episode),
     Rig(rig::RigCommand),
@@ -103,6 +107,8 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
+        Command::Drive(command) => command.run(),
+        Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Episode(command) => command.run(),
         Command::Rig(command) => command.run(),

@@ -9,6 +9,8 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
+use wildcity_session::Engine;
+
 use crate::listen::listen;
 use crate::state::ServerState;
 use crate::tls::{self, Tls};
@@ -85,6 +87,11 @@ impl Running {
     pub fn page(&self) -> String {
         let scheme = if self.has_tls { "https" } else { "http" };
         format!("{scheme}://{}/", self.address)
+    }
+
+    /// The renderer and the twins, for other services of the same process.
+    pub fn engine(&self) -> &Arc<Engine> {
+        &self.state.engine
     }
 
     /// Number of sessions at this moment: connected, and waiting to be resumed.

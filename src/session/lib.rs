@@ -15,6 +15,7 @@
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
 //! | `scenario` | scenarios by name, and the files beside them |
+//! | `stills` | images from any views, without an episode |
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
@@ -24,6 +25,7 @@ mod error;
 pub mod limits;
 mod observe;
 mod options;
+mod pin;
 mod prefetch;
 mod record;
 mod scenario;
@@ -31,6 +33,7 @@ mod session;
 mod snapshot;
 mod start;
 mod state;
+mod stills;
 mod viewpoint;
 
 pub use engine::render_queue::{FrameCost, Scratch};
@@ -67,4 +70,5 @@ pub use scenario::{
 };
 pub use session::Session;
 pub use snapshot::{Snapshot, Snapshots};
+pub use stills::{Still, Stills};
 pub use viewpoint::viewpoints;

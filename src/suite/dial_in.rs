@@ -15,6 +15,8 @@ use crate::technical::Technical;
 
 /// A command that is started.
 pub(crate) struct Dialled<'a> {
+    /// Its name in results.
+    pub(crate) name: &'a str,
     /// The command line, for the shell.
     pub(crate) command: &'a str,
     /// Where it dials.
@@ -36,12 +38,17 @@ pub(crate) async fn drive(
 ) -> Result<(), Technical> {
     let child = start(dialled, case).map_err(|error| Technical {
         kind: "agent_lost",
-        message: format!("{:?} cannot be started: {error}", dialled.command),
+        message: format!("{:?} cannot be started: {error}", dialled.name),
     })?;
     let status = wait(child, dialled.timeout).await?;
     if !status.success() {
-        let message = format!("{:?} ended with {status}", dialled.command);
-        return Err(Technical { kind: "agent_error", message });
+        let kind = match status.code() {
+            Some(limits::TIMEOUT_STATUS) => "agent_timeout",
+            Some(limits::LOST_STATUS) => "agent_lost",
+            _ => "agent_error",
+        };
+        let message = format!("{:?} ended with {status}", dialled.name);
+        return Err(Technical { kind, message });
     }
     wait_for_end(record).await
 }

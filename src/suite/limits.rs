@@ -28,3 +28,9 @@ pub const OFF_MODEL_SHARE: f64 = 0.1;
 
 /// Worst episodes that the report shows with pictures.
 pub const WORST: usize = 12;
+
+/// Exit status of an agent that ran out of time: that of the command `timeout`.
+pub const TIMEOUT_STATUS: i32 = 124;
+
+/// Exit status of an agent that lost what it needs: EX_UNAVAILABLE.
+pub const LOST_STATUS: i32 = 69;

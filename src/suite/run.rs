@@ -29,7 +29,12 @@ pub enum AgentChoice {
     /// An agent that comes with the program.
     BuiltIn(BuiltIn),
     /// A command, started once for each episode, that dials in.
-    Command(String),
+    Command {
+        /// Its name in results.
+        name: String,
+        /// The command line, for the shell.
+        line: String,
+    },
 }
 
 /// How a suite is run.
@@ -101,11 +106,11 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
     check_empty(&settings.episodes)?;
     let host = match &settings.agent {
         AgentChoice::BuiltIn(_) => Host::Engine(engine(&settings)?),
-        AgentChoice::Command(_) => server(&settings).await?,
+        AgentChoice::Command { .. } => server(&settings).await?,
     };
     let agent_name = match &settings.agent {
         AgentChoice::BuiltIn(agent) => agent.name().to_owned(),
-        AgentChoice::Command(command) => command.clone(),
+        AgentChoice::Command { name, .. } => name.clone(),
     };
     let permits = Arc::new(Semaphore::new(settings.jobs.clamp(1, limits::JOBS)));
     let shared = Arc::new(Shared {
@@ -227,9 +232,9 @@ impl Shared {
             (Host::Engine(engine), AgentChoice::BuiltIn(agent)) => {
                 drive(engine.clone(), case, session, *agent).await?;
             }
-            (Host::Server { url, .. }, AgentChoice::Command(command)) => {
-                let dialled =
-                    Dialled { command, url, session: &session, timeout: self.agent_timeout };
+            (Host::Server { url, .. }, AgentChoice::Command { name, line }) => {
+                let timeout = self.agent_timeout;
+                let dialled = Dialled { name, command: line, url, session: &session, timeout };
                 dial_in::drive(&dialled, case, &record).await?;
             }
             _ => return Err(Technical::server("the host does not fit the agent")),

@@ -12,7 +12,8 @@ use crate::street::Bench;
 fn command(manner: &str) -> AgentChoice {
     let binary = env::current_exe().unwrap();
     let test = "dial_in::the_agent --exact --nocapture";
-    AgentChoice::Command(format!("AGENT_MANNER={manner} {} {test}", binary.display()))
+    let line = format!("AGENT_MANNER={manner} {} {test}", binary.display());
+    AgentChoice::Command { name: manner.to_owned(), line }
 }
 
 /// Not a test: the agent, if the suite has started this binary as one.

@@ -10,6 +10,9 @@ use crate::source::{Package, packages, paths};
 /// Crates that only some files may name, by their path from the root of the repository.
 const CRATES: &[(&str, &[&str])] = &[
     ("axum", &["src/server"]),
+    ("prost", &["src/alpasim"]),
+    ("tonic", &["src/alpasim"]),
+    ("tonic_prost", &["src/alpasim"]),
     ("prometheus_client", &["src/server/metrics.rs"]),
     ("bincode", &["src/twin/store/chunk_file.rs"]),
     ("fearless_simd", &["src/render/cpu", "src/scene/sky"]),
@@ -17,7 +20,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
     ("rustls", &["src/twin/store/remote", "src/server/tls.rs", "clients/rust"]),
     ("flate2", &["src/twin/ingest"]),
-    ("zip", &["src/twin/ingest/archive.rs"]),
+    ("zip", &["src/twin/ingest/archive.rs", "src/cli/alpasim"]),
     ("image_webp", &["src/twin/ingest/sog"]),
 ];
 

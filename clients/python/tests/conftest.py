@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import inspect
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,22 @@ def vector(name: str) -> Any:
 def frame(name: str) -> bytes:
     """A golden binary file."""
     return (PROTOCOL / "vectors" / name).read_bytes()
+
+
+@pytest.fixture(scope="session")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a reader of the documentation, with `wildcity` on the path and the demo twin built."""
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the built wildcity binary"
+    home = tmp_path_factory.mktemp("home")
+    environment = dict(os.environ)
+    environment["PATH"] = f"{Path(binary).parent}:{Path(sys.executable).parent}:{environment['PATH']}"
+    for name in ("DATA", "STATE", "CACHE"):
+        environment[f"XDG_{name}_HOME"] = str(home / name.lower())
+    demo = ["wildcity", "demo", "--steps", "1", "--out", str(home / "demo")]
+    done = subprocess.run(demo, cwd=home, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return environment
 
 
 @pytest.fixture(params=["sync", "aio"])

@@ -21,6 +21,8 @@ PAGES = [
     "docs/actors.md",
     "docs/agents.md",
     "docs/alpamayo.md",
+    "docs/alpasim.md",
+    "docs/gym.md",
     "docs/operators.md",
     "docs/pipelines.md",
     "docs/scenarios.md",
@@ -30,26 +32,12 @@ PAGES = [
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-@pytest.fixture(scope="module")
-def reader(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment of a reader with `wildcity` on the path and the demo twin built."""
-    binary = os.environ.get("WILDCITY_BIN")
-    assert binary, "set WILDCITY_BIN to the built wildcity binary"
-    home = tmp_path_factory.mktemp("home")
-    environment = dict(os.environ)
-    environment["PATH"] = f"{Path(binary).parent}:{Path(sys.executable).parent}:{environment['PATH']}"
-    for name in ("DATA", "STATE", "CACHE"):
-        environment[f"XDG_{name}_HOME"] = str(home / name.lower())
-    run(["wildcity", "demo", "--steps", "1", "--out", str(home / "demo")], home, environment)
-    return environment
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_does_what_it_says(page: str, reader: dict[str, str], tmp_path: Path) -> None:
     write_ply(tmp_path / "capture.ply", 0.0, 1)
     write_ply(tmp_path / "block7.ply", 0.0, 2)
     port = free_port()
-    text = (ROOT / page).read_text().replace("8080", str(port))
+    text = (ROOT / page).read_text().replace("8080", str(port)).replace("127.0.0.1:6000", "127.0.0.1:0")
     blocks = [block for block in BLOCK.findall(text) if block[0] in ("sh", "python")]
     assert blocks, f"{page} has nothing to run"
     servers: list[subprocess.Popen[str]] = []

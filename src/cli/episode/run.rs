@@ -26,7 +26,8 @@ use crate::cli::{output, progress};
 ///
 /// An agent that is a command is started by the shell, once for each episode. It finds in its environment
 /// WILDCITY_URL, WILDCITY_OPEN (the fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and
-/// WILDCITY_STEPS (after which it closes its session).
+/// WILDCITY_STEPS (after which it closes its session). It ends with exit code 0, or 124 if it ran out of time, 69 if what
+/// it needs went away.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Run {
@@ -34,7 +35,8 @@ pub(super) struct Run {
     #[arg(value_name = "SUITE")]
     suite: PathBuf,
 
-    /// What drives: log, stand or idm, or a command [default: that of the suite, or log]
+    /// What drives: log, stand or idm; egodriver:HOST:PORT, a driver of AlpaSim; or a command [default: that of the
+    /// suite, or log]
     #[arg(long, value_name = "AGENT")]
     agent: Option<String>,
 
@@ -82,6 +84,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity episode run scenes/suites/street/suite.json
   wildcity episode run suite.json --agent 'python drive.py' --jobs 4 --at-least 0.9
+  wildcity episode run suite.json --agent egodriver:127.0.0.1:7102
   wildcity episode run pedestrian.json --agent stand --verify
   wildcity episode run suite.json --agent log --bare        (each scenario tests itself)";
 
@@ -92,14 +95,11 @@ impl Run {
         if at_least.is_some_and(|rate| !(0.0..=1.0).contains(&rate)) {
             return Err(usage("--at-least is a rate from 0 to 1"));
         }
+        let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
+        let agent = choice(agent)?;
         let catalog = self.twins.catalog()?;
         let options = CaseOptions { latest: self.latest, bare: self.bare };
         let cases = cases(&suite, &scenarios, &catalog, options).map_err(usage)?;
-        let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
-        let agent = match BuiltIn::named(&agent) {
-            Some(agent) => AgentChoice::BuiltIn(agent),
-            None => AgentChoice::Command(agent),
-        };
         output::create_dir(&self.out).map_err(usage)?;
         let backend: Arc<dyn Backend> = Arc::from(self.backend.backend()?);
         let episodes = self.out.join("episodes");
@@ -197,6 +197,26 @@ impl Run {
         }
         Err(exit(ExitCode::NotVerified, format!("not repeated: {}", wrong.join("; "))))
     }
+}
+
+/// An agent by what the command line or the suite says.
+fn choice(agent: String) -> anyhow::Result<AgentChoice> {
+    if let Some(built_in) = BuiltIn::named(&agent) {
+        return Ok(AgentChoice::BuiltIn(built_in));
+    }
+    let line = match agent.strip_prefix("egodriver:") {
+        // This program is the bridge. The address is an argument of its own for the shell.
+        Some(address) => {
+            let is_address = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
+            if address.is_empty() || !address.chars().all(is_address) {
+                return Err(usage(format!("{agent:?} is no agent: expected egodriver:HOST:PORT")));
+            }
+            let program = std::env::current_exe().map_err(usage)?;
+            format!("'{}' drive --egodriver '{address}'", program.display())
+        }
+        None => agent.clone(),
+    };
+    Ok(AgentChoice::Command { name: agent, line })
 }
 
 fn exit(code: ExitCode, message: impl std::fmt::Display) -> anyhow::Error {

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use tracing_subscriber::EnvFilter;
 
+use wildcity_alpasim::sensorsim;
 use wildcity_server::{Origins, TlsFiles, Tokens};
 use wildcity_twin::ingest;
 use wildcity_twin::residency::default_memory_bytes;
@@ -76,6 +77,16 @@ pub(super) struct Serve {
     /// --tokens.
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
+
+    /// Address and port of a second listener, for AlpaSim: gRPC `sensorsim`, by which AlpaSim uses the twins
+    /// as scenes of its renderer. AlpaSim sends no tokens.
+    #[arg(long, value_name = "ADDR", value_parser = address)]
+    alpasim: Option<SocketAddr>,
+
+    /// Let --alpasim listen on an address that is not loopback: every machine that reaches it can read the
+    /// twins.
+    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
+    alpasim_open: bool,
 
     /// Memory that the Gaussians of all twins may take, in GiB, for example 2 or 0.5 [default: three
     /// quarters of the machine's]. A session is refused if its largest frame does not fit into memory
@@ -201,10 +212,23 @@ impl Serve {
             // Before the address is printed: the signal may come right after.
             let stop = wildcity_server::stop_signal()?;
             let running = wildcity_server::start(config).await?;
+            let alpasim = match self.alpasim {
+                Some(listen) => {
+                    let engine = running.engine().clone();
+                    Some(sensorsim::start(engine, listen, self.alpasim_open).await?)
+                }
+                None => None,
+            };
             writeln!(io::stdout(), "listening on {}", running.url())?;
+            if let Some(alpasim) = &alpasim {
+                writeln!(io::stdout(), "AlpaSim: listening on {}", alpasim.address())?;
+            }
             tracing::info!("viewer at {}", running.page());
             stop.await;
             tracing::info!("stopping");
+            if let Some(alpasim) = alpasim {
+                alpasim.stop().await;
+            }
             running.stop().await;
             Ok(())
         });

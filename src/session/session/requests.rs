@@ -4,13 +4,11 @@
 //! is dropped before that, nothing has happened, and the client can repeat it.
 
 use serde_json::Value;
-use tokio::sync::oneshot;
-use tokio::time::{Instant, timeout_at};
+use tokio::time::Instant;
 
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::{Command, Ground};
-use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
 use super::recording::traffic_lines;
@@ -25,6 +23,7 @@ use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
 use crate::options::{ResetOptions, Start, StepOptions};
+use crate::pin::pin;
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
@@ -270,7 +269,8 @@ impl Session {
                 traffic.placed(capture.time_us, detail)
             });
             // Load before the job is queued, so that no render thread waits for a disk.
-            let mut pinned = pin(version, deadline, viewpoints).await?;
+            let resident = version.resident.clone();
+            let mut pinned = pin(resident, profile, deadline, viewpoints).await?;
             pinned.place(placed.unwrap_or_default());
             builder.add_load(pinned.waited_for, pinned.waited);
             let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
@@ -297,29 +297,4 @@ fn check_notes(notes: Option<&Value>) -> Result<(), SessionError> {
         return Err(SessionError::OutOfRange { field: "notes", must });
     }
     Ok(())
-}
-
-/// Waits until all sections that a frame needs are in memory, and pins them.
-async fn pin(
-    version: &PinnedVersion,
-    deadline: Instant,
-    viewpoints: Vec<Viewpoint>,
-) -> Result<PinnedScene, SessionError> {
-    let (reply, answer) = oneshot::channel();
-    let resident = version.resident.clone();
-    let profile = version.profile;
-    let request = run_blocking(move || {
-        let done = Box::new(move |pinned| {
-            // Sending fails if the deadline has passed and the receiver is gone.
-            let _ = reply.send(pinned);
-        });
-        resident.request(&viewpoints, &profile, done)
-    });
-    // Dropping the request takes the frame out of the pager's queue.
-    let request = request.await??;
-    match timeout_at(deadline, answer).await {
-        Ok(Ok(pinned)) => Ok(pinned?),
-        Ok(Err(_)) => Err(SessionError::Crashed),
-        Err(_) => Err(request.timeout_error().into()),
-    }
 }

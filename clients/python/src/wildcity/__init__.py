@@ -53,6 +53,7 @@ from .protocol import (
     png_data_uri,
 )
 from .pushing import Push, PushProgress, push, recorded_drive, rollback
+from .serving import LocalServer, ServeFailed, serve
 from .sync import Client, Session, connect
 
 __version__ = _version("wildcity")
@@ -74,6 +75,7 @@ __all__ = [
     "ImageInfo",
     "ImagePart",
     "Lens",
+    "LocalServer",
     "Metadata",
     "Observation",
     "Opened",
@@ -88,6 +90,7 @@ __all__ = [
     "Refused",
     "Resumed",
     "Rig",
+    "ServeFailed",
     "Session",
     "Shutter",
     "SnapshotPoint",
@@ -109,4 +112,5 @@ __all__ = [
     "push",
     "recorded_drive",
     "rollback",
+    "serve",
 ]

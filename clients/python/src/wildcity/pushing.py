@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import http.client
-import json
 import os
 import time
 import urllib.parse
@@ -15,15 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from .errors import Code, ConnectFailed, ProtocolError, PushFailed, Refused
+from .errors import Code, ConnectFailed, PushFailed, Refused
+from .http_client import ATTEMPTS, RETRY_DELAY_S, HttpClient
 from .protocol import Drive, decode
 
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are read at a time."""
-ATTEMPTS = 6
-"""How many attempts in a row may fail without transferring a byte."""
-RETRY_DELAY_S = 0.2
-"""Delay before the first repetition of a failed attempt; it doubles with each further one."""
 POLL_INTERVAL_S = 0.1
 """How often the client asks for the state of a push."""
 
@@ -101,7 +95,7 @@ def push(
     server does not answer.
     """
     paths = [files] if isinstance(files, (str, os.PathLike)) else list(files)
-    http_client = _HttpClient(server, token, timeout)
+    http_client = HttpClient(server, token, timeout)
     report = progress or (lambda _: None)
     request: dict[str, Any] = {
         "id": push_id or uuid.uuid4().hex,
@@ -150,7 +144,7 @@ def rollback(
     Raises `Refused` if the server refuses, and `ConnectFailed` if it does not answer.
     """
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/rollback"
-    answer = _HttpClient(server, token, timeout).json("POST", path, {"version": version})
+    answer = HttpClient(server, token, timeout).json("POST", path, {"version": version})
     return int(answer["version"])
 
 
@@ -173,7 +167,7 @@ def recorded_drive(
     optional = {"version": version, "from_m": from_m, "to_m": to_m, "every_m": every_m}
     query = urllib.parse.urlencode({key: value for key, value in optional.items() if value is not None})
     twin, name = (urllib.parse.quote(text, safe="") for text in (twin, name))
-    answer = _HttpClient(server, token, timeout).json("GET", f"/v1/twins/{twin}/trajectories/{name}?{query}", None)
+    answer = HttpClient(server, token, timeout).json("GET", f"/v1/twins/{twin}/trajectories/{name}?{query}", None)
     drive: Drive = decode(Drive, answer, "drive")
     return drive
 
@@ -194,7 +188,7 @@ def _finished_push(answer: dict[str, Any]) -> Push:
     raise PushFailed(code, error["message"], cells, answer.get("report"))
 
 
-def _upload(http_client: _HttpClient, path: Path, report: Callable[[PushProgress], None]) -> str:
+def _upload(http_client: HttpClient, path: Path, report: Callable[[PushProgress], None]) -> str:
     """Uploads the bytes of a file that the server lacks, and returns the id of the upload."""
     digest = hashlib.sha256()
     size = 0
@@ -238,62 +232,3 @@ def _chunks(
         yield chunk
         offset += len(chunk)
         report(PushProgress("uploading", offset, size))
-
-
-class _HttpClient:
-    """Sends HTTP requests, each on a connection of its own."""
-
-    def __init__(self, server: str, token: str | None, timeout: float) -> None:
-        parts = urllib.parse.urlsplit(server)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError(f"{server!r} is not a server; expected http://HOST:PORT or https://HOST:PORT")
-        secure = parts.scheme == "https"
-        self._connection_type = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-        self._host = parts.hostname
-        self._port = parts.port
-        self._timeout = timeout
-        self._token = token or os.environ.get("WILDCITY_TOKEN")
-
-    def json_with_retries(self, method: str, path: str, body: Any) -> Any:
-        """As `json`, and repeats the request up to `ATTEMPTS` times if no answer comes."""
-        for failures in range(ATTEMPTS):
-            try:
-                return self.json(method, path, body)
-            except ConnectFailed:
-                time.sleep(RETRY_DELAY_S * 2**failures)
-        return self.json(method, path, body)
-
-    def json(
-        self,
-        method: str,
-        path: str,
-        body: dict[str, Any] | Iterator[bytes] | None,
-        headers: dict[str, str] | None = None,
-    ) -> Any:
-        """Sends JSON or bytes, and returns the JSON of the answer."""
-        sent = dict(headers or {})
-        if self._token:
-            sent["Authorization"] = f"Bearer {self._token}"
-        content = json.dumps(body, allow_nan=False).encode() if isinstance(body, dict) else body
-        connection = self._connection_type(self._host, self._port, timeout=self._timeout)
-        try:
-            connection.connect()
-            # A server that refuses may close before it has read the whole body. Its answer says why.
-            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-                connection.request(method, path, content, sent)
-            response = connection.getresponse()
-            status = response.status
-            text = response.read()
-        except (OSError, http.client.HTTPException) as error:
-            raise ConnectFailed(f"no answer from {self._host}:{self._port}: {error}") from error
-        finally:
-            connection.close()
-        try:
-            answer = json.loads(text)
-        except ValueError as error:
-            raise ProtocolError(f"the answer with HTTP status {status} is not JSON: {text[:200]!r}") from error
-        if 200 <= status < 300:
-            return answer
-        if not isinstance(answer, dict) or "code" not in answer:
-            raise ProtocolError(f"HTTP status {status} without an error code: {text[:200]!r}")
-        raise Refused(answer["code"], answer["message"], answer.get("field"), False)

@@ -1,0 +1,81 @@
+"""`wildcity/Drive-v0`: one episode after the other in one session."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sync import Client, Session, connect
+from .task import DriveConfig, DriveTask, Seen, drive_of
+
+
+class DriveEnv(gymnasium.Env[Any, Any]):
+    """Follow a recorded drive. The arguments are those of `DriveConfig`, and `render_mode`.
+
+    The session is opened by the first `reset`, whose options are `start`, a distance along the drive in metres (or a
+    `Station`), and `version`, the version of the twin to show from then on. `render` returns the images side by side.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, **arguments: Any) -> None:
+        self.config = DriveConfig(**arguments)
+        self.render_mode = render_mode
+        self.observation_space = self.config.observation_space()
+        self.action_space = self.config.action_space()
+        self._client: Client | None = None
+        self._session: Session | None = None
+        self._task: DriveTask | None = None
+        self._version: int | None = None
+        self._seen: Seen | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Seen, dict[str, Any]]:
+        """Starts an episode."""
+        super().reset(seed=seed)
+        session, task = self._opened()
+        version = (options or {}).get("version")
+        if version is not None and version != self._version:
+            self._version = session.switch_version(version).version
+        start = task.start(self.np_random, options)
+        first = session.reset(int(self.np_random.integers(1 << 32)), start)
+        self._seen, info = task.begin(first)
+        return self._seen, info
+
+    def step(self, action: Any) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        """Applies acceleration and curvature for one step."""
+        session, task = self._opened()
+        result = task.advance(session.step(task.movement(action)))
+        self._seen = result[0]
+        return result
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """uint8 [height, width * cameras, 3]: the images of the last observation."""
+        if self.render_mode is None or self._seen is None:
+            return None
+        images = [image for key, image in self._seen.items() if key.startswith("image_")]
+        return np.concatenate(images, axis=1)
+
+    def close(self) -> None:
+        """Ends session and connection."""
+        client = self._client
+        session = self._session
+        self._client = self._session = self._task = None
+        if client is not None:
+            # `Session.__exit__` closes the session if the connection still exists.
+            with client, session or contextlib.nullcontext():
+                pass
+
+    def _opened(self) -> tuple[Session, DriveTask]:
+        if self._session is None or self._task is None:
+            config = self.config
+            self._client = connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token)
+            self._session = self._client.open(**config.open_options(self._client.welcome))
+            self._version = self._session.opened.version
+            self._task = DriveTask(config, drive_of(self._session.opened))
+        return self._session, self._task

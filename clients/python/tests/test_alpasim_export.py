@@ -1,0 +1,112 @@
+"""`wildcity alpasim export`: the files are what AlpaSim's runtime reads (its `Artifact`, `Rig` and `TrafficObjects`)."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import zipfile
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml  # type: ignore[import-untyped]
+from test_end_to_end import write_corridor, write_log
+
+EPOCH_US = 1_700_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, bytes]]:
+    """The files of each scene, by its name."""
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the built wildcity binary"
+    folder = tmp_path_factory.mktemp("export")
+    write_corridor(folder / "corridor.ply")
+    write_log(folder / "log.json")
+    twins = ["--twins", str(folder / "twins")]
+    importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor", *twins]
+    subprocess.run([*importing, "--trajectory", str(folder / "log.json")], check=True, timeout=60)
+    exporting = [binary, "alpasim", "export", "corridor", "--out", str(folder / "scenes"), *twins]
+    done = subprocess.run([*exporting, "--every-m", "4", "--length-s", "1"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "physics=disabled" in done.stdout
+    found = {}
+    for path in sorted((folder / "scenes").iterdir()):
+        assert str(path) in done.stdout
+        with zipfile.ZipFile(path) as archive:
+            assert archive.testzip() is None
+            found[path.name] = {name: archive.read(name) for name in archive.namelist()}
+    return found
+
+
+def test_a_scene_every_four_metres(scenes: dict[str, dict[str, bytes]]) -> None:
+    # The drive is 10 m long.
+    assert list(scenes) == [f"corridor@1+log+{start}.usdz" for start in (0, 4, 8)]
+    for name, files in scenes.items():
+        assert set(files) == {"metadata.yaml", "rig_trajectories.json", "sequence_tracks.json", "map.xodr"}
+        metadata = yaml.safe_load(files["metadata.yaml"])
+        assert f"{metadata['scene_id']}.usdz" == name
+        required = {"version_string", "training_date", "dataset_hash", "uuid", "is_resumable", "logger"}
+        assert required <= set(metadata) and metadata["is_resumable"] is False
+        assert metadata["sensors"]["lidar_ids"] == [] and "camera_front" in metadata["sensors"]["camera_ids"]
+        assert metadata["time_range"]["start"] < metadata["time_range"]["end"]
+
+
+def test_rigs_are_in_the_local_frame_at_ten_hertz(scenes: dict[str, dict[str, bytes]]) -> None:
+    rig = json.loads(scenes["corridor@1+log+4.usdz"]["rig_trajectories.json"])
+    assert np.array_equal(rig["world_to_nre"]["matrix"], np.eye(4))
+    (drive,) = rig["rig_trajectories"]
+    times = drive["T_rig_world_timestamps_us"]
+    assert times == [EPOCH_US + 100_000 * k for k in range(11)]
+    poses = np.array(drive["T_rig_worlds"])
+    # 5 m/s along x from the origin, which is 4 m along the drive.
+    assert poses[:, :3, 3] == pytest.approx(np.array([[0.5 * k, 0, 0] for k in range(11)]), abs=1e-9)
+    assert np.array_equal(poses[0, :3, :3], np.eye(3)) and poses[:, 3].tolist() == [[0, 0, 0, 1]] * 11
+    names = {c["logical_sensor_name"] for c in rig["camera_calibrations"].values()}
+    assert {"camera_front", "camera_front_wide_120fov"} <= names
+    assert set(drive["cameras_frame_timestamps_us"]) == set(rig["camera_calibrations"])
+    for ranges in drive["cameras_frame_timestamps_us"].values():
+        assert [end for _, end in ranges] == times
+        assert all(isinstance(start, int) and start < end for start, end in ranges)
+    assert drive["rig_bbox"]["rot"] == [0, 0, 0] and min(drive["rig_bbox"]["dim"]) > 1
+
+
+def test_one_sequence_without_tracks(scenes: dict[str, dict[str, bytes]]) -> None:
+    for files in scenes.values():
+        (sequence,) = json.loads(files["sequence_tracks.json"]).values()
+        lists = [*sequence["tracks_data"].values(), *sequence["cuboidtracks_data"].values()]
+        assert len(lists) == 6 and all(values == [] for values in lists)
+
+
+def test_the_map_is_a_road_along_the_drive_and_beyond(scenes: dict[str, dict[str, bytes]]) -> None:
+    root = ElementTree.fromstring(scenes["corridor@1+log+0.usdz"]["map.xodr"])
+    assert root.tag == "OpenDRIVE" and root.find("header/geoReference") is None
+    (road,) = root.findall("road")
+    lines: list[Any] = road.findall("planView/geometry")
+    numbers = [{key: float(value) for key, value in line.attrib.items()} for line in lines]
+    end = 0.0
+    for line in numbers:
+        # Each line begins where the one before ends.
+        assert line["s"] == pytest.approx(end)
+        end += line["length"]
+    assert end == pytest.approx(float(road.attrib["length"])) and end > 120
+    last = numbers[-1]
+    assert last["x"] + math.cos(last["hdg"]) * last["length"] > 120
+    widths = [float(width.attrib["a"]) for width in road.iter("width")]
+    assert widths == [3.5, 3.5]
+    assert [lane.attrib["id"] for lane in road.iter("lane")] == ["1", "0", "-1"]
+
+
+def test_a_twin_without_a_drive_is_refused(tmp_path: Path) -> None:
+    binary = os.environ["WILDCITY_BIN"]
+    write_corridor(tmp_path / "corridor.ply")
+    twins = ["--twins", str(tmp_path / "twins")]
+    subprocess.run([binary, "import", str(tmp_path / "corridor.ply"), "--twin", "bare", *twins], check=True)
+    exporting = [binary, "alpasim", "export", "bare", "--out", str(tmp_path / "scenes"), *twins]
+    done = subprocess.run(exporting, capture_output=True, text=True)
+    assert done.returncode == 1 and "no recorded drive" in done.stderr
+    assert not (tmp_path / "scenes").exists()

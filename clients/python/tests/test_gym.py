@@ -1,0 +1,213 @@
+"""`wildcity/Drive-v0` and its vector environment on a real server, and `wildcity.serve`."""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import wildcity
+import wildcity.gym
+from gymnasium.utils.env_checker import check_env
+from test_end_to_end import PAIR, Server, server, write_corridor, write_log
+from wildcity import Drive, DrivePose, Pose, Refused, ServeFailed, Station, serving
+from wildcity.gym import DriveConfig, DriveEnv, DriveState, DriveVectorEnv, Route
+
+SMALL: dict[str, Any] = {"twin": "corridor", "rig": PAIR, "size": (32, 20), "horizon": 30, "speed": 5.0}
+STRAIGHT = np.zeros(2, np.float32)
+LEFT = np.array([0.0, 1.0], np.float32)
+
+
+@pytest.fixture
+def env(server: Server) -> Iterator[DriveEnv]:
+    made = DriveEnv(server=server.url, render_mode="rgb_array", **SMALL)
+    yield made
+    made.close()
+
+
+def test_the_environment_passes_gymnasiums_own_check(server: Server) -> None:
+    made = gymnasium.make("wildcity/Drive-v0", server=server.url, render_mode="rgb_array", **SMALL)
+    check_env(made.unwrapped)
+    made.close()
+
+
+def test_driving_straight_makes_progress(env: DriveEnv) -> None:
+    seen, info = env.reset(seed=1, options={"start": 1.0})
+    assert env.observation_space.contains(seen)
+    assert info["station_m"] == pytest.approx(1.0, abs=1e-6) and info["distance_m"] < 1e-6
+    # The route is 4 m, 8 m, ... ahead, and goes straight on beyond the end of the drive at 10 m.
+    assert seen["route"][:, 0] == pytest.approx(4.0 * np.arange(1, 21), abs=1e-4)
+    assert seen["route"][:, 1] == pytest.approx(0.0, abs=1e-6)
+    seen, reward, terminated, truncated, info = env.step(STRAIGHT)
+    assert reward == pytest.approx(0.5, abs=0.01) and not terminated and not truncated
+    assert seen["speed"][0] == pytest.approx(5.0, abs=0.05)
+    assert seen["image_front"].shape == (20, 32, 3) and seen["image_front"].max() > 50
+    picture = env.render()
+    assert picture is not None and picture.shape == (20, 32, 3)
+
+
+def test_an_episode_ends_off_the_route_at_its_end_and_at_the_horizon(server: Server) -> None:
+    def drive(action: np.ndarray[Any, Any], **changes: Any) -> tuple[bool, bool, int, float]:
+        env = DriveEnv(server=server.url, **{**SMALL, **changes})
+        env.reset(seed=1, options={"start": 0.0})
+        try:
+            for step in range(1, 100):
+                _, _, terminated, truncated, info = env.step(action)
+                if terminated or truncated:
+                    return terminated, truncated, step, info["distance_m"]
+            raise AssertionError("the episode does not end")
+        finally:
+            env.close()
+
+    terminated, truncated, _, distance_m = drive(LEFT, off_route_m=1.0)
+    assert (terminated, truncated) == (True, False) and distance_m > 1.0
+    # 9.5 m at 5 m/s.
+    terminated, truncated, steps, distance_m = drive(STRAIGHT)
+    assert (terminated, truncated) == (False, True) and steps in (19, 20) and distance_m < 1e-3
+    assert drive(STRAIGHT, horizon=3)[:3] == (False, True, 3)
+
+
+def test_a_reward_of_the_users_own(server: Server) -> None:
+    def speed(before: DriveState, after: DriveState) -> float:
+        return after.speed_m_s
+
+    env = DriveEnv(server=server.url, reward=speed, **SMALL)
+    env.reset(seed=1)
+    assert env.step(STRAIGHT)[1] == pytest.approx(5.0, abs=0.05)
+    env.close()
+
+
+def test_starts_follow_the_seed(env: DriveEnv) -> None:
+    starts = [env.reset(seed=seed)[1]["station_m"] for seed in (1, 1, 2)]
+    assert starts[0] == starts[1] != starts[2]
+    assert env.reset()[1]["station_m"] not in starts
+    assert env.reset(options={"start": Station("log", 2.0), "version": 1})[1]["station_m"] == pytest.approx(2.0)
+    with pytest.raises(ValueError, match="'station'.* unknown; known are start and version"):
+        env.reset(options={"station": 2.0})
+    with pytest.raises(Refused, match="unknown_version"):
+        env.reset(options={"version": 9})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"cameras": ()}, "cameras is empty"), ({"dynamics": "teleport"}, "teleport"), ({"horizon": 0}, "horizon is 0")],
+)
+def test_bad_arguments_are_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DriveConfig(**changes)
+
+
+def test_unknown_cameras_are_refused_by_the_server(server: Server) -> None:
+    env = DriveEnv(server=server.url, **{**SMALL, "cameras": ("left",)})
+    with pytest.raises(Refused, match="unknown_camera"):
+        env.reset()
+    env.close()
+
+
+def test_the_vector_environment_is_n_environments(server: Server) -> None:
+    """Observations, rewards, ends and restarts equal those of Gymnasium's own SyncVectorEnv, step by step."""
+    arguments = {**SMALL, "horizon": 4, "server": server.url}
+    ours = gymnasium.make_vec(
+        "wildcity/Drive-v0", num_envs=3, vectorization_mode="vector_entry_point", **arguments
+    )
+    theirs = gymnasium.vector.SyncVectorEnv([lambda: DriveEnv(**arguments)] * 3)
+    numbers = np.random.default_rng(7)
+    try:
+        expected = theirs.reset(seed=5)
+        compare(ours.reset(seed=5), expected)
+        assert ours.observation_space == theirs.observation_space
+        for _ in range(11):
+            actions = numbers.uniform(-1, 1, (3, 2)).astype(np.float32)
+            result = ours.step(actions)
+            compare(result, theirs.step(actions))
+            assert ours.observation_space.contains(result[0])
+        mask = np.array([True, False, False])
+        compare(
+            ours.reset(seed=9, options={"reset_mask": mask}), theirs.reset(seed=9, options={"reset_mask": mask})
+        )
+    finally:
+        ours.close()
+        theirs.close()
+
+
+def compare(ours: Any, theirs: Any) -> None:
+    if isinstance(theirs, dict):
+        assert set(ours) == set(theirs)
+        for key in theirs:
+            compare(ours[key], theirs[key])
+    elif isinstance(theirs, tuple):
+        for one, other in zip(ours, theirs, strict=True):
+            compare(one, other)
+    else:
+        assert np.array_equal(ours, theirs), (ours, theirs)
+
+
+def test_closing_ends_the_sessions(server: Server) -> None:
+    envs = DriveVectorEnv(2, server=server.url, **SMALL)
+    envs.reset(seed=1)
+    assert server.get("/v1/sessions")[1].count('"session"') >= 2
+    envs.close()
+    assert server.get("/v1/sessions")[1].count('"session"') == 0
+
+
+def test_a_route_that_crosses_itself_is_followed_by_its_stations() -> None:
+    # A figure of eight: two circles of radius 10 m that touch at the origin.
+    angle = np.linspace(0, 2 * np.pi, 200)
+    first = np.stack([10 * np.sin(angle), 10 - 10 * np.cos(angle)], axis=-1)
+    second = np.stack([10 * np.sin(angle), 10 * np.cos(angle) - 10], axis=-1)
+    xy = np.concatenate([first, second[1:]])
+    station_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+    poses = tuple(
+        DrivePose(station, time_us, Pose((x, y, 0.0)))
+        for time_us, (station, (x, y)) in enumerate(zip(station_m.tolist(), xy.tolist(), strict=True))
+    )
+    route = Route(Drive("eight", 1, "", float(station_m[-1]), poses))
+    at_crossing = Pose((0.1, 0.0, 0.0))
+    assert route.locate(at_crossing, 1.0)[0] == pytest.approx(0.1, abs=0.01)
+    middle = route.length_m / 2
+    assert route.locate(at_crossing, middle)[0] == pytest.approx(middle + 0.1, abs=0.01)
+    # 2 m outside of the first circle, at its far end.
+    station, distance = route.locate(Pose((0.0, 22.0, 0.0)), middle / 2)
+    assert (station, distance) == (pytest.approx(middle / 2, abs=0.2), pytest.approx(2.0, abs=0.01))
+
+
+def test_serve_starts_and_stops_the_program(tmp_path: Path) -> None:
+    write_corridor(tmp_path / "corridor.ply")
+    write_log(tmp_path / "log.json")
+    twins = tmp_path / "twins"
+    importing = [serving.binary(), "import", tmp_path / "corridor.ply", "--twin", "corridor"]
+    serving.subprocess.run([*importing, "--twins", twins, "--trajectory", tmp_path / "log.json"], check=True)
+    with wildcity.serve(twins, memory_gib=1) as running:
+        process = running.process
+        with wildcity.connect(running.url) as client:
+            assert [twin.name for twin in client.welcome.twins] == ["corridor"]
+            client.open("corridor", rig=PAIR).reset()
+        assert wildcity.recorded_drive("corridor", "log", server=running.http).length_m == pytest.approx(10.0)
+    assert process.returncode == 0
+
+
+def test_a_server_that_does_not_start_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ServeFailed, match=r"(?s)ended with 2.*--colour"), wildcity.serve(tmp_path, arguments=["--colour"]):
+        raise AssertionError("it started")
+    silent = tmp_path / "silent"
+    silent.write_text("#!/bin/sh\nexec sleep 60\n")
+    silent.chmod(silent.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("WILDCITY_BIN", str(silent))
+    began = time.monotonic()
+    with pytest.raises(ServeFailed, match="did not listen within 0.3 s"), wildcity.serve(timeout=0.3):
+        raise AssertionError("it started")
+    assert time.monotonic() - began < 10
+    monkeypatch.setenv("WILDCITY_BIN", str(tmp_path / "nowhere"))
+    with pytest.raises(ServeFailed, match="cannot run"), wildcity.serve():
+        raise AssertionError("it started")
+    monkeypatch.delenv("WILDCITY_BIN")
+    monkeypatch.setenv("PATH", os.devnull)
+    monkeypatch.setattr(serving.sysconfig, "get_path", lambda _: str(tmp_path))
+    with pytest.raises(ServeFailed, match="there is no program wildcity"), wildcity.serve():
+        raise AssertionError("it started")

@@ -1,0 +1,95 @@
+"""The package as it is published: its version, its metadata, and a wheel that carries the program."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+CLIENT = Path(__file__).resolve().parents[1]
+ROOT = CLIENT.parents[1]
+sys.path.insert(0, str(CLIENT))
+
+import build_wheel  # noqa: E402
+
+
+def field(file: Path, name: str) -> str:
+    """The first `name = "..."` of a TOML file; Python 3.10 has no TOML reader."""
+    found = re.search(rf'^{name} = "(.*)"$', file.read_text(), re.MULTILINE)
+    assert found, f"{file} has no {name}"
+    return found[1]
+
+
+def test_the_version_is_that_of_the_crate() -> None:
+    assert field(CLIENT / "pyproject.toml", "version") == field(ROOT / "Cargo.toml", "version")
+
+
+@pytest.mark.parametrize("version", ["3.10", "3.14"])
+def test_the_types_are_right_for_the_first_and_the_last_supported_python(version: str, tmp_path: Path) -> None:
+    assert f'"Programming Language :: Python :: {version}"' in (CLIENT / "pyproject.toml").read_text()
+    command = [sys.executable, "-m", "mypy", "--python-version", version, "--cache-dir", str(tmp_path)]
+    # Without the packages around it: numpy's own types may need a newer Python than the client does.
+    command += ["--no-site-packages", "--ignore-missing-imports", "--allow-subclassing-any", "--no-warn-return-any"]
+    done = subprocess.run([*command, "src"], cwd=CLIENT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_wheel_carries_the_program(tmp_path: Path) -> None:
+    """Built here, installed in an empty environment, which has the program and the client then."""
+    binary = os.environ.get("WILDCITY_BIN")
+    assert binary, "set WILDCITY_BIN to the built wildcity binary"
+    wheel = build_wheel.build(Path(binary), tmp_path / "dist")
+    assert re.fullmatch(r"wildcity-[\d.]+-py3-none-\w+\.whl", wheel.name)
+    with zipfile.ZipFile(wheel) as archive:
+        assert archive.testzip() is None
+        assert "wildcity/py.typed" in archive.namelist()
+    venv.create(tmp_path / "venv", with_pip=True)
+    bin_dir = tmp_path / "venv" / "bin"
+    run([bin_dir / "python", "-m", "pip", "install", "--quiet", wheel], tmp_path)
+    environment = {"PATH": f"{bin_dir}:/usr/bin:/bin", "HOME": str(tmp_path)}
+    run(["wildcity", "demo", "--steps", "5"], tmp_path, environment)
+    assert (tmp_path / "wildcity-demo" / "report.json").is_file()
+    program = """
+import wildcity
+with wildcity.serve() as server, wildcity.connect(server.url) as client:
+    assert server.process.args[0].startswith(%r), server.process.args
+    print(client.open("demo").reset().images["front"].shape)
+""" % str(bin_dir)
+    assert run(["python", "-c", program], tmp_path, environment) == "(928, 1440, 3)\n"
+
+
+def run(command: list[object], folder: Path, environment: dict[str, str] | None = None) -> str:
+    words = [str(word) for word in command]
+    path = environment["PATH"] if environment else None
+    done = subprocess.run(
+        ["env", f"PATH={path}", *words] if path else words,
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_a_program_of_another_version_is_refused(tmp_path: Path) -> None:
+    program = tmp_path / "wildcity"
+    program.write_text("#!/bin/sh\necho wildcity 9.9.9\n# GLIBC_2.17\0\n")
+    program.chmod(0o755)
+    with pytest.raises(ValueError, match="is wildcity 9.9.9, the client is"):
+        build_wheel.build(program, tmp_path / "dist")
+    assert not (tmp_path / "dist").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc is of Linux")
+def test_the_newest_glibc_symbol_gives_the_platform() -> None:
+    tag = build_wheel.platform_tag(b"x GLIBC_2.9\0GLIBC_2.35\0GLIBC_2.17\0")
+    assert tag.startswith("manylinux_2_35_")
+    with pytest.raises(ValueError, match="names no glibc"):
+        build_wheel.platform_tag(b"static")

@@ -1,0 +1,235 @@
+//! The files of a scene that AlpaSim's runtime reads itself: rig, cameras, tracks and map.
+//!
+//! The runtime reads them from a zip archive named `.usdz`. Poses are in the scene's local frame, so that
+//! `world_to_nre` is the identity. There is no mesh: the runtime's physics stays disabled.
+
+use std::fmt::Write as _;
+
+use glam::{DMat4, DVec2, DVec3};
+use serde_json::{Value, json};
+
+use wildcity_scene::Manifest;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::route::{Route, RouteError};
+
+use crate::camera::logical_id;
+use crate::limits;
+use crate::scene::{SceneError, SceneId};
+
+/// Name of the one sequence of a scene.
+const SEQUENCE: &str = "drive";
+
+/// Time between two poses, in microseconds.
+const PERIOD_US: i64 = 100_000;
+
+/// Width of a lane, in metres.
+const LANE_M: f64 = 3.5;
+
+/// Distance between two points of the map's road, in metres.
+const ROAD_STEP_M: f64 = 2.0;
+
+/// How far the road goes on after the end of the scene, in metres: a driver plans beyond it.
+const BEYOND_M: f64 = 120.0;
+
+/// Length, width and height of the ego's box, and the box's centre in the rig frame, in metres: a car with the
+/// wheelbase of the simulated one, 2.85 m.
+const BOX_M: [f64; 3] = [4.85, 1.9, 1.6];
+const BOX_CENTRE_M: [f64; 3] = [1.4, 0.0, 0.8];
+
+/// Why a scene was not exported.
+#[derive(Debug, thiserror::Error)]
+pub enum ExportError {
+    /// There is no such scene.
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    /// The drive is damaged.
+    #[error(transparent)]
+    Route(#[from] RouteError),
+    /// The scene would have fewer than two poses.
+    #[error("{scene} is shorter than {PERIOD_US} us: choose an earlier start")]
+    Short {
+        /// The scene.
+        scene: String,
+    },
+}
+
+/// The files of a scene, by name. `hash` is that of the version's manifest, and `cameras` are those that the
+/// scene offers.
+///
+/// # Errors
+/// The manifest has no such scene, or it is too short.
+pub fn files(
+    id: &SceneId,
+    manifest: &Manifest,
+    hash: &str,
+    cameras: &[RigCamera],
+    length_s: f64,
+) -> Result<Vec<(&'static str, String)>, ExportError> {
+    let drive = id.drive(manifest)?;
+    let frame = id.local_frame(manifest)?;
+    let route = Route::new(drive)?;
+    let start_us = route.at(id.start_m).time_us;
+    let last_us = drive.keyframes.last().map_or(start_us, |last| last.time_us);
+    let end_us = last_us.min(start_us.saturating_add((length_s * 1e6) as i64));
+    let mut poses = Vec::new();
+    let mut time_us = start_us;
+    while time_us <= end_us {
+        let world = route.pose_at(time_us)?;
+        let local = Pose { position_m: world.position_m - frame.origin_m, ..world };
+        poses.push((time_us - start_us, local));
+        time_us += PERIOD_US;
+    }
+    if poses.len() < 2 {
+        return Err(ExportError::Short { scene: id.to_string() });
+    }
+    Ok(vec![
+        ("metadata.yaml", pretty(&metadata(id, hash, cameras, &poses))),
+        ("rig_trajectories.json", pretty(&rig_trajectories(cameras, &poses))),
+        ("sequence_tracks.json", pretty(&sequence_tracks())),
+        ("map.xodr", road(&poses)),
+    ])
+}
+
+/// JSON, which is YAML as well.
+fn pretty(value: &Value) -> String {
+    // Numbers, texts and lists always have JSON.
+    serde_json::to_string_pretty(value).unwrap_or_default() + "\n"
+}
+
+fn metadata(id: &SceneId, hash: &str, cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
+    let seconds = |since_us: i64| 1e-6 * (limits::EPOCH_US as i64 + since_us) as f64;
+    let last_us = poses.last().map_or(0, |(since_us, _)| *since_us);
+    let camera_ids: Vec<String> = cameras.iter().map(|camera| logical_id(&camera.name)).collect();
+    json!({
+        "scene_id": id.to_string(),
+        "version_string": format!("wildcity {}", env!("CARGO_PKG_VERSION")),
+        "training_date": "1970-01-01",
+        "dataset_hash": hash,
+        "uuid": id.to_string(),
+        "is_resumable": false,
+        "sensors": { "camera_ids": camera_ids, "lidar_ids": [] },
+        "logger": {},
+        "time_range": { "start": seconds(0), "end": seconds(last_us) },
+    })
+}
+
+fn rig_trajectories(cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
+    let identity = rows(&Pose::IDENTITY);
+    let times: Vec<i64> =
+        poses.iter().map(|(since_us, _)| limits::EPOCH_US as i64 + since_us).collect();
+    let unique_id = |camera: &RigCamera| format!("{}@{SEQUENCE}", logical_id(&camera.name));
+    let calibrations: serde_json::Map<_, _> = cameras
+        .iter()
+        .map(|camera| {
+            let name = json!({ "logical_sensor_name": logical_id(&camera.name) });
+            (unique_id(camera), name)
+        })
+        .collect();
+    let frames: serde_json::Map<_, _> = cameras
+        .iter()
+        .map(|camera| {
+            // The runtime wants an end after the start, for global shutters too.
+            let open_us = camera.shutter.map_or(1, |shutter| shutter.duration_us);
+            let ranges: Vec<[i64; 2]> = times.iter().map(|&end| [end - open_us, end]).collect();
+            (unique_id(camera), json!(ranges))
+        })
+        .collect();
+    json!({
+        "T_world_base": identity,
+        "world_to_nre": { "matrix": identity },
+        "camera_calibrations": calibrations,
+        "rig_trajectories": [{
+            "sequence_id": SEQUENCE,
+            "T_rig_world_timestamps_us": times,
+            "T_rig_worlds": poses.iter().map(|(_, pose)| rows(pose)).collect::<Vec<_>>(),
+            "cameras_frame_timestamps_us": frames,
+            "rig_bbox": { "centroid": BOX_CENTRE_M, "dim": BOX_M, "rot": [0.0, 0.0, 0.0] },
+        }],
+    })
+}
+
+/// One sequence without tracks: twins have no other traffic yet.
+fn sequence_tracks() -> Value {
+    json!({ SEQUENCE: {
+        "tracks_data": {
+            "tracks_id": [], "tracks_label_class": [], "tracks_flags": [],
+            "tracks_timestamps_us": [], "tracks_poses": [],
+        },
+        "cuboidtracks_data": { "cuboids_dims": [] },
+    } })
+}
+
+/// A transform as a 4x4 matrix, row by row.
+fn rows(pose: &Pose) -> [[f64; 4]; 4] {
+    DMat4::from_rotation_translation(pose.rotation, pose.position_m).transpose().to_cols_array_2d()
+}
+
+/// One OpenDRIVE road along the poses: straight lines with an elevation, the ego's lane and one beside it. It has no
+/// `geoReference`, so that its coordinates are those of the local frame.
+fn road(poses: &[(i64, Pose)]) -> String {
+    let mut points: Vec<DVec3> = Vec::new();
+    for (_, pose) in poses {
+        let far =
+            |last: &DVec3| last.truncate().distance(pose.position_m.truncate()) >= ROAD_STEP_M;
+        if points.last().is_none_or(far) {
+            points.push(pose.position_m);
+        }
+    }
+    let last = poses.last().map_or(Pose::IDENTITY, |(_, pose)| *pose);
+    let ahead = (last.rotation * DVec3::X).with_z(0.0).normalize_or(DVec3::X);
+    let from = points.last().copied().unwrap_or(last.position_m);
+    points.push(from + BEYOND_M * ahead);
+
+    let mut lines = String::new();
+    let mut elevations = String::new();
+    let mut s_m = 0.0;
+    for pair in points.windows(2) {
+        let along: DVec2 = (pair[1] - pair[0]).truncate();
+        let length_m = along.length();
+        let heading = along.y.atan2(along.x);
+        let [x, y, z] = pair[0].to_array();
+        let slope = (pair[1].z - z) / length_m;
+        // Writing to a text cannot fail.
+        let _ = writeln!(
+            lines,
+            "      <geometry s=\"{s_m}\" x=\"{x}\" y=\"{y}\" hdg=\"{heading}\" length=\"{length_m}\"><line/></geometry>"
+        );
+        let _ = writeln!(
+            elevations,
+            "      <elevation s=\"{s_m}\" a=\"{z}\" b=\"{slope}\" c=\"0\" d=\"0\"/>"
+        );
+        s_m += length_m;
+    }
+    let lane = |id: i32| {
+        format!(
+            "<lane id=\"{id}\" type=\"driving\" level=\"false\"><width sOffset=\"0\" a=\"{LANE_M}\" b=\"0\" c=\"0\" d=\"0\"/></lane>"
+        )
+    };
+    // The reference line is shifted by half a lane, so that the drive runs in the middle of lane -1.
+    format!(
+        r#"<?xml version="1.0" encoding="UTF-8"?>
+<OpenDRIVE>
+  <header revMajor="1" revMinor="6" name="wildcity"/>
+  <road name="drive" length="{s_m}" id="1" junction="-1">
+    <type s="0" type="town"/>
+    <planView>
+{lines}    </planView>
+    <elevationProfile>
+{elevations}    </elevationProfile>
+    <lanes>
+      <laneOffset s="0" a="{half}" b="0" c="0" d="0"/>
+      <laneSection s="0">
+        <left>{left}</left>
+        <center><lane id="0" type="none" level="false"/></center>
+        <right>{right}</right>
+      </laneSection>
+    </lanes>
+  </road>
+</OpenDRIVE>
+"#,
+        half = LANE_M / 2.0,
+        left = lane(1),
+        right = lane(-1),
+    )
+}

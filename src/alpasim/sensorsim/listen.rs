@@ -1,0 +1,193 @@
+//! Accepts connections, and calls a method by its path.
+
+use std::convert::Infallible;
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use hyper::server::conn::http2;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use tokio::net::TcpListener;
+use tokio::sync::{Semaphore, watch};
+use tokio::task::JoinHandle;
+
+use wildcity_session::Engine;
+
+use super::methods::{Sensorsim, stopped};
+use crate::grpc::{unary, unimplemented};
+use crate::limits;
+use crate::wire::common::Empty;
+
+/// Path of the service's methods.
+const SERVICE: &str = "/nre.grpc.protos.sensorsim.SensorsimService/";
+
+/// Why the service did not start.
+#[derive(Debug, thiserror::Error)]
+pub enum AlpasimError {
+    /// The address is not a loopback address.
+    #[error(
+        "{address} is not a loopback address, and AlpaSim sends no tokens: any machine of the network could \
+         read the twins; give --alpasim-open if that is intended"
+    )]
+    PublicAddress {
+        /// The refused address.
+        address: SocketAddr,
+    },
+    /// The address cannot be used.
+    #[error("cannot listen on {address}: {cause}")]
+    Listen {
+        /// The address.
+        address: SocketAddr,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+}
+
+/// A service that listens. Dropping it stops it.
+#[derive(Debug)]
+pub struct Running {
+    address: SocketAddr,
+    stop: watch::Sender<bool>,
+    listening: JoinHandle<()>,
+    /// One permit per connection.
+    permits: Arc<Semaphore>,
+}
+
+/// Starts the service within the running tokio runtime, and returns once it listens.
+///
+/// # Errors
+/// The address cannot be used, or is not a loopback address and `open` is false.
+pub async fn start(
+    engine: Arc<Engine>,
+    listen: SocketAddr,
+    open: bool,
+) -> Result<Running, AlpasimError> {
+    if !open && !listen.ip().is_loopback() {
+        return Err(AlpasimError::PublicAddress { address: listen });
+    }
+    let failed = |cause| AlpasimError::Listen { address: listen, cause };
+    let listener = TcpListener::bind(listen).await.map_err(failed)?;
+    let address = listener.local_addr().map_err(failed)?;
+    let (stop, stopping) = watch::channel(false);
+    let sensorsim = Arc::new(Sensorsim::new(engine, stopping.clone()));
+    let permits = Arc::new(Semaphore::new(limits::CONNECTIONS));
+    let free = permits.clone();
+    let listening = tokio::spawn(async move {
+        tokio::select! {
+            () = accept(sensorsim.clone(), listener, free, stopping.clone()) => {}
+            () = sensorsim.forget_idle() => {}
+            () = stopped(stopping.clone()) => {}
+        }
+    });
+    Ok(Running { address, stop, listening, permits })
+}
+
+impl Running {
+    /// The address that the service listens on.
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Stops accepting connections. Running requests are answered with `UNAVAILABLE`.
+    pub async fn stop(self) {
+        // An error means that no task waits for the signal any more.
+        let _ = self.stop.send(true);
+        if let Err(error) = self.listening.await {
+            tracing::error!("the AlpaSim listener crashed: {error}");
+        }
+        // All permits are free when all connections have ended, and so have sent their answers.
+        let all = self.permits.acquire_many(limits::CONNECTIONS as u32);
+        if tokio::time::timeout(limits::DRAIN, all).await.is_err() {
+            tracing::warn!("some AlpaSim clients did not leave within {:?}", limits::DRAIN);
+        }
+    }
+}
+
+async fn accept(
+    sensorsim: Arc<Sensorsim>,
+    listener: TcpListener,
+    permits: Arc<Semaphore>,
+    stopping: watch::Receiver<bool>,
+) {
+    // The semaphore is never closed.
+    while let Ok(permit) = permits.clone().acquire_owned().await {
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                // Most likely there are no file descriptors left; some will be closed.
+                tracing::warn!("cannot accept a connection: {error}");
+                tokio::time::sleep(Duration::from_millis(100)).await;
+                continue;
+            }
+        };
+        if let Err(error) = stream.set_nodelay(true) {
+            tracing::warn!("cannot set socket options: {error}");
+        }
+        let sensorsim = sensorsim.clone();
+        let stopping = stopping.clone();
+        tokio::spawn(async move {
+            let service = service_fn(move |request| {
+                let sensorsim = sensorsim.clone();
+                async move { Ok::<_, Infallible>(call(sensorsim, request).await) }
+            });
+            let connection = http2::Builder::new(TokioExecutor::new())
+                .timer(TokioTimer::new())
+                // Images of a request have megabytes; the default window of 64 KiB would stop at each part.
+                .initial_stream_window_size(8 << 20)
+                .initial_connection_window_size(16 << 20)
+                .max_concurrent_streams(64)
+                .serve_connection(TokioIo::new(stream), service);
+            tokio::pin!(connection);
+            tokio::select! {
+                // Errors are caused by the client, which disconnected or sent no HTTP/2, and are not logged.
+                _ = &mut connection => {}
+                () = stopped(stopping) => {
+                    // Running requests see the same signal, and are answered.
+                    connection.as_mut().graceful_shutdown();
+                    let _ = tokio::time::timeout(limits::DRAIN, connection).await;
+                }
+            }
+            drop(permit);
+        });
+    }
+}
+
+/// Calls the method that the path names.
+async fn call(
+    sensorsim: Arc<Sensorsim>,
+    request: http::Request<hyper::body::Incoming>,
+) -> http::Response<tonic::body::Body> {
+    let path = request.uri().path().to_owned();
+    match path.strip_prefix(SERVICE) {
+        Some("get_version") => unary(request, |_: Empty| async { sensorsim.get_version() }).await,
+        Some("get_available_scenes") => {
+            unary(request, |_: Empty| async { sensorsim.get_available_scenes().await }).await
+        }
+        Some("get_loaded_scenes") => {
+            unary(request, |_: Empty| async { sensorsim.get_loaded_scenes().await }).await
+        }
+        Some("get_available_cameras") => {
+            unary(request, |asked| async { sensorsim.get_available_cameras(asked).await }).await
+        }
+        Some("get_available_trajectories") => {
+            unary(request, |asked| async { sensorsim.get_available_trajectories(asked).await })
+                .await
+        }
+        Some("get_available_ego_masks") => {
+            unary(request, |_: Empty| async { sensorsim.get_available_ego_masks().await }).await
+        }
+        Some("render_rgb") => {
+            unary(request, |asked| async { sensorsim.render_rgb(asked).await }).await
+        }
+        Some("batch_render_rgb") => {
+            unary(request, |asked| async { sensorsim.batch_render_rgb(asked).await }).await
+        }
+        Some("render_aggregated") => {
+            unary(request, |asked| async { sensorsim.render_aggregated(asked).await }).await
+        }
+        Some("render_lidar") => unary(request, |_: Empty| async { sensorsim.render_lidar() }).await,
+        _ => unimplemented(&path),
+    }
+}

@@ -1,0 +1,18 @@
+//! wildcity as AlpaSim's renderer: the service `nre.grpc.protos.sensorsim.SensorsimService`.
+//!
+//! ```text
+//! listen    accepts connections, and calls a method by its path
+//! methods   the ten methods
+//! render    requests for images
+//! open      twins with reserved memory
+//! status    the gRPC status of each error
+//! ```
+
+mod listen;
+mod methods;
+mod open;
+mod render;
+mod status;
+
+pub use listen::{AlpasimError, Running, start};
+pub use render::offered_cameras;

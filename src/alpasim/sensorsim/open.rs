@@ -1,0 +1,87 @@
+//! Twins with reserved memory.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::sync::Mutex;
+
+use wildcity_render::View;
+use wildcity_session::{Engine, Stills};
+use wildcity_twin::residency::Resident;
+
+use super::status::SensorsimError;
+use crate::limits;
+
+/// A version of a twin, and the memory for its worst frame.
+struct OpenVersion {
+    stills: Arc<Stills>,
+    /// The scenes that were drawn, and when last.
+    scenes: BTreeMap<String, Instant>,
+}
+
+/// The versions that were drawn in the last [`limits::SCENE_IDLE`].
+#[derive(Default)]
+pub(super) struct OpenVersions(Mutex<BTreeMap<(String, u64), OpenVersion>>);
+
+impl OpenVersions {
+    /// What renders a version, with enough memory for these views.
+    ///
+    /// # Errors
+    /// Too many versions are open, or too little memory is left.
+    pub(super) async fn stills(
+        &self,
+        engine: &Arc<Engine>,
+        resident: Arc<Resident>,
+        scene: &str,
+        views: &[View],
+    ) -> Result<Arc<Stills>, SensorsimError> {
+        let version = &resident.version;
+        let key = (version.manifest.twin.clone(), version.number);
+        // Held while memory is reserved, so that simultaneous requests reserve it once.
+        let mut open = self.0.lock().await;
+        if !open.contains_key(&key) && open.len() >= limits::OPEN_SCENES {
+            let oldest = open.iter().min_by_key(|(_, version)| version.last_drawn());
+            let oldest = oldest.map(|(key, _)| key.clone());
+            oldest.and_then(|key| open.remove(&key));
+        }
+        let known = open.remove(&key);
+        let enough = match &known {
+            Some(version) => version.stills.covers(views).await?,
+            None => false,
+        };
+        let mut scenes = known.as_ref().map(|version| version.scenes.clone()).unwrap_or_default();
+        scenes.insert(scene.to_owned(), Instant::now());
+        let stills = match known {
+            Some(version) if enough => version.stills,
+            // The smaller reservation is dropped first, so that its memory counts as free.
+            other => {
+                drop(other);
+                Arc::new(Stills::open(engine.clone(), resident, views).await?)
+            }
+        };
+        open.insert(key, OpenVersion { stills: stills.clone(), scenes });
+        Ok(stills)
+    }
+
+    /// The scenes that were drawn in the last [`limits::SCENE_IDLE`].
+    pub(super) async fn recent(&self) -> Vec<String> {
+        let open = self.0.lock().await;
+        open.values().flat_map(|version| version.scenes.keys().cloned()).collect()
+    }
+
+    /// Forgets scenes that were not drawn for [`limits::SCENE_IDLE`], and frees the memory of their versions.
+    pub(super) async fn forget_idle(&self) {
+        let mut open = self.0.lock().await;
+        open.retain(|_, version| {
+            version.scenes.retain(|_, drawn| drawn.elapsed() < limits::SCENE_IDLE);
+            !version.scenes.is_empty()
+        });
+    }
+}
+
+impl OpenVersion {
+    fn last_drawn(&self) -> Option<Instant> {
+        self.scenes.values().max().copied()
+    }
+}

@@ -1,0 +1,100 @@
+//! `wildcity alpasim export`.
+
+use std::io::{self, Cursor, Write};
+use std::path::PathBuf;
+
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipWriter};
+
+use crate::cli::directories::Twins;
+use crate::cli::output;
+use wildcity_alpasim::export::files;
+use wildcity_alpasim::scene::SceneId;
+use wildcity_alpasim::sensorsim::offered_cameras;
+
+/// Write scenes of a twin as the files that AlpaSim's runtime reads: rig, cameras, tracks and map.
+///
+/// Writes one file per scene, TWIN@VERSION+TRAJECTORY+START_M.usdz, and prints what AlpaSim's configuration needs.
+/// The images come from `wildcity serve --alpasim`.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Example:
+  wildcity alpasim export demo --out scenes --every-m 200")]
+pub(super) struct Export {
+    /// The twin's name.
+    #[arg(value_name = "TWIN")]
+    twin: String,
+
+    /// Directory for the scenes; created if it is missing.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+
+    /// Distance between the starts of two scenes along a drive, in metres.
+    #[arg(long, value_name = "M", default_value_t = 200.0, value_parser = positive)]
+    every_m: f64,
+
+    /// Length of a scene, in seconds of the recorded drive; the last one of a drive may be shorter.
+    #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = positive)]
+    length_s: f64,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+impl Export {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let version = self.twins.catalog()?.version(&self.twin, None)?;
+        let manifest = &version.manifest;
+        anyhow::ensure!(
+            !manifest.trajectories.is_empty(),
+            "twin {:?} has no recorded drive: import one with --trajectory",
+            self.twin
+        );
+        output::create_dir(&self.out)?;
+        let cameras = offered_cameras(manifest);
+        let mut out = io::stdout().lock();
+        for drive in &manifest.trajectories {
+            let starts = (drive.length_m() / self.every_m).floor() as u32;
+            for start in 0..=starts {
+                let id = SceneId {
+                    twin: self.twin.clone(),
+                    version: version.number,
+                    trajectory: drive.name.clone(),
+                    start_m: f64::from(start) * self.every_m,
+                };
+                let scene = match files(&id, manifest, &version.hash, &cameras, self.length_s) {
+                    // A drive may end less than two poses after the last start.
+                    Err(_) if start > 0 && start == starts => continue,
+                    other => other?,
+                };
+                let path = self.out.join(format!("{id}.usdz"));
+                output::write(&path, &archive(&scene)?)?;
+                writeln!(out, "{}", path.display())?;
+            }
+        }
+        writeln!(
+            out,
+            "AlpaSim: physics=disabled ego_mask_rig_config_id=null \
+             wizard.external_services.renderer=[HOST:6000]"
+        )?;
+        Ok(())
+    }
+}
+
+/// A zip archive without compression, as USDZ is.
+fn archive(files: &[(&str, String)]) -> anyhow::Result<Vec<u8>> {
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    let stored = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    for (name, content) in files {
+        archive.start_file(*name, stored)?;
+        archive.write_all(content.as_bytes())?;
+    }
+    Ok(archive.finish()?.into_inner())
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if number > 0.0 && number.is_finite() => Ok(number),
+        _ => Err("expected a positive number".to_owned()),
+    }
+}

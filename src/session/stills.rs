@@ -1,0 +1,148 @@
+//! Images of a version from any views, without an episode: for programs that simulate elsewhere and only
+//! render here.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use glam::DVec3;
+use tokio::time::Instant;
+
+use wildcity_render::{Frame, MAX_VIEWS, Target, View};
+use wildcity_scene::RenderProfile;
+use wildcity_scene::appearance::Appearance;
+use wildcity_twin::residency::{Reservation, Resident, RigExtent};
+
+use crate::blocking::run_blocking;
+use crate::engine::Engine;
+use crate::engine::render_queue::FrameCost;
+use crate::error::SessionError;
+use crate::observe::encode::{Encoding, encode};
+use crate::pin::pin;
+use crate::viewpoint::viewpoints;
+
+/// One image to render.
+#[derive(Clone, Debug)]
+pub struct Still {
+    /// Camera and pose.
+    pub view: View,
+    /// Exposure and overlay.
+    pub appearance: Appearance,
+    /// How the image is encoded.
+    pub encoding: Encoding,
+}
+
+/// A version that images are rendered of, and the memory for its worst frame.
+#[derive(Debug)]
+pub struct Stills {
+    engine: Arc<Engine>,
+    reservation: Reservation,
+    profile: RenderProfile,
+    /// Its frames share one turn, as those of a session do.
+    number: u64,
+}
+
+impl Stills {
+    /// Reserves the memory for the worst frame of views as these, wherever in the twin they are.
+    ///
+    /// # Errors
+    /// The version's sky cannot be baked, or too little memory is left.
+    pub async fn open(
+        engine: Arc<Engine>,
+        resident: Arc<Resident>,
+        views: &[View],
+    ) -> Result<Self, SessionError> {
+        let profile = resident.version.manifest.profile;
+        Engine::bake_sky(resident.clone(), profile).await?;
+        let reservation = Engine::reserve(resident, extent(views), profile).await?;
+        let number = engine.new_session_number();
+        Ok(Self { engine, reservation, profile, number })
+    }
+
+    /// Whether the reserved memory is enough for these views.
+    pub async fn covers(&self, views: &[View]) -> Result<bool, SessionError> {
+        let resident = self.reservation.resident().clone();
+        let needed = Engine::worst_case_bytes(resident, extent(views), self.profile).await?;
+        Ok(needed <= self.reservation.bytes())
+    }
+
+    /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than [`MAX_VIEWS`] are
+    /// rendered in several frames, each in its turn among the frames of all sessions.
+    ///
+    /// # Errors
+    /// Names what was not ready within `patience`, or what the backend refuses.
+    pub async fn render(
+        &self,
+        stills: Vec<Still>,
+        patience: Duration,
+    ) -> Result<Vec<Vec<u8>>, SessionError> {
+        let deadline = Instant::now() + patience;
+        let mut images = Vec::with_capacity(stills.len());
+        for part in stills.chunks(MAX_VIEWS) {
+            images.append(&mut self.render_frame(part.to_vec(), deadline).await?);
+        }
+        Ok(images)
+    }
+
+    async fn render_frame(
+        &self,
+        stills: Vec<Still>,
+        deadline: Instant,
+    ) -> Result<Vec<Vec<u8>>, SessionError> {
+        let views: Vec<View> = stills.iter().map(|still| still.view).collect();
+        let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
+        // The pixels, and a copy that is encoded.
+        let _share = self.engine.answer_budget().reserve(6 * pixels)?;
+
+        // Load before the job is queued, so that no render thread waits for a disk.
+        let resident = self.reservation.resident().clone();
+        let scene = pin(resident, self.profile, deadline, viewpoints(&views)).await?;
+        let profile = self.profile;
+        let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
+            let zeroed = |view: &View| vec![0; 3 * view.camera.pixels()];
+            let mut images: Vec<Vec<u8>> = views.iter().map(zeroed).collect();
+            let mut targets: Vec<Target<'_>> = images
+                .iter_mut()
+                .zip(&stills)
+                .map(|(rgb8, still)| Target {
+                    rgb8: Some(rgb8),
+                    appearance: Some(&still.appearance),
+                    ..Target::default()
+                })
+                .collect();
+            let frame = Frame { scene: &scene, profile: &profile, views: &views };
+            let rendered = backend.render(&frame, &mut targets, &|_, _| {});
+            rendered.map(|_| (images, stills))
+        };
+        let cost = FrameCost { session: self.number, pixels };
+        let (rendered, _queued) = self.engine.run(cost, deadline, work).await?;
+        let (images, stills) = rendered?;
+        run_blocking(move || {
+            let both = images.into_iter().zip(&stills).enumerate();
+            both.map(|(index, (rgb8, still))| encoded(index, rgb8, still)).collect()
+        })
+        .await?
+    }
+}
+
+fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, SessionError> {
+    if still.encoding == Encoding::Raw {
+        return Ok(rgb8);
+    }
+    let camera = &still.view.camera;
+    let image = encode(&rgb8, camera.width_px, camera.height_px, still.encoding);
+    let image = image.map_err(|reason| SessionError::Encode { camera: index.to_string(), reason });
+    image.map(|image| image.file)
+}
+
+/// The focal length of the finest view, and how far the views are from their middle.
+fn extent(views: &[View]) -> RigExtent {
+    let viewpoints = viewpoints(views);
+    let count = viewpoints.len().max(1) as f64;
+    let middle_m = viewpoints.iter().map(|one| one.position_m).sum::<DVec3>() / count;
+    RigExtent {
+        focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
+        radius_m: viewpoints
+            .iter()
+            .fold(0.0, |most, one| one.position_m.distance(middle_m).max(most)),
+    }
+}
