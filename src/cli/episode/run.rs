@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    AgentChoice, BuiltIn, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit, page,
-    pictures,
+    AgentChoice, BuiltIn, CaseOptions, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit,
+    page, pictures,
 };
 use wildcity_twin::store::Catalog;
 
@@ -69,6 +69,10 @@ pub(super) struct Run {
     #[arg(long)]
     latest: bool,
 
+    /// Leave out all actors: on the bare twin the agent log must pass.
+    #[arg(long)]
+    bare: bool,
+
     #[command(flatten)]
     twins: Twins,
 
@@ -81,7 +85,8 @@ Examples:
   wildcity episode run scenes/suites/street/suite.json
   wildcity episode run suite.json --agent 'python drive.py' --jobs 4 --at-least 0.9
   wildcity episode run suite.json --agent egodriver:127.0.0.1:7102
-  wildcity episode run pedestrian.json --agent stand --verify";
+  wildcity episode run pedestrian.json --agent stand --verify
+  wildcity episode run suite.json --agent log --bare        (each scenario tests itself)";
 
 impl Run {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -93,7 +98,8 @@ impl Run {
         let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
         let agent = choice(agent)?;
         let catalog = self.twins.catalog()?;
-        let cases = cases(&suite, &scenarios, &catalog, self.latest).map_err(usage)?;
+        let options = CaseOptions { latest: self.latest, bare: self.bare };
+        let cases = cases(&suite, &scenarios, &catalog, options).map_err(usage)?;
         output::create_dir(&self.out).map_err(usage)?;
         let backend: Arc<dyn Backend> = Arc::from(self.backend.backend()?);
         let episodes = self.out.join("episodes");
@@ -111,6 +117,7 @@ impl Run {
             catalog: catalog.clone(),
             twins: self.twins.dir()?,
             cache: self.twins.cache(),
+            scenarios: self.suite.parent().unwrap_or(Path::new(".")).to_owned(),
             backend: backend.clone(),
             episodes: episodes.clone(),
             progress: Box::new(move |_| counted.inc(1)),
