@@ -55,3 +55,26 @@ async fn events_are_counted() {
     assert!(number("wildcity_residency_limit_bytes") > 1e6);
     assert!(scrape(&idle).await.lines().any(|line| line == "wildcity_steps_total 0"));
 }
+
+/// The panels of the dashboard show what the server has.
+#[tokio::test]
+async fn the_dashboard_names_existing_metrics() {
+    let server = TestServer::start().await;
+    get(&server, "/v1/uploads/nothing").await.refused(404, "unknown_upload");
+    let text = scrape(&server).await;
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/grafana.json");
+    let dashboard = std::fs::read_to_string(path).unwrap();
+    let mut names: Vec<&str> = dashboard
+        .split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'))
+        .filter(|word| word.starts_with("wildcity_"))
+        .collect();
+    names.sort_unstable();
+    names.dedup();
+    assert!(names.len() > 15, "{names:?}");
+    for name in names {
+        let is_there = text
+            .lines()
+            .any(|line| line.strip_prefix(name).is_some_and(|rest| rest.starts_with([' ', '{'])));
+        assert!(is_there, "the server has no metric {name}");
+    }
+}

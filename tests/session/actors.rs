@@ -15,8 +15,8 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
 use wildcity_session::{
-    Encoding, Engine, Observation, Outputs, RigChoice, ScenarioError, ScenarioOptions,
-    ScenarioSource, Session, SessionError, SessionOptions, Start, StepOptions,
+    DType, Encoding, Engine, Observation, Outputs, RigChoice, ScenarioError, ScenarioOptions,
+    ScenarioSource, Session, SessionError, SessionOptions, Start, StepOptions, TensorKind,
 };
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
@@ -31,28 +31,30 @@ const EGO_M: f64 = 100.0;
 /// Longest exposure of the rig with rolling shutters, in microseconds.
 const EXPOSURE_US: i64 = 60_000;
 
-/// A coloured box of 400 Gaussians, 4 m long, in the store of the demo street.
+/// A coloured box of 400 Gaussians, 4 m long.
+fn car_asset() -> ActorAsset {
+    let mut gaussians = Gaussians::with_capacity(0, 400);
+    for i in 0..400 {
+        let at = |k: usize| (i * k % 397) as f64 / 397.0;
+        gaussians.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.ln_scales.push([0.15_f32.ln(); 3]);
+        gaussians.logit_opacities.push(4.0);
+        gaussians.sh.extend([1.5, -1.2 + (i % 5) as f32 * 0.3, -1.5]);
+    }
+    let description = AssetDescription {
+        name: "red-box".to_owned(),
+        class: ActorClass::Vehicle,
+        box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
+        provenance: Provenance::of("test".to_owned()),
+    };
+    ActorAsset::new(&gaussians, description).unwrap()
+}
+
+/// The car in the store of the demo street.
 fn car() -> &'static StoredActor {
     static CAR: OnceLock<StoredActor> = OnceLock::new();
-    CAR.get_or_init(|| {
-        let mut gaussians = Gaussians::with_capacity(0, 400);
-        for i in 0..400 {
-            let at = |k: usize| (i * k % 397) as f64 / 397.0;
-            gaussians.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
-            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            gaussians.ln_scales.push([0.15_f32.ln(); 3]);
-            gaussians.logit_opacities.push(4.0);
-            gaussians.sh.extend([1.5, -1.2 + (i % 5) as f32 * 0.3, -1.5]);
-        }
-        let description = AssetDescription {
-            name: "red-box".to_owned(),
-            class: ActorClass::Vehicle,
-            box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
-            provenance: Provenance::of("test".to_owned()),
-        };
-        let asset = ActorAsset::new(&gaussians, description).unwrap();
-        demo().catalog().put_actor(&asset, RecordFormat::F32).unwrap()
-    })
+    CAR.get_or_init(|| demo().catalog().put_actor(&car_asset(), RecordFormat::F32).unwrap())
 }
 
 /// The cameras of the other tests.
@@ -322,6 +324,35 @@ async fn plans_and_warm_ups_draw_the_actors_of_each_frame() {
     };
     assert_eq!(history(&planned), history(&last));
     assert_eq!(history(&last).len(), 6);
+}
+
+/// The ids of pixels are those of the scenario's actors, whatever is there.
+#[tokio::test(flavor = "multi_thread")]
+async fn instances_tell_whose_pixels_they_are() {
+    let bench = bench(unlimited());
+    let mut asked = options(&actors(&Value::from(&*car().hash)), false);
+    asked.outputs.maps.instances = true;
+    let mut session = open(&bench, "a", asked.clone()).await;
+    let seen = session.reset(0, None).await.unwrap();
+    let ids = |seen: &Observation| -> Vec<u16> {
+        let tensor = seen
+            .tensors
+            .iter()
+            .find(|tensor| tensor.kind == TensorKind::Instances(0))
+            .expect("the tensor of the front camera");
+        assert_eq!((tensor.dtype, &*tensor.shape), (DType::U16, &[64, 96][..]));
+        let header = seen.buffer.bytes().len() - seen.tensors.last().unwrap().bytes.end;
+        let bytes = &seen.buffer.bytes()[header..][tensor.bytes.clone()];
+        bytes.chunks_exact(2).map(|two| u16::from_le_bytes([two[0], two[1]])).collect()
+    };
+    let count = |seen: &[u16], id: u16| seen.iter().filter(|one| **one == id).count();
+    let first = ids(&seen);
+    assert!(count(&first, 2) > 20, "the car ahead: {}", count(&first, 2));
+    assert!(count(&first, 1) > 1000 && first.iter().all(|id| *id <= 3));
+    // The colours do not depend on it.
+    asked.outputs.maps.instances = false;
+    let mut plain = open(&bench, "b", asked).await;
+    assert_eq!(hashes(&plain.reset(0, None).await.unwrap()), hashes(&seen));
 }
 
 /// Assets take their room from the twins, once for all sessions, and give it back.

@@ -188,7 +188,7 @@ def test_points_land_where_alpasim_projects_them(stub: Any, camera: str, shutter
     still = project(spec, camera_from_world(CENTRES, np.array(AT_END)))
     expected = still if shutter == "GLOBAL" else rolled(spec)
     error = np.linalg.norm(found(image, expected) - expected, axis=1)
-    assert len(error) == 50 and error.max() < 1.0, error.round(2)
+    assert len(error) == 50 and error.max() < 0.1, error.round(3)
     if shutter != "GLOBAL":
         # The motion is seen: the top rows lie elsewhere.
         assert np.linalg.norm(expected - still, axis=1).max() > 5.0

@@ -12,6 +12,7 @@ import { StagePlot } from "./plot";
 import { clamp, rotate } from "./pose";
 import type { Camera, Metadata, Observation, Opened, Twin } from "./protocol";
 import { Refused } from "./server";
+import { drivenSession } from "./session";
 import { Settings } from "./settings";
 
 const DT_US = 50_000;
@@ -118,16 +119,18 @@ export class DrivePage implements Page {
   /** Opens the session: once to learn the twin's cameras, and then with images of the wanted size. */
   private async open(twin: Twin): Promise<void> {
     const client = this.client!;
-    const dynamics = { model: "dynamic", speed: 0, reverse: true };
     const { scenario, width, quality } = this.settings;
-    const fields: Record<string, unknown> = { twin: twin.name, dynamics, dt_us: DT_US, ...this.start };
+    const fields: Record<string, unknown> = { twin: twin.name, dt_us: DT_US, ...this.start };
     if (scenario) fields.scenario = scenario;
     const first = await client.open(fields);
     await client.close();
+    // A scenario says how fast its drive begins.
+    const { model, speed } = first.dynamics;
+    fields.dynamics = model === "teleport" ? { model: "dynamic", speed: 0, reverse: true } : { model, speed, reverse: true };
     const images = imageSizes(first.cameras, width);
     const trust = twin.trajectories.length > 0;
     fields.outputs = { encoding: "jpeg", quality, trust, images, ...(scenario ? { actors: true } : {}) };
-    this.opened = await client.open(fields);
+    this.opened = await client.open({ ...fields, session: drivenSession(twin.name) });
     await this.map.load(twin.name, this.opened.version, twin.trajectories.map(({ name }) => name));
     place(el("b", {}, twin.name), ` v${this.opened.version} · ${count(twin.gaussians)} Gaussians · drive`);
     await this.show(await client.observation({ type: "reset", ...this.start }));

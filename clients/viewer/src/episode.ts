@@ -44,7 +44,7 @@ class Player {
   }
 
   /** Shows the frame at a time, and tells `shown`. While one is rendered only the newest wish counts. */
-  async seek(timeUs: number, shown: (metadata: Metadata, frame: RecordedFrame) => void): Promise<void> {
+  async seek(timeUs: number, shown: (metadata: Metadata) => void): Promise<void> {
     const frame = this.frameAt(timeUs);
     if (!frame || frame === this.wanted) return;
     this.wanted = frame;
@@ -54,7 +54,7 @@ class Player {
       let done: RecordedFrame | undefined;
       while (this.wanted !== done && !this.ended) {
         done = this.wanted;
-        shown(await this.render(done!), done!);
+        shown(await this.render(done!));
       }
     } finally {
       this.works = false;
@@ -80,16 +80,18 @@ class Player {
       return recorded === undefined ? "not recorded" : recorded === hash ? "" : "differs";
     });
     // The rows of a rolling shutter depend on the motion, which a pose alone does not have.
-    const rolls = cameras.some(({ shutter }) => shutter);
+    const reasons = [cameras.some(({ shutter }) => shutter) ? "rolling shutter" : "", this.recording.drawsActors ? "without the actors" : ""];
+    const reason = reasons.filter(Boolean).join(", ");
     const isSame = equal.length === compared.length && compared.length > 0;
     this.verdict.className = isSame ? "verdict good" : "verdict bad";
     this.verdict.textContent = compared.length === 0 ? "no images recorded here"
       : isSame ? `${equal.length} of ${compared.length} images have the recorded hash`
-      : `${compared.length - equal.length} of ${compared.length} images differ${rolls ? " (rolling shutter)" : ""}`;
+      : `${compared.length - equal.length} of ${compared.length} images differ${reason && ` (${reason})`}`;
     await this.mosaic.show(observation);
     this.element.dataset.same = String(isSame);
     this.element.dataset.timeUs = String(frame.time_us);
-    return { ...observation.metadata, step: frame.step, time_us: frame.time_us };
+    const { ego } = observation.metadata;
+    return { ...observation.metadata, step: frame.step, time_us: frame.time_us, actors: frame.actors, ego: { ...ego, pose: frame.pose } };
   }
 }
 
@@ -143,6 +145,7 @@ export class EpisodePage implements Page {
       const { trajectories } = await get<Twin>(`v1/twins/${first!.twin}`);
       await this.map.load(first!.twin, first!.frames[0]!.version, trajectories.map(({ name }) => name));
       recordings.forEach(({ frames }, at) => this.map.path(frames.map(({ pose }) => pose.xyz), at === 0 ? "accent" : "warm"));
+      this.map.lanes(recordings.flatMap(({ lanes }) => lanes));
       this.showEvents(recordings);
       const line = el("div.line", {}, this.play, el("div.track", {}, this.slider, this.marks), this.time);
       this.element.append(
@@ -201,9 +204,7 @@ export class EpisodePage implements Page {
     this.time.textContent = `${fixed(timeUs * 1e-6, 2)} s`;
     this.time.dataset.timeUs = String(timeUs);
     try {
-      await Promise.all(this.players.map((player, at) => player.seek(timeUs, (metadata, { pose }) => {
-        if (at === 0) this.map.at({ ...metadata, ego: { ...metadata.ego, pose } });
-      })));
+      await Promise.all(this.players.map((player, at) => player.seek(timeUs, (metadata) => this.map.at(metadata, at))));
     } catch (error) {
       this.setPlaying(false);
       if (!this.ended) say(error instanceof Error ? error.message : String(error), "bad");

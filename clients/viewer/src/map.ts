@@ -40,6 +40,8 @@ export class MapView {
   private trail: TrailPoint[] = [];
   private ghosts: { points: Vector[]; colour: string }[] = [];
   private now: Metadata | undefined;
+  private other: Pose | undefined;
+  private outlines: Vector[][] = [];
   /** Middle of the map: a place, or the ego. */
   private centre: [number, number] | undefined;
   private pixelsPerM = 4;
@@ -98,9 +100,16 @@ export class MapView {
     this.drawing.redraw();
   }
 
-  /** Moves the ego without a trail. */
-  at(metadata: Metadata): void {
-    this.now = metadata;
+  /** Outlines of lanes. */
+  lanes(outlines: Vector[][]): void {
+    this.outlines = outlines;
+    this.drawing.redraw();
+  }
+
+  /** Moves the ego without a trail; `which` is 1 for the ego of a second episode. */
+  at(metadata: Metadata, which = 0): void {
+    if (which === 0) this.now = metadata;
+    else this.other = metadata.ego.pose;
     this.drawing.redraw();
   }
 
@@ -181,6 +190,7 @@ export class MapView {
     };
     context.lineJoin = "round";
     context.lineCap = "round";
+    for (const outline of this.outlines) line([...outline, outline[0]!], colour("dim"), 0.5);
     for (const { points } of this.drives) {
       const path = points.map(({ pose }) => pose.xyz);
       line(path, colour("line"), Math.max(5, 3 * this.pixelsPerM));
@@ -202,6 +212,7 @@ export class MapView {
         this.box(context, toScreen, actor.pose, [-length / 2, length / 2], breadth, colour("warm"));
       }
       const ends: [number, number] = [EGO_REAR_M, EGO_REAR_M + EGO_LENGTH_M];
+      if (this.other) this.box(context, toScreen, this.other, ends, EGO_WIDTH_M, colour("warm"));
       this.box(context, toScreen, now.ego.pose, ends, EGO_WIDTH_M, colour("accent"));
     }
     this.scaleBar(context, height);

@@ -46,6 +46,7 @@ export interface Opened {
   backend: string;
   start: Pose;
   dt_us: number;
+  dynamics: { model: string; speed: number };
   cameras: Camera[];
   trajectories: Drive[];
 }

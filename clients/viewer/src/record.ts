@@ -1,7 +1,7 @@
 // The record of an episode: a JSON object a line, as the server writes it.
 
-import type { Pose } from "./pose";
-import type { Camera } from "./protocol";
+import type { Pose, Quaternion, Vector } from "./pose";
+import type { Actor, Camera } from "./protocol";
 import { getText } from "./server";
 
 export interface RecordedFrame {
@@ -12,6 +12,8 @@ export interface RecordedFrame {
   version: number;
   /** Hash of the images of the cameras, by camera; only of those with an image at this time. */
   images: Map<string, string>;
+  /** Where the actors of the scenario are. */
+  actors: Actor[];
 }
 
 export interface RecordedEvent {
@@ -28,6 +30,10 @@ export interface Recording {
   profile: Record<string, unknown>;
   frames: RecordedFrame[];
   events: RecordedEvent[];
+  /** Outlines of the lanes near the route. */
+  lanes: Vector[][];
+  /** Whether actors are drawn in the images: those that are rendered again do not have them. */
+  drawsActors: boolean;
   outcome: string | undefined;
 }
 
@@ -39,17 +45,31 @@ export async function load(name: string): Promise<Recording> {
   const set = Object.entries(header.profile as Record<string, unknown>).filter(([, value]) => value !== null);
   const recording: Recording = {
     name, cameras, twin: header.twin, backend: header.backend, profile: Object.fromEntries(set), frames: [], events: [],
-    outcome: undefined,
+    lanes: [], drawsActors: false, outcome: undefined,
   };
   let version: number = header.version;
+  let known: { name: string; class: string; size: Vector; asset?: string }[] = [];
+  let actors: Actor[] = [];
   for (const line of lines) {
     if (line.kind === "version") version = line.version;
     if (line.kind === "end") recording.outcome = line.outcome;
-    if (line.kind === "event") recording.events.push(eventOf(line));
+    if (line.kind === "event") recording.events.push(eventOf(line, known.map((actor) => actor.name)));
+    if (line.kind === "scenario") {
+      known = line.actors ?? [];
+      recording.lanes = (line.lanes ?? []).map(({ outline }: any) => outline.map(([x, y]: [number, number]) => [x, y, 0]));
+      recording.drawsActors = known.some(({ asset }) => asset);
+    }
+    // They stand before the frame of their step.
+    if (line.kind === "actors") {
+      actors = line.actors.map(([index, xyz, q]: [number, Vector, Quaternion]) => {
+        const { name = "", class: kind = "", size = [4, 2, 1.5] as Vector } = known[index] ?? {};
+        return { name, kind, size, pose: { xyz, q } };
+      });
+    }
     if (line.kind !== "frame" || line.request === "observe" || line.poses.length === 0) continue;
     const frames = recording.frames.filter(({ step }) => step < line.step);
     recording.frames = frames;
-    frames.push({ step: line.step, time_us: line.time_us, pose: line.poses.at(-1), version, images: lastImages(line, cameras) });
+    frames.push({ step: line.step, time_us: line.time_us, pose: line.poses.at(-1), version, images: lastImages(line, cameras), actors });
   }
   return recording;
 }
@@ -62,9 +82,10 @@ function lastImages(line: any, cameras: Camera[]): Map<string, string> {
   return new Map(last.map((index, at) => [cameras[index]!.name, hashes[at]!]));
 }
 
-function eventOf(line: any): RecordedEvent {
-  const { kind, actor, name, at_fault: atFault } = line;
-  const parts = [kind, actor, name, atFault ? "at fault" : ""].filter((part) => typeof part === "string" && part);
-  const isEnd = kind === "end" || kind === "ended";
-  return { time_us: line.time_us ?? 0, text: parts.join(" "), isBad: kind === "contact" || (isEnd && name !== "route_done") };
+function eventOf(line: any, names: string[]): RecordedEvent {
+  const { time_us: timeUs, event, actor, rule, trust, ego_at_fault: atFault } = line;
+  const parts = [String(event).replaceAll("_", " "), names[actor] ?? "", rule?.replaceAll("_", " ") ?? "",
+    trust === undefined ? "" : `trust ${trust.toFixed(2)}`, atFault ? "(ego at fault)" : ""];
+  const isBad = event === "contact" || event === "static_contact" || (event === "ended" && !["route_done", "time"].includes(rule));
+  return { time_us: timeUs, text: parts.filter(Boolean).join(" "), isBad };
 }

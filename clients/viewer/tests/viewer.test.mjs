@@ -145,8 +145,10 @@ test("a lost connection is resumed", async () => {
 test("nothing is wider than a phone, and the pads drive", async () => {
   const phone = { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true };
   const { page, complaints, close } = await open(browser, server, "", phone);
-  const fits = () => page.evaluate(() => document.documentElement.scrollWidth <= innerWidth);
-  await page.waitForSelector("text=demo");
+  const fits = () => page.evaluate(() => [document.documentElement, document.getElementById("page")]
+    .every(({ scrollWidth }) => scrollWidth <= innerWidth));
+  // The last of its lists.
+  await page.waitForSelector("text=Recorded episodes");
   assert.ok(await fits(), "the first page");
   await page.click("text=demo");
   await steps(page, 1);

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import json
 import math
 import types
@@ -251,7 +252,7 @@ class Outputs:
     `images` has crops and sizes that differ from the rig's, by camera name. `frames` is how many of the newest
     frames of each camera an observation has, 1 if None. `period_us` is the time between two frames of a camera, by
     name, for cameras that do not take one with every step. `trust` adds a confidence to each image. `actors` tells
-    where the actors of the scenario are.
+    where the actors of the scenario are. `instances` adds whose Gaussian each pixel shows.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -260,6 +261,7 @@ class Outputs:
     depth: bool = False
     opacity: bool = False
     normals: bool | None = None
+    instances: bool | None = None
     images: dict[str, ImagePart] | None = None
     frames: int | None = None
     trust: bool | None = None
@@ -543,7 +545,10 @@ class Route:
 
 @dataclass(frozen=True)
 class Actor:
-    """An actor of the scenario: its box stands on the ground at `pose`, x forward; `size` is length, width, height."""
+    """An actor of the scenario: its box stands on the ground at `pose`, x forward; `size` is length, width, height.
+
+    `instance` is its number in `Observation.instances`.
+    """
 
     name: str
     kind: str
@@ -551,6 +556,7 @@ class Actor:
     pose: Pose
     velocity: Vector
     yaw_rate: float
+    instance: int = 0
 
 
 @dataclass(frozen=True)
@@ -626,6 +632,12 @@ def decode(kind: Any, value: Any, path: str) -> Any:
     """
     if kind is Any:
         return value
+    if kind is float:
+        # Python's parser turns 1e999 into infinity, which is not a JSON number.
+        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not is_number or not math.isfinite(value):
+            return _mismatch(path, value, "a finite number")
+        return float(value)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is Literal:
         return value if value in arguments else _mismatch(path, value, " or ".join(arguments))
@@ -636,13 +648,7 @@ def decode(kind: Any, value: Any, path: str) -> Any:
     if origin is dict or kind is dict:
         return value if isinstance(value, dict) else _mismatch(path, value, "an object")
     if dataclasses.is_dataclass(kind):
-        return _decode_dataclass(typing.cast(type[Any], kind), value, path)
-    if kind is float:
-        # Python's parser turns 1e999 into infinity, which is not a JSON number.
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not is_number or not math.isfinite(value):
-            return _mismatch(path, value, "a finite number")
-        return float(value)
+        return _decode_dataclass(kind, value, path)
     if type(value) is not kind:
         return _mismatch(path, value, kind.__name__)
     return value
@@ -658,17 +664,24 @@ def _decode_tuple(arguments: tuple[Any, ...], value: Any, path: str) -> tuple[An
     return tuple(decode(kind, item, f"{path}[{index}]") for index, (kind, item) in pairs)
 
 
-def _decode_dataclass(kind: type[Any], value: Any, path: str) -> Any:
+def _decode_dataclass(kind: Any, value: Any, path: str) -> Any:
     if not isinstance(value, dict):
         return _mismatch(path, value, "an object")
-    hints = typing.get_type_hints(kind)
     fields = {}
-    for field in dataclasses.fields(kind):
-        if field.name in value:
-            fields[field.name] = decode(hints[field.name], value[field.name], f"{path}.{field.name}")
-        elif field.default is dataclasses.MISSING:
-            raise ProtocolError(f"{path}.{field.name} is missing")
+    for name, hint, is_required in _fields(kind):
+        if name in value:
+            fields[name] = decode(hint, value[name], f"{path}.{name}")
+        elif is_required:
+            raise ProtocolError(f"{path}.{name} is missing")
     return kind(**fields)
+
+
+@functools.cache
+def _fields(kind: type[Any]) -> tuple[tuple[str, Any, bool], ...]:
+    """Name and type of each field, and whether it has no default. Python evaluates the types anew each time it is asked."""
+    hints = typing.get_type_hints(kind)
+    fields = dataclasses.fields(kind)
+    return tuple((field.name, hints[field.name], field.default is dataclasses.MISSING) for field in fields)
 
 
 def _mismatch(path: str, value: Any, expected: str) -> NoReturn:
