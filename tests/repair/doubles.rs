@@ -36,6 +36,13 @@ pub(crate) fn nan_where_bright() -> Vec<u8> {
     rgb(nodes, vec![floats("limit", &[], &[0.49])])
 }
 
+/// The image without its first row, which shows only when it runs.
+pub(crate) fn without_a_row() -> Vec<u8> {
+    let index = |name: &str, value: u64| tensor(name, I64, &[1], &value.to_le_bytes());
+    let constants = vec![index("from", 1), index("to", 1 << 40), index("rows", 2)];
+    rgb(vec![node("Slice", &["image", "from", "to", "rows"], &["repaired"], &[])], constants)
+}
+
 /// Six channels.
 pub(crate) fn six_channels() -> Vec<u8> {
     rgb(vec![node("Concat", &["image", "image"], &["repaired"], &[int("axis", 1)])], Vec::new())

@@ -28,8 +28,15 @@ fn a_nan_is_an_error_at_load_and_in_a_run_and_the_model_goes_on() {
 #[test]
 fn shapes_names_types_and_ranks_are_compared_with_the_graph() {
     let error = Folder::new(&doubles::six_channels(), json!({})).load().unwrap_err();
+    let text = error.to_string();
+    assert!(
+        text.contains("outputs[0].role") && text.contains("the graph [1, 6, -1, -1]"),
+        "{text}"
+    );
+
+    let error = Folder::new(&doubles::without_a_row(), json!({})).load().unwrap_err();
     let RepairError::Shape { wanted, found, .. } = &error else { panic!("{error}") };
-    assert_eq!((&wanted[..], &found[..]), (&[1, 3, 64, 64][..], &[1, 6, 64, 64][..]));
+    assert_eq!((&wanted[..], &found[..]), (&[1, 3, 64, 64][..], &[1, 3, 63, 64][..]));
 
     for (changes, field, message) in [
         (
