@@ -181,6 +181,7 @@ fn ftheta(lens: &wire::FthetaCameraParam) -> Result<Intrinsics, CameraSpecError>
         center_px: [lens.principal_point_x + 0.5, lens.principal_point_y + 0.5],
         lens: Some(lens_fields),
         windshield: None,
+        native_size_px: None,
     })
 }
 
@@ -194,6 +195,7 @@ fn opencv(lens: &wire::OpenCvPinholeCameraParam) -> Result<Intrinsics, CameraSpe
         center_px: [lens.principal_point_x, lens.principal_point_y],
         lens: Some(LensFields::Opencv { k, p, s }),
         windshield: None,
+        native_size_px: None,
     })
 }
 
@@ -206,6 +208,7 @@ fn fisheye(lens: &wire::OpenCvFisheyeCameraParam) -> Result<Intrinsics, CameraSp
         center_px: [lens.principal_point_x, lens.principal_point_y],
         lens: Some(LensFields::Fisheye { k, max_angle }),
         windshield: None,
+        native_size_px: None,
     })
 }
 
