@@ -245,6 +245,7 @@ async fn trust_is_sent_if_it_is_requested() {
         *summary,
         json!({
             "outcome": "completed", "steps": 1, "time_us": 100_000, "distance_m": 9.0, "least_trust": 0.5,
+            "episode": summary["episode"],
         })
     );
     let seen = open(&server, json!({})).await.step(1.0).await;
@@ -340,6 +341,7 @@ async fn time_motion_and_history_advance_with_steps() {
     let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
     let expected = json!({
         "outcome": "completed", "steps": 11, "time_us": 550_000, "distance_m": 6.0,
+        "episode": summary["episode"],
     });
     assert_eq!(*summary, expected);
 }

@@ -51,10 +51,14 @@ async fn a_plan_gives_the_observation_of_its_last_step() {
         // The front at 7, 8, 9, 10 tenths, the rear at 4, 6, 8, 10.
         assert_eq!(server.painter.begun.load(Ordering::SeqCst) - begun, 6, "frames at six times");
     }
-    let summaries = [
+    let mut summaries = [
         single.ask(json!({ "type": "close" })).await,
         planned.ask(json!({ "type": "close" })).await,
     ];
+    let [of_single, of_planned] = &mut summaries;
+    // Each has its own file.
+    let files = [of_single, of_planned].map(|closed| closed["summary"]["episode"].take());
+    assert_ne!(files[0], files[1]);
     assert_eq!(summaries[0]["summary"], summaries[1]["summary"]);
     for path in server.recorded() {
         let report = replay(&server, &path, &Painter::default()).unwrap();

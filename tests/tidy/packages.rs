@@ -10,7 +10,7 @@ use crate::source::{Package, packages, paths};
 /// Crates that only some files may name, by their path from the root of the repository.
 const CRATES: &[(&str, &[&str])] = &[
     ("axum", &["src/server"]),
-    ("prost", &["src/alpasim"]),
+    ("prost", &["src/alpasim", "src/episode/export"]),
     ("tonic", &["src/alpasim"]),
     ("tonic_prost", &["src/alpasim"]),
     ("prometheus_client", &["src/server/metrics.rs"]),

@@ -9,7 +9,7 @@ use wildcity_twin::store::StoredActor;
 pub(super) enum DemoScenario {
     /// A van overtakes, moves into the ego's lane and brakes; a car comes from ahead.
     CutIn,
-    /// Cars ahead and from ahead, and a pedestrian who crosses the street.
+    /// Cars ahead and from ahead, and a pedestrian on the crosswalk.
     Traffic,
 }
 
