@@ -401,7 +401,7 @@ impl Manifest {
             );
         }
         let needs_tile = size.fit == Fit::Tile && size.fixed.is_none();
-        let is_tile = |side: &u32| is_side(side) && side % multiple == 0;
+        let is_tile = |side: &u32| is_side(side) && side.is_multiple_of(multiple);
         if needs_tile && !size.tile.is_some_and(|sides| sides.iter().all(is_tile)) {
             return wrong(
                 "tile",

@@ -45,8 +45,8 @@ pub(crate) fn rgb(image: &Image) -> Planes {
     let mut planes = Planes::zeros(3, image.height, image.width);
     let pixels = image.width * image.height;
     for (at, pixel) in image.rgb8.chunks_exact(3).enumerate() {
-        for channel in 0..3 {
-            planes.values[channel * pixels + at] = f32::from(pixel[channel]);
+        for (channel, &value) in pixel.iter().enumerate() {
+            planes.values[channel * pixels + at] = f32::from(value);
         }
     }
     planes

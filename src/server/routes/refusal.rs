@@ -12,11 +12,11 @@ pub(crate) type HttpResult = Result<Response, Refusal>;
 
 /// A fault that becomes an HTTP answer.
 #[derive(Debug)]
-pub(crate) struct Refusal(Fault);
+pub(crate) struct Refusal(Box<Fault>);
 
 impl<F: Into<Fault>> From<F> for Refusal {
     fn from(fault: F) -> Self {
-        Self(fault.into())
+        Self(Box::new(fault.into()))
     }
 }
 
@@ -30,7 +30,7 @@ impl IntoResponse for Refusal {
             response.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
         }
         // A client whose handshake is refused learns what this server speaks (RFC 6455, section 4.4).
-        if matches!(self.0, Fault::NoUpgrade | Fault::Handshake { .. }) {
+        if matches!(*self.0, Fault::NoUpgrade | Fault::Handshake { .. }) {
             let headers = response.headers_mut();
             headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));
             headers.insert(header::SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
