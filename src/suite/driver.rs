@@ -158,7 +158,8 @@ impl<'a> IdmPlan<'a> {
             true => (length_m / whole_s).max(LEAST_FREE_MPS),
             false => Idm::WILDCITY.free_speed_mps,
         };
-        let idm = Idm { free_speed_mps, ..Idm::WILDCITY };
+        // It brakes as hard as the formula says: a driver that is to pass must be able to stop.
+        let idm = Idm { free_speed_mps, clipped: false, ..Idm::WILDCITY };
         let lead = lead(case, session, begin.station_m);
         let forward = episode.world_from_rig().rotation * DVec3::X;
         let mut speed_mps = episode.ego().velocity_m_s().dot(forward).max(0.0);
