@@ -524,6 +524,7 @@ mod tests {
             }
         }
         eprintln!("largest error: {max_error_px:.1e} px");
-        assert!(max_error_px < 1.5e-3, "{max_error_px:e} px");
+        // Beyond the field, a lens is continued by a series of its slope.
+        assert!(max_error_px < 1e-2, "{max_error_px:e} px");
     }
 }
