@@ -278,7 +278,7 @@ impl<'a> ListBuilder<'a> {
                 scale,
                 ..self.as_served.clone()
             };
-            let name = format!("{}, own blur", scaled.name);
+            let name = format!("{} with its own blur", scaled.name);
             self.settings.push(scaled.clone());
             self.settings.push(Setting { name, own_blur: true, ..scaled });
         }

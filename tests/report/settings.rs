@@ -96,8 +96,8 @@ fn coarser_settings_have_larger_errors_and_lower_costs() {
         &["as served", "alpha_cut=0.008", "alpha_cut=0.016", "alpha_cut=0.032"],
         &["as served", "stop=0.004", "stop=0.016"],
         &["as served", "8 bits", "jpeg 98", "jpeg 90", "jpeg 75", "jpeg 50"],
-        &["as served", "scale 0.5", "scale 0.5, own blur"],
-        &["as served", "scale 0.25", "scale 0.25, own blur"],
+        &["as served", "scale 0.5", "scale 0.5 with its own blur"],
+        &["as served", "scale 0.25", "scale 0.25 with its own blur"],
     ] {
         assert!(
             falling.windows(2).all(|w| db(w[0]) > db(w[1])),
