@@ -123,7 +123,7 @@ impl PixelFilter {
     /// Variance of a pixel that averages very many native ones.
     const BOX_PX2: f64 = 1.0 / 15.0;
 
-    /// The power of [`Filtered::shrink_share`] that multiplies opacity.
+    /// Opacity is multiplied by the shrink share of a splat to this power.
     pub const SHRINK_POWER: f64 = 0.75;
 
     /// The filter of a camera's pixels.
