@@ -19,10 +19,10 @@ const bundle = await build({
   write: false,
 });
 const files = new Map(bundle.outputFiles.map((file) => [file.path.split("/").pop(), Buffer.from(file.contents)]));
-files.set("index.html", await readFile(at("src/index.html")));
-files.set("icon.svg", await readFile(at("src/icon.svg")));
+// The server embeds these as they are.
+const unbuilt = await Promise.all(["src/index.html", "src/icon.svg"].map((name) => readFile(at(name))));
 
-const bytes = [...files.values()].reduce((sum, content) => sum + gzipSync(content).length, 0);
+const bytes = [...files.values(), ...unbuilt].reduce((sum, content) => sum + gzipSync(content).length, 0);
 console.log(`${bytes} bytes gzipped, ${LIMIT_BYTES} allowed`);
 if (bytes > LIMIT_BYTES) throw new Error("the viewer is too large");
 

@@ -105,6 +105,34 @@ impl Uploads {
     }
 }
 
+/// The directories of a server, for every command that starts one with the user's own.
+#[derive(Debug, clap::Args)]
+pub(super) struct ServerDirectories {
+    #[command(flatten)]
+    pub(super) twins: Twins,
+
+    #[command(flatten)]
+    pub(super) episodes: Episodes,
+
+    #[command(flatten)]
+    pub(super) scenarios: Scenarios,
+
+    #[command(flatten)]
+    pub(super) uploads: Uploads,
+}
+
+impl ServerDirectories {
+    /// All of them: each that is given, or the user's own.
+    pub(super) fn all(&self) -> anyhow::Result<wildcity_server::Directories> {
+        Ok(wildcity_server::Directories {
+            twins: self.twins.dir()?,
+            episodes: self.episodes.dir()?,
+            scenarios: self.scenarios.dir()?,
+            uploads: self.uploads.dir()?,
+        })
+    }
+}
+
 /// The directory that an option gives, or the user's own directory of the same name.
 fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
     if let Some(dir) = given {

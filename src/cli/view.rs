@@ -2,15 +2,13 @@
 
 use std::env;
 use std::io::{self, Write};
-use std::net::SocketAddr;
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 
-use wildcity_scene::ProfileOverrides;
-use wildcity_server::{Config, Limits};
+use wildcity_server::Config;
 
 use super::backend_options::BackendOptions;
-use super::directories::{Episodes, Scenarios, Twins, Uploads};
+use super::directories::ServerDirectories;
 
 /// Look at a twin in the browser, and drive through it by hand.
 ///
@@ -27,16 +25,7 @@ pub(super) struct View {
     no_open: bool,
 
     #[command(flatten)]
-    twins: Twins,
-
-    #[command(flatten)]
-    episodes: Episodes,
-
-    #[command(flatten)]
-    scenarios: Scenarios,
-
-    #[command(flatten)]
-    uploads: Uploads,
+    directories: ServerDirectories,
 
     #[command(flatten)]
     backend: BackendOptions,
@@ -52,21 +41,11 @@ impl View {
     pub(super) fn run(self) -> anyhow::Result<()> {
         if let Some(twin) = &self.twin {
             // An unknown or damaged twin is reported here, and not by the page.
-            self.twins.catalog()?.version(twin, None)?;
+            self.directories.twins.catalog()?.version(twin, None)?;
         }
         let config = Config {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
-            twins: self.twins.dir()?,
-            cache: self.twins.cache(),
-            episodes: self.episodes.dir()?,
-            scenarios: self.scenarios.dir()?,
-            uploads: self.uploads.dir()?,
-            tokens: None,
-            origins: wildcity_server::Origins::default(),
-            tls: None,
-            backend: Arc::from(self.backend.backend()?),
-            profile: ProfileOverrides::default(),
-            limits: Limits::default(),
+            cache: self.directories.twins.cache(),
+            ..Config::local(self.directories.all()?, Arc::from(self.backend.backend()?))
         };
         serve(config, self.twin.as_deref(), !self.no_open)
     }

@@ -16,22 +16,29 @@ use crate::limits;
 use crate::origins::Origins;
 use crate::tls::TlsFiles;
 
-/// The configuration of a server.
-#[derive(Clone)]
-pub struct Config {
-    /// Address to listen on; port 0 takes a free one. It must be a loopback address if there are no
-    /// tokens.
-    pub listen: SocketAddr,
+/// Where a server reads and writes.
+#[derive(Clone, Debug)]
+pub struct Directories {
     /// Directory of twins, or their URL.
     pub twins: PathBuf,
-    /// Where parts of twins at a URL are kept on disk.
-    pub cache: Option<DiskCacheSettings>,
     /// Directory where episodes are recorded.
     pub episodes: PathBuf,
     /// Directory of the scenarios that can be opened by name; it need not exist.
     pub scenarios: PathBuf,
     /// Directory where uploads are kept until they are pushed. One server uses it at a time.
     pub uploads: PathBuf,
+}
+
+/// The configuration of a server.
+#[derive(Clone)]
+pub struct Config {
+    /// Address to listen on; port 0 takes a free one. It must be a loopback address if there are no
+    /// tokens.
+    pub listen: SocketAddr,
+    /// Where it reads and writes.
+    pub directories: Directories,
+    /// Where parts of twins at a URL are kept on disk.
+    pub cache: Option<DiskCacheSettings>,
     /// The tokens of clients; without tokens every client may do everything.
     pub tokens: Option<Tokens>,
     /// Web pages of other sites that may send requests.
@@ -44,6 +51,24 @@ pub struct Config {
     pub profile: ProfileOverrides,
     /// Time-outs, counts and bytes.
     pub limits: Limits,
+}
+
+impl Config {
+    /// A server for programs of this machine, on a free port, without tokens, TLS or disk cache, with all
+    /// defaults.
+    pub fn local(directories: Directories, backend: Arc<dyn Backend>) -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+            directories,
+            cache: None,
+            tokens: None,
+            origins: Origins::default(),
+            tls: None,
+            backend,
+            profile: ProfileOverrides::default(),
+            limits: Limits::default(),
+        }
+    }
 }
 
 /// Time-outs, counts and bytes of a server. The constants in [`crate::limits`] and in the packages of
@@ -141,27 +166,12 @@ impl Default for SpoolLimits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self {
-            listen,
-            twins,
-            cache,
-            episodes,
-            scenarios,
-            uploads,
-            tokens,
-            origins,
-            tls,
-            backend,
-            profile,
-            limits,
-        } = self;
+        let Self { listen, directories, cache, tokens, origins, tls, backend, profile, limits } =
+            self;
         f.debug_struct("Config")
             .field("listen", listen)
-            .field("twins", twins)
+            .field("directories", directories)
             .field("cache", cache)
-            .field("episodes", episodes)
-            .field("scenarios", scenarios)
-            .field("uploads", uploads)
             .field("tokens", &tokens.is_some())
             .field("origins", origins)
             .field("tls", tls)

@@ -53,7 +53,7 @@ mod tls;
 mod watchers;
 
 pub use auth::{Role, Tokens, TokensError};
-pub use config::{Config, Limits, SpoolLimits};
+pub use config::{Config, Directories, Limits, SpoolLimits};
 pub use origins::{OriginError, Origins};
 pub use shutdown::{Running, stop_signal};
 pub use start::{ServerError, start};

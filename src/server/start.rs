@@ -14,7 +14,7 @@ use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
 use crate::auth::Tokens;
-use crate::config::Config;
+use crate::config::{Config, Directories};
 use crate::metrics::Metrics;
 use crate::sessions::SessionRegistry;
 use crate::shutdown::Running;
@@ -72,11 +72,8 @@ pub enum ServerError {
 pub async fn start(config: Config) -> Result<Running, ServerError> {
     let Config {
         listen,
-        twins,
+        directories: Directories { twins, episodes, scenarios, uploads },
         cache,
-        episodes,
-        scenarios,
-        uploads,
         tokens,
         origins,
         tls,

@@ -8,8 +8,7 @@ use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
 use wildcity_render::Backend;
-use wildcity_scene::ProfileOverrides;
-use wildcity_server::{Config, Limits, Running};
+use wildcity_server::{Config, Directories, Limits, Running};
 use wildcity_session::{Engine, EngineSettings, Outcome, Scenarios, Session};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
@@ -165,19 +164,15 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
 }
 
 async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
-    let config = Config {
-        listen: ([127, 0, 0, 1], 0).into(),
+    let directories = Directories {
         twins: settings.twins.clone(),
-        cache: settings.cache.clone(),
         episodes: settings.episodes.clone(),
         scenarios: settings.scenarios.clone(),
         uploads: settings.episodes.join(".uploads"),
-        tokens: None,
-        origins: wildcity_server::Origins::default(),
-        tls: None,
-        backend: settings.backend.clone(),
-        profile: ProfileOverrides::default(),
-        limits: Limits::default(),
+    };
+    let config = Config {
+        cache: settings.cache.clone(),
+        ..Config::local(directories, settings.backend.clone())
     };
     let running = wildcity_server::start(config).await?;
     let url = running.url();

@@ -6,8 +6,7 @@ use std::sync::Arc;
 
 use serde_json::json;
 use wildcity_render::cpu::{Cpu, Simd};
-use wildcity_scene::ProfileOverrides;
-use wildcity_server::{Config, Limits};
+use wildcity_server::Config;
 
 use crate::episodes::{drive, lines, tamper};
 use crate::support::{self, Agent};
@@ -21,20 +20,8 @@ fn wildcity(arguments: &[&str], episode: &Path, twins: &Path) -> Output {
 #[tokio::test]
 async fn the_command_verifies_what_the_cpu_backend_served() {
     let (twins, episodes) = (support::twins(), tempfile::tempdir().unwrap());
-    let config = Config {
-        listen: "127.0.0.1:0".parse().unwrap(),
-        twins: twins.path().to_owned(),
-        cache: None,
-        episodes: episodes.path().to_owned(),
-        scenarios: twins.path().join(".scenarios"),
-        uploads: twins.path().join(".uploads"),
-        tokens: None,
-        origins: wildcity_server::Origins::default(),
-        tls: None,
-        backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
-        profile: ProfileOverrides::default(),
-        limits: Limits::default(),
-    };
+    let directories = support::directories(twins.path(), episodes.path());
+    let config = Config::local(directories, Arc::new(Cpu::new(2, Simd::Best).unwrap()));
     let running = wildcity_server::start(config).await.unwrap();
     let mut agent = Agent::connect(running.address()).await;
     agent.hello().await;

@@ -96,7 +96,8 @@ async fn an_incomplete_upload_survives_a_restart_and_stray_files_do_not() {
     }
     let TestServer { running, twins: kept, .. } = server;
     running.stop().await;
-    let server = TestServer::configured(|config| config.uploads = twins.join(".uploads")).await;
+    let server =
+        TestServer::configured(|config| config.directories.uploads = twins.join(".uploads")).await;
     assert_eq!(get(&server, &path).await.body["offset"], 60_000);
     let end = append(&server, &path, 60_000, "", &content[60_000..]).await;
     assert_eq!(end.body["complete"], true, "{end:?}");
@@ -109,7 +110,7 @@ async fn an_incomplete_upload_survives_a_restart_and_stray_files_do_not() {
 async fn two_servers_do_not_share_a_spool() {
     let server = TestServer::start().await;
     let spool = server.twins.path().join(".uploads");
-    let second = TestServer::configured(|config| config.uploads = spool).await;
+    let second = TestServer::configured(|config| config.directories.uploads = spool).await;
     let refused = begin(&second, b"x").await;
     refused.refused(503, "busy");
     assert!(refused.body["message"].as_str().unwrap().contains("--uploads"), "{refused:?}");

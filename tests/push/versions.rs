@@ -38,7 +38,7 @@ async fn rendering(twins: Option<&Path>) -> TestServer {
     TestServer::configured(|config| {
         config.backend = cpu;
         if let Some(twins) = twins {
-            config.twins = twins.to_owned();
+            config.directories.twins = twins.to_owned();
         }
     })
     .await

@@ -44,11 +44,11 @@ async fn nine_twins_are_served_beside_a_damaged_one() {
     let good: Vec<String> = (1..9).map(|k| format!("good{k}")).collect();
     let server = TestServer::configured(|config| {
         for name in &good {
-            commit(&config.twins, name);
+            commit(&config.directories.twins, name);
         }
         // The newest record is empty, as after a power cut on a file system without ordered writes.
-        commit(&config.twins, "broken");
-        std::fs::write(config.twins.join("broken/log/0000000002"), "").unwrap();
+        commit(&config.directories.twins, "broken");
+        std::fs::write(config.directories.twins.join("broken/log/0000000002"), "").unwrap();
     })
     .await;
     let mut served: Vec<&str> = good.iter().map(String::as_str).collect();

@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
-use wildcity_scene::ProfileOverrides;
 use wildcity_server::{Config, Limits, ServerError};
 
 use crate::support::{TEST_TIMEOUT, TestServer};
@@ -227,20 +226,7 @@ async fn only_local_pages_and_agents_may_drive() {
 #[tokio::test]
 async fn public_addresses_are_refused() {
     let server = TestServer::start().await;
-    let config = Config {
-        listen: "0.0.0.0:0".parse().unwrap(),
-        twins: server.twins.path().to_owned(),
-        cache: None,
-        episodes: server.episodes.path().to_owned(),
-        scenarios: server.twins.path().join(".scenarios"),
-        uploads: server.twins.path().join(".uploads"),
-        tokens: None,
-        origins: wildcity_server::Origins::default(),
-        tls: None,
-        backend: server.painter.clone(),
-        profile: ProfileOverrides::default(),
-        limits: Limits::default(),
-    };
+    let config = Config { listen: "0.0.0.0:0".parse().unwrap(), ..server.config() };
     let refused = wildcity_server::start(config.clone()).await.unwrap_err();
     assert!(matches!(refused, ServerError::PublicAddress { .. }), "{refused}");
     let taken =

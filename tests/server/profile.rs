@@ -102,7 +102,7 @@ fn commit_creased(dir: &Path) {
 
 #[tokio::test]
 async fn a_sky_that_cannot_be_baked_as_finely_is_refused_when_it_is_opened() {
-    let server = TestServer::configured(|config| commit_creased(&config.twins)).await;
+    let server = TestServer::configured(|config| commit_creased(&config.directories.twins)).await;
     let mut agent = server.agent().await;
     let asked =
         |sky_error: f64| json!({ "twin": "creased", "profile": { "sky_error": sky_error } });
@@ -120,7 +120,7 @@ async fn a_sky_that_cannot_be_baked_as_finely_is_refused_when_it_is_opened() {
 
 #[tokio::test]
 async fn every_map_that_was_baked_of_a_sky_is_set_aside() {
-    let server = TestServer::configured(|config| commit_creased(&config.twins)).await;
+    let server = TestServer::configured(|config| commit_creased(&config.directories.twins)).await;
     let mut agents = [server.agent().await, server.agent().await];
     let mut reserved_bytes = Vec::new();
     for (agent, sky_error) in agents.iter_mut().zip([0.1, 0.001]) {

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use rcgen::{CertifiedKey, generate_simple_self_signed};
 use wildcity_client::{Client, ConnectOptions, Open, Pose};
-use wildcity_server::{Config, Limits, ServerError, TlsFiles};
+use wildcity_server::{Config, ServerError, TlsFiles};
 
 use crate::support::{TEST_TIMEOUT, TestServer};
 
@@ -85,20 +85,7 @@ async fn unusable_certificates_are_named() {
         (TlsFiles { key: dir.path().join("cert.pem"), ..files(dir.path()) }, "cert.pem: "),
         (TlsFiles { key: other.path().join("key.pem"), ..files(dir.path()) }, "key.pem: "),
     ] {
-        let config = Config {
-            listen: "127.0.0.1:0".parse().unwrap(),
-            twins: server.twins.path().to_owned(),
-            cache: None,
-            episodes: server.episodes.path().to_owned(),
-            scenarios: server.twins.path().join(".scenarios"),
-            uploads: server.twins.path().join(".uploads"),
-            tokens: None,
-            origins: wildcity_server::Origins::default(),
-            tls: Some(tls),
-            backend: server.painter.clone(),
-            profile: wildcity_scene::ProfileOverrides::default(),
-            limits: Limits::default(),
-        };
+        let config = Config { tls: Some(tls), ..server.config() };
         let refused = wildcity_server::start(config).await.unwrap_err();
         assert!(matches!(refused, ServerError::Tls(_)), "{refused}");
         assert!(refused.to_string().contains(named), "{refused}");

@@ -2,7 +2,7 @@
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -18,13 +18,12 @@ use tokio_tungstenite::tungstenite::{Bytes, Message};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity_scene::Gaussians;
-use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
-use wildcity_server::{Config, Limits, Running};
+use wildcity_server::{Config, Directories, Limits, Running};
 use wildcity_twin::store::{Catalog, NewVersion};
 
 /// How long a test waits for anything before it fails.
@@ -163,7 +162,22 @@ pub(crate) struct TestServer {
     pub(crate) episodes: tempfile::TempDir,
 }
 
+/// The directories of a server that reads those twins and records there.
+pub(crate) fn directories(twins: &Path, episodes: &Path) -> Directories {
+    Directories {
+        twins: twins.to_owned(),
+        episodes: episodes.to_owned(),
+        scenarios: twins.join(".scenarios"),
+        uploads: twins.join(".uploads"),
+    }
+}
+
 impl TestServer {
+    /// A configuration for a second server with the same twins and recordings.
+    pub(crate) fn config(&self) -> Config {
+        Config::local(directories(self.twins.path(), self.episodes.path()), self.painter.clone())
+    }
+
     pub(crate) async fn start() -> Self {
         Self::with(Limits::default()).await
     }
@@ -176,20 +190,8 @@ impl TestServer {
         let twins = twins();
         let painter = Arc::new(Painter::default());
         let episodes = tempfile::tempdir().expect("a temporary directory");
-        let mut config = Config {
-            listen: SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0),
-            twins: twins.path().to_owned(),
-            cache: None,
-            episodes: episodes.path().to_owned(),
-            scenarios: twins.path().join(".scenarios"),
-            uploads: twins.path().join(".uploads"),
-            tokens: None,
-            origins: wildcity_server::Origins::default(),
-            tls: None,
-            backend: painter.clone(),
-            profile: ProfileOverrides::default(),
-            limits: Limits::default(),
-        };
+        let directories = directories(twins.path(), episodes.path());
+        let mut config = Config::local(directories, painter.clone());
         change(&mut config);
         let running = wildcity_server::start(config).await.expect("a server");
         Self { running, painter, twins, episodes }

@@ -9,6 +9,7 @@ import type { Page } from "./page";
 import { WatchPage } from "./watch";
 
 const THEME = "wildcity-theme";
+const systemIsLight = matchMedia("(prefers-color-scheme: light)");
 
 let page: Page | undefined;
 
@@ -28,17 +29,17 @@ function show(): void {
   byId("page").replaceChildren(page.element);
 }
 
-function applyTheme(theme: string | null): void {
-  if (theme) document.documentElement.dataset.theme = theme;
+/** The theme that the user chose, else the system's. */
+function applyTheme(): void {
+  document.documentElement.dataset.theme = localStorage.getItem(THEME) ?? (systemIsLight.matches ? "light" : "dark");
 }
 
 byId("theme").addEventListener("click", () => {
-  const isDark = getComputedStyle(document.documentElement).colorScheme.startsWith("dark");
-  const theme = isDark ? "light" : "dark";
-  localStorage.setItem(THEME, theme);
-  applyTheme(theme);
+  localStorage.setItem(THEME, document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+  applyTheme();
 });
+systemIsLight.addEventListener("change", applyTheme);
 addEventListener("hashchange", show);
 addEventListener("pagehide", () => void page?.end());
-applyTheme(localStorage.getItem(THEME));
+applyTheme();
 show();

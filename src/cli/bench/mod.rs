@@ -1,5 +1,6 @@
 //! `wildcity bench`.
 
+mod benched_twin;
 mod drive;
 mod gpu;
 mod load;

@@ -8,16 +8,12 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use serde_json::json;
 
+use super::benched_twin::BenchedTwin;
 use super::temporary_dir::TemporaryDir;
-use crate::cli::backend_options::{self, BackendOptions};
-use crate::cli::directories::{TwinVersion, Twins};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{
-    Encoding, Engine, EngineSettings, Outputs, RigChoice, Scenarios, Session, SessionOptions, Start,
-};
-use wildcity_twin::residency::Cache;
+use wildcity_session::{Encoding, Engine, Outputs, RigChoice, Session, SessionOptions, Start};
 
 /// Measure how many steps per second several sessions on one twin take together, without a network.
 ///
@@ -28,19 +24,8 @@ use wildcity_twin::residency::Cache;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Sessions {
-    /// The twin: NAME, or NAME@NUMBER for an older version.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
-
     #[command(flatten)]
-    twins: Twins,
-
-    #[command(flatten)]
-    backend: BackendOptions,
-
-    /// Memory for the twin, in GiB [default: three quarters of the machine's]
-    #[arg(long, value_name = "GIB", value_parser = backend_options::gib)]
-    memory_gib: Option<f64>,
+    twin: BenchedTwin,
 
     /// Numbers of sessions.
     #[arg(long, value_name = "N,..", value_delimiter = ',', default_values_t = [1, 2, 4, 8, 16],
@@ -97,17 +82,8 @@ struct Row {
 
 impl Sessions {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = self.twins.catalog()?;
-        let version = catalog.version(&self.twin.name, self.twin.number)?;
-        let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
         let episodes = TemporaryDir::new()?;
-        let engine = Engine::start(EngineSettings {
-            cache: Cache::limited(catalog, limit_bytes),
-            episodes: episodes.path().to_owned(),
-            scenarios: Scenarios::in_dir(""),
-            backend: Arc::from(self.backend.backend()?),
-            step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
-        })?;
+        let (engine, version) = self.twin.start(episodes.path())?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let mut out = io::stdout().lock();
         if !self.json {
@@ -196,9 +172,8 @@ impl Sessions {
             }
         }
         Ok(SessionOptions {
-            version: self.twin.number,
             rig: Some(RigChoice::Full(rig)),
-            ..SessionOptions::twin(&self.twin.name, Outputs::colour(self.encoding))
+            ..self.twin.session(Outputs::colour(self.encoding))
         })
     }
 }

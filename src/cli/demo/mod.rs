@@ -5,7 +5,6 @@ mod mosaic;
 mod scenario;
 
 use std::io::{self, ErrorKind, Write};
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -19,8 +18,8 @@ use wildcity_client::protocol::observation::Event;
 use wildcity_client::{Client, Movement, Observation, Open, Pose};
 use wildcity_generate::StreetSettings;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{ProfileOverrides, RecordFormat, Rig};
-use wildcity_server::Limits;
+use wildcity_scene::{RecordFormat, Rig};
+use wildcity_server::{Config, Directories};
 use wildcity_twin::ingest::sky;
 use wildcity_twin::store::{
     Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, StoredActor, Version,
@@ -98,19 +97,15 @@ impl Demo {
             None => Vec::new(),
         };
         output::create_dir(&self.out)?;
-        let config = wildcity_server::Config {
-            listen: SocketAddr::from(([127, 0, 0, 1], 0)),
+        let directories = Directories {
             twins,
-            cache: self.twins.cache(),
             episodes: self.out.join("episodes"),
             scenarios: self.out.join("scenarios"),
             uploads: self.out.join("uploads"),
-            tokens: None,
-            origins: wildcity_server::Origins::default(),
-            tls: None,
-            backend: Arc::from(self.backend.backend()?),
-            profile: ProfileOverrides::default(),
-            limits: Limits::default(),
+        };
+        let config = Config {
+            cache: self.twins.cache(),
+            ..Config::local(directories, Arc::from(self.backend.backend()?))
         };
         if self.view {
             return view::serve(config, Some(TWIN), true);

@@ -20,7 +20,7 @@ use wildcity_twin::store::DamagedTwin;
 use limit_options::{LimitOptions, gib_of};
 
 use super::backend_options::{BackendOptions, bytes_of_gib, gib};
-use super::directories::{Episodes, Scenarios, Twins, Uploads};
+use super::directories::ServerDirectories;
 use super::profile_options::read_profile;
 
 /// Serve twins to agents over WebSocket.
@@ -42,16 +42,7 @@ pub(super) struct Serve {
     print_config: bool,
 
     #[command(flatten)]
-    twins: Twins,
-
-    #[command(flatten)]
-    episodes: Episodes,
-
-    #[command(flatten)]
-    scenarios: Scenarios,
-
-    #[command(flatten)]
-    uploads: Uploads,
+    directories: ServerDirectories,
 
     /// JSON file of tokens and what each allows (see below); without it the server only listens on a
     /// loopback address.
@@ -144,11 +135,11 @@ impl Serve {
     fn default_of(&self, id: &str) -> anyhow::Result<Option<String>> {
         let text = |path: PathBuf| Some(path.display().to_string());
         Ok(match id {
-            "twins" => text(self.twins.dir()?),
-            "episodes" => text(self.episodes.dir()?),
-            "scenarios" => text(self.scenarios.dir()?),
-            "uploads" => text(self.uploads.dir()?),
-            "cache_dir" => self.twins.cache().and_then(|cache| text(cache.dir)),
+            "twins" => text(self.directories.twins.dir()?),
+            "episodes" => text(self.directories.episodes.dir()?),
+            "scenarios" => text(self.directories.scenarios.dir()?),
+            "uploads" => text(self.directories.uploads.dir()?),
+            "cache_dir" => self.directories.twins.cache().and_then(|cache| text(cache.dir)),
             "memory_gib" => Some(gib_of(default_memory_bytes()).to_string()),
             "log" => Some(self.log_filter()),
             _ => None,
@@ -167,13 +158,14 @@ impl Serve {
             .with_writer(io::stderr)
             .with_ansi(io::stderr().is_terminal())
             .init();
-        let twins = self.twins.dir()?;
+        let directories = self.directories.all()?;
+        let twins = &directories.twins;
         anyhow::ensure!(
             !twins.exists() || twins.is_dir(),
             "--twins {} is not a directory",
             twins.display()
         );
-        let found = self.twins.catalog()?.twins()?;
+        let found = self.directories.twins.catalog()?.twins()?;
         for DamagedTwin { name, error } in &found.damaged {
             tracing::error!(twin = name, "damaged, not served: {error}");
         }
@@ -194,11 +186,8 @@ impl Serve {
         };
         let config = wildcity_server::Config {
             listen: self.listen,
-            twins,
-            cache: self.twins.cache(),
-            episodes: self.episodes.dir()?,
-            scenarios: self.scenarios.dir()?,
-            uploads: self.uploads.dir()?,
+            cache: self.directories.twins.cache(),
+            directories,
             tokens,
             origins: self.origin.unwrap_or_default(),
             tls,
@@ -206,7 +195,8 @@ impl Serve {
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
             limits: self.limits.limits(self.memory_gib.map(bytes_of_gib)),
         };
-        tracing::info!(twins = %config.twins.display(), episodes = %config.episodes.display(), "serving");
+        let served = &config.directories;
+        tracing::info!(twins = %served.twins.display(), episodes = %served.episodes.display(), "serving");
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let served = runtime.block_on(async {
             // Before the address is printed: the signal may come right after.

@@ -14,6 +14,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::sync::atomic::Ordering::Relaxed;
+use std::time::Duration;
 
 use futures_util::FutureExt;
 use parking_lot::Mutex;
@@ -284,6 +285,15 @@ impl Device {
         match self.fault.lock().take() {
             None => Ok(()),
             Some(reason) => Err(self.failed(reason)),
+        }
+    }
+
+    /// How long a frame may take on this device before it counts as lost. Software Vulkan compiles a shader on one
+    /// thread when it runs for the first time, which takes long while other programs run.
+    pub(super) fn frame_timeout(&self) -> Duration {
+        match self.info.device_type {
+            DeviceType::Cpu => Duration::from_secs(300),
+            _ => Duration::from_secs(60),
         }
     }
 

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::Duration;
 
 use parking_lot::Mutex;
 use wgpu::{BufferUsages, BufferView, MapMode, PollType, SubmissionIndex};
@@ -14,9 +13,6 @@ use super::layout::{Counters, FrameView};
 use super::rasterize::pages;
 use super::resolve::Planes;
 use crate::{FrameStats, RenderError, limits};
-
-/// How long a frame may take on the device before it counts as lost.
-const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Offset of the timestamps after the counters, in bytes.
 pub(super) const TIMESTAMP_OFFSET: u64 = 256;
@@ -105,7 +101,7 @@ impl ReadBack {
     /// Waits for a submission, and maps all buffers.
     ///
     /// # Errors
-    /// The device fails, or does not finish within [`FRAME_TIMEOUT`].
+    /// The device fails, or does not finish within [`Device::frame_timeout`].
     pub(super) fn map(
         &self,
         device: &Device,
@@ -118,8 +114,8 @@ impl ReadBack {
                 failed.fetch_or(result.is_err(), Relaxed);
             });
         }
-        let wait =
-            PollType::Wait { submission_index: Some(submission), timeout: Some(FRAME_TIMEOUT) };
+        let timeout = Some(device.frame_timeout());
+        let wait = PollType::Wait { submission_index: Some(submission), timeout };
         let polled = device.device.poll(wait);
         device.check()?;
         polled.map_err(|error| device.failed(error.to_string()))?;

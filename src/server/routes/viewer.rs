@@ -1,4 +1,5 @@
-//! The viewer: the page at `/` and its files. They are built from `clients/viewer`, and part of the program.
+//! The viewer: the page at `/` and its files, which are part of the program. Script and style are built from
+//! `clients/viewer/src`; the others stand there.
 
 use axum::http::{HeaderName, header};
 use axum::response::IntoResponse;
@@ -16,7 +17,7 @@ pub(super) const FILES: [File; 4] = [
     File {
         path: "/",
         content_type: "text/html; charset=utf-8",
-        bytes: include_bytes!("../../../clients/viewer/dist/index.html"),
+        bytes: include_bytes!("../../../clients/viewer/src/index.html"),
     },
     File {
         path: "/viewer.js",
@@ -31,7 +32,7 @@ pub(super) const FILES: [File; 4] = [
     File {
         path: "/icon.svg",
         content_type: "image/svg+xml",
-        bytes: include_bytes!("../../../clients/viewer/dist/icon.svg"),
+        bytes: include_bytes!("../../../clients/viewer/src/icon.svg"),
     },
 ];
 

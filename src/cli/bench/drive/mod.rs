@@ -10,17 +10,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
-use crate::cli::backend_options::{self, BackendOptions};
-use crate::cli::directories::{TwinVersion, Twins};
 use crate::cli::{output, progress};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
-use wildcity_session::{
-    Encoding, EngineSettings, Outputs, RigChoice, Scenarios, Session, SessionOptions, Start,
-};
-use wildcity_twin::residency::{Cache, Stats};
+use wildcity_session::{Encoding, Outputs, RigChoice, Session, SessionOptions, Start};
+use wildcity_twin::residency::Stats;
 
+use super::benched_twin::BenchedTwin;
 use super::temporary_dir::TemporaryDir;
 use report::{Report, Row};
 use step::DriveStep;
@@ -34,19 +31,8 @@ use step::DriveStep;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
-    /// The twin: NAME, or NAME@NUMBER for an older version.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
-
     #[command(flatten)]
-    twins: Twins,
-
-    #[command(flatten)]
-    backend: BackendOptions,
-
-    /// Memory for the twin, in GiB [default: three quarters of the machine's]
-    #[arg(long, value_name = "GIB", value_parser = backend_options::gib)]
-    memory_gib: Option<f64>,
+    twin: BenchedTwin,
 
     /// Speed, in m/s.
     #[arg(long, value_name = "M_PER_S", default_value_t = 30.0, value_parser = speed)]
@@ -89,17 +75,8 @@ Examples:
 
 impl Drive {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let catalog = self.twins.catalog()?;
-        let version = catalog.version(&self.twin.name, self.twin.number)?;
-        let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
         let episodes = TemporaryDir::new()?;
-        let engine = wildcity_session::Engine::start(EngineSettings {
-            cache: Cache::limited(catalog, limit_bytes),
-            episodes: episodes.path().to_owned(),
-            scenarios: Scenarios::in_dir(""),
-            backend: Arc::from(self.backend.backend()?),
-            step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
-        })?;
+        let (engine, version) = self.twin.start(episodes.path())?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let report = runtime.block_on(self.drive(engine, &version.manifest))?;
         if let Some(path) = &self.csv {
@@ -180,11 +157,7 @@ impl Drive {
         let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
         let rig = rig.map(|rig| cropped(rig, self.crop));
         let outputs = Outputs::colour(Encoding::Jpeg(wildcity_session::limits::JPEG_QUALITY));
-        SessionOptions {
-            version: self.twin.number,
-            rig: rig.map(RigChoice::Full),
-            ..SessionOptions::twin(&self.twin.name, outputs)
-        }
+        SessionOptions { rig: rig.map(RigChoice::Full), ..self.twin.session(outputs) }
     }
 }
 

@@ -1,0 +1,52 @@
+//! The twin of a benchmark, in an engine of this process.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use crate::cli::backend_options::{self, BackendOptions};
+use crate::cli::directories::{TwinVersion, Twins};
+use wildcity_session::{Engine, EngineSettings, Outputs, Scenarios, SessionOptions};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Version;
+
+#[derive(Debug, clap::Args)]
+pub(super) struct BenchedTwin {
+    /// The twin: NAME, or NAME@NUMBER for an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    backend: BackendOptions,
+
+    /// Memory for the twin, in GiB [default: three quarters of the machine's]
+    #[arg(long, value_name = "GIB", value_parser = backend_options::gib)]
+    memory_gib: Option<f64>,
+}
+
+impl BenchedTwin {
+    /// Starts an engine that records to a directory, and finds the twin.
+    pub(super) fn start(&self, episodes: &Path) -> anyhow::Result<(Arc<Engine>, Version)> {
+        let catalog = self.twins.catalog()?;
+        let version = catalog.version(&self.twin.name, self.twin.number)?;
+        let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
+        let engine = Engine::start(EngineSettings {
+            cache: Cache::limited(catalog, limit_bytes),
+            episodes: episodes.to_owned(),
+            scenarios: Scenarios::in_dir(""),
+            backend: Arc::from(self.backend.backend()?),
+            step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
+        })?;
+        Ok((engine, version))
+    }
+
+    /// Options of a session on the twin.
+    pub(super) fn session(&self, outputs: Outputs) -> SessionOptions {
+        SessionOptions {
+            version: self.twin.number,
+            ..SessionOptions::twin(&self.twin.name, outputs)
+        }
+    }
+}
