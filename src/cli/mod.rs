@@ -19,6 +19,7 @@ mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod doctor;
 mod drive;
 mod episode;
 mod exit;
@@ -89,6 +90,7 @@ enum Command {
     Stress(stress::Stress),
     Report(report::Command),
     Devices(devices::Devices),
+    Doctor(doctor::Doctor),
 }
 
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure, and 3
@@ -120,6 +122,7 @@ pub fn main() -> ExitCode {
         Command::Stress(command) => command.run(),
         Command::Report(command) => command.run(),
         Command::Devices(command) => command.run(),
+        Command::Doctor(command) => command.run(),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -3,6 +3,7 @@
 mod drive;
 mod gpu;
 mod load;
+mod soak;
 mod step;
 mod timed;
 
@@ -12,7 +13,8 @@ mod timed;
 Examples:
   wildcity bench step street.ply --cameras cameras.json
   wildcity bench drive street --csv steps.csv
-  wildcity bench load street")]
+  wildcity bench load street
+  wildcity bench soak street")]
 pub(super) struct Bench {
     #[command(subcommand)]
     subcommand: Subcommand,
@@ -24,6 +26,7 @@ enum Subcommand {
     Gpu(gpu::Gpu),
     Drive(Box<drive::Drive>),
     Load(load::Load),
+    Soak(soak::Soak),
 }
 
 impl Bench {
@@ -33,6 +36,7 @@ impl Bench {
             Subcommand::Gpu(gpu) => gpu.run(),
             Subcommand::Drive(drive) => drive.run(),
             Subcommand::Load(load) => load.run(),
+            Subcommand::Soak(soak) => soak.run(),
         }
     }
 }
