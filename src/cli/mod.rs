@@ -19,6 +19,7 @@ mod bisect;
 mod demo;
 mod devices;
 mod directories;
+mod doctor;
 mod drive;
 mod episode;
 mod exit;
@@ -92,6 +93,7 @@ enum Command {
     Stress(stress::Stress),
     Report(report::Command),
     Devices(devices::Devices),
+    Doctor(doctor::Doctor),
 }
 
 /// Parses the command line, runs the command, and returns the exit code: 0 for success, 1 for a failure, and 3
@@ -124,6 +126,7 @@ pub fn main() -> ExitCode {
         Command::Stress(command) => command.run(),
         Command::Report(command) => command.run(),
         Command::Devices(command) => command.run(),
+        Command::Doctor(command) => command.run(),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -48,6 +48,7 @@ mod generate;
 mod import;
 mod kills;
 mod load;
+mod operations;
 mod push;
 mod remote;
 mod repair;

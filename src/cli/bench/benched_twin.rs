@@ -13,17 +13,17 @@ use wildcity_twin::store::Version;
 pub(super) struct BenchedTwin {
     /// The twin: NAME, or NAME@NUMBER for an older version.
     #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
+    pub(super) twin: TwinVersion,
 
     #[command(flatten)]
-    twins: Twins,
+    pub(super) twins: Twins,
 
     #[command(flatten)]
-    backend: BackendOptions,
+    pub(super) backend: BackendOptions,
 
     /// Memory for the twin, in GiB [default: three quarters of the machine's]
     #[arg(long, value_name = "GIB", value_parser = backend_options::gib)]
-    memory_gib: Option<f64>,
+    pub(super) memory_gib: Option<f64>,
 }
 
 impl BenchedTwin {

@@ -5,6 +5,7 @@ mod drive;
 mod gpu;
 mod load;
 mod sessions;
+mod soak;
 mod step;
 mod temporary_dir;
 mod timed;
@@ -16,7 +17,8 @@ Examples:
   wildcity bench step street.ply --cameras cameras.json
   wildcity bench drive street --csv steps.csv
   wildcity bench sessions street --size 96x60
-  wildcity bench load street")]
+  wildcity bench load street
+  wildcity bench soak street")]
 pub(super) struct Bench {
     #[command(subcommand)]
     subcommand: Subcommand,
@@ -29,6 +31,7 @@ enum Subcommand {
     Drive(Box<drive::Drive>),
     Sessions(Box<sessions::Sessions>),
     Load(load::Load),
+    Soak(soak::Soak),
 }
 
 impl Bench {
@@ -39,6 +42,7 @@ impl Bench {
             Subcommand::Drive(drive) => drive.run(),
             Subcommand::Sessions(sessions) => sessions.run(),
             Subcommand::Load(load) => load.run(),
+            Subcommand::Soak(soak) => soak.run(),
         }
     }
 }

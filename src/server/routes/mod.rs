@@ -3,9 +3,11 @@
 mod cors;
 mod episodes;
 mod metrics;
+mod openapi;
 mod pushes;
 mod refusal;
 mod sessions;
+mod table;
 mod tickets;
 mod twins;
 mod uploads;
@@ -18,7 +20,6 @@ use axum::extract::{DefaultBodyLimit, Request, State};
 use axum::http::{Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
-use axum::routing::{get, post};
 use axum::{Json, Router};
 
 use crate::auth::Grant;
@@ -28,42 +29,18 @@ use crate::newcomers::ConnectionSlot;
 use crate::state::ServerState;
 
 use refusal::Refusal;
+use table::Row;
 
 /// The routes of a server.
 pub(crate) fn router(state: Arc<ServerState>) -> Router {
     let json_limit = DefaultBodyLimit::max(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES);
-    let pages = viewer::FILES.iter().fold(Router::new(), |pages, &file| {
-        pages.route(file.path, get(async move || file.response()))
-    });
-    Router::new()
-        .route("/v1/session", get(websocket::upgrade))
-        .route("/v1/sessions", get(sessions::list))
-        .route("/v1/sessions/{session}/watch", get(websocket::watch))
-        .route("/v1/tickets", post(tickets::issue))
-        .route("/v1/episodes", get(episodes::list))
-        .route("/v1/episodes/{episode}", get(episodes::show))
-        .route("/v1/twins", get(twins::list))
-        .route("/v1/twins/{twin}", get(twins::show))
-        .route("/v1/twins/{twin}/versions", get(twins::versions))
-        .route("/v1/twins/{twin}/trajectories/{name}", get(twins::trajectory))
-        .route("/v1/twins/{twin}/rollback", post(twins::rollback))
-        .route("/v1/twins/{twin}/pushes", post(pushes::begin))
-        .route("/v1/twins/{twin}/pushes/{id}", get(pushes::show).delete(pushes::cancel))
-        .route("/v1/uploads", post(uploads::begin))
-        // The body of an upload is not held in memory: it is written to disk as it arrives.
-        .route(
-            "/v1/uploads/{id}",
-            get(uploads::show)
-                .delete(uploads::delete)
-                .patch(uploads::append)
-                .layer(DefaultBodyLimit::disable()),
-        )
-        .route("/metrics", get(metrics::show))
-        // The routes above need a token on a server with tokens; those below need none.
+    let all = |rows: Vec<Row>| {
+        rows.into_iter()
+            .fold(Router::new(), |router, row| router.route(row.operation.path, row.handler))
+    };
+    all(table::guarded())
         .route_layer(from_fn_with_state(state.clone(), authorize))
-        .route("/healthz", get(async || "ok\n"))
-        .route("/readyz", get(ready))
-        .merge(pages)
+        .merge(all(table::open()))
         .fallback(no_route)
         .method_not_allowed_fallback(no_method)
         .layer(json_limit)

@@ -42,6 +42,11 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
      base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 impl File {
+    /// The content type without its parameters.
+    pub(super) fn media_type(self) -> &'static str {
+        self.content_type.split_once(';').map_or(self.content_type, |(media_type, _)| media_type)
+    }
+
     /// The answer to a request for the file.
     pub(super) fn response(self) -> impl IntoResponse {
         let headers: [(HeaderName, &'static str); 5] = [

@@ -1,0 +1,248 @@
+//! `wildcity doctor`.
+
+use std::fs;
+use std::io::{self, Write};
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::thread::available_parallelism;
+use std::time::SystemTime;
+
+use serde_json::json;
+
+use wildcity_render::gpu::devices;
+use wildcity_twin::residency::default_memory_bytes;
+
+use super::directories::{Episodes, Twins, Uploads};
+use super::exit::Exit;
+
+/// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
+///
+/// Prints one line for each check. A line that begins with `bad` says what to do; then the exit code is 1.
+/// `note` is no obstacle. Nothing is changed: to see whether a directory can be written, a file without a name
+/// in it is created and removed.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Doctor {
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    episodes: Episodes,
+
+    #[command(flatten)]
+    uploads: Uploads,
+
+    /// Print one JSON array on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity doctor
+  wildcity doctor --twins s3://city/twins";
+
+/// Memory below which a city of some blocks does not fit.
+const LITTLE_MEMORY_BYTES: u64 = 2 << 30;
+/// Free space below which a push or a day of records may fail.
+const LITTLE_DISK_BYTES: u64 = 5 << 30;
+/// Files of a full server: 1,024 connections, 512 newcomers, and what it reads.
+const FILES: u64 = 4096;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Level {
+    Good,
+    Note,
+    Bad,
+}
+
+/// The result of one check.
+#[derive(Debug)]
+struct Finding {
+    level: Level,
+    about: &'static str,
+    text: String,
+}
+
+impl Finding {
+    fn new(level: Level, about: &'static str, text: String) -> Self {
+        Self { level, about, text }
+    }
+}
+
+impl Level {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Good => "ok",
+            Self::Note => "note",
+            Self::Bad => "bad",
+        }
+    }
+}
+
+impl Doctor {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let mut findings =
+            vec![devices_found(), processors(), memory(), open_files(), clock(), port()];
+        let directories = [("episodes", self.episodes.dir()?), ("uploads", self.uploads.dir()?)];
+        findings.extend(directories.map(|(about, dir)| disk(about, &dir)));
+        findings.extend(self.twins());
+        let mut out = io::stdout().lock();
+        if self.json {
+            let of = |Finding { level, about, text }: &Finding| json!({ "level": level.name(), "about": about, "text": text });
+            writeln!(out, "{}", json!(findings.iter().map(of).collect::<Vec<_>>()))?;
+        } else {
+            for Finding { level, about, text } in &findings {
+                writeln!(out, "{:<5}{about:<11}{text}", level.name())?;
+            }
+        }
+        let bad = findings.iter().filter(|finding| finding.level == Level::Bad).count();
+        if bad > 0 {
+            let message = format!("{bad} of {} checks failed", findings.len());
+            return Err(Exit { code: 1, message }.into());
+        }
+        Ok(())
+    }
+
+    /// The directory or the object store of the twins, and the twins.
+    fn twins(&self) -> Vec<Finding> {
+        let bad = |text: String| vec![Finding::new(Level::Bad, "twins", text)];
+        let dir = match self.twins.dir() {
+            Ok(dir) => dir,
+            Err(error) => return bad(format!("{error:#}")),
+        };
+        let is_remote = dir.to_string_lossy().contains("://");
+        let mut findings = match is_remote {
+            true => Vec::new(),
+            false => vec![disk("twins", &dir)],
+        };
+        let begun = std::time::Instant::now();
+        match self.twins.catalog().and_then(|catalog| Ok(catalog.twins()?)) {
+            Ok(list) => {
+                let text = format!(
+                    "{} twins in {}, listed in {} ms",
+                    list.twins.len(),
+                    dir.display(),
+                    begun.elapsed().as_millis()
+                );
+                let level = if list.twins.is_empty() { Level::Note } else { Level::Good };
+                findings.push(Finding::new(level, "twins", text));
+                for damaged in list.damaged {
+                    let text = format!(
+                        "{} is damaged: {}; wildcity twin fsck {} says more",
+                        damaged.name, damaged.error, damaged.name
+                    );
+                    findings.push(Finding::new(Level::Bad, "twins", text));
+                }
+            }
+            Err(error) => findings.extend(bad(format!("{}: {error:#}", dir.display()))),
+        }
+        findings
+    }
+}
+
+fn devices_found() -> Finding {
+    let devices = devices();
+    match devices.iter().find(|device| device.kind != "cpu") {
+        Some(device) => {
+            let text = format!("{} ({}), driver {}", device.name, device.kind, device.driver);
+            Finding::new(Level::Good, "gpu", text)
+        }
+        None => {
+            let found = match devices.is_empty() {
+                true => "no Vulkan device",
+                false => "no Vulkan device but software",
+            };
+            let text = format!(
+                "{found}: the server renders on the CPU. For a GPU install its driver with Vulkan, and in a \
+                 container NVIDIA_DRIVER_CAPABILITIES=graphics"
+            );
+            Finding::new(Level::Note, "gpu", text)
+        }
+    }
+}
+
+fn processors() -> Finding {
+    let count = available_parallelism().map_or(1, usize::from);
+    Finding::new(Level::Good, "processors", format!("{count} for this process"))
+}
+
+fn memory() -> Finding {
+    let bytes = default_memory_bytes();
+    let text = format!("{:.1} GiB for Gaussians, unless --memory-gib says otherwise", gib(bytes));
+    match bytes >= LITTLE_MEMORY_BYTES {
+        true => Finding::new(Level::Good, "memory", text),
+        false => {
+            Finding::new(Level::Note, "memory", format!("{text}: enough for small twins alone"))
+        }
+    }
+}
+
+/// The limit of open files, as Linux gives it.
+fn open_files() -> Finding {
+    let limits = fs::read_to_string("/proc/self/limits").unwrap_or_default();
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files"));
+    let soft = line.and_then(|line| line.split_whitespace().next());
+    match soft.map(str::parse::<u64>) {
+        Some(Ok(files)) if files < FILES => {
+            let text = format!("at most {files}, and a full server has {FILES}: ulimit -n {FILES}");
+            Finding::new(Level::Note, "open files", text)
+        }
+        Some(Ok(files)) => Finding::new(Level::Good, "open files", format!("at most {files}")),
+        // `unlimited`, or another system.
+        _ => Finding::new(Level::Good, "open files", "no limit is known".to_owned()),
+    }
+}
+
+/// A clock that is behind the program's own file is wrong: tokens of object stores and certificates need it.
+fn clock() -> Finding {
+    let built = std::env::current_exe().and_then(fs::metadata).and_then(|file| file.modified());
+    let behind = built.ok().and_then(|built| built.duration_since(SystemTime::now()).ok());
+    match behind.filter(|behind| behind.as_secs() > 60) {
+        Some(behind) => {
+            let text = format!("{} s behind the file of this program: set it", behind.as_secs());
+            Finding::new(Level::Bad, "clock", text)
+        }
+        None => {
+            Finding::new(Level::Good, "clock", "not behind the file of this program".to_owned())
+        }
+    }
+}
+
+fn port() -> Finding {
+    let address = wildcity_server::limits::LISTEN;
+    match TcpListener::bind(address) {
+        Ok(_) => Finding::new(Level::Good, "port", format!("{address} is free")),
+        Err(error) => {
+            let text = format!("{address}: {error}; a server may run already, or give --listen");
+            Finding::new(Level::Note, "port", text)
+        }
+    }
+}
+
+/// Whether a directory can be written, and its free space.
+fn disk(about: &'static str, dir: &Path) -> Finding {
+    // It may not exist yet: then the server makes it in its nearest parent.
+    let existing =
+        dir.ancestors().find(|dir| dir.is_dir()).map_or(PathBuf::from("."), PathBuf::from);
+    if let Err(error) = tempfile::tempfile_in(&existing) {
+        let text = format!("{} cannot be written: {error}", existing.display());
+        return Finding::new(Level::Bad, about, text);
+    }
+    match rustix::fs::statvfs(&existing) {
+        Ok(disk) => {
+            let free_bytes = disk.f_bavail.saturating_mul(disk.f_frsize);
+            let text = format!("{}: {:.1} GiB free", dir.display(), gib(free_bytes));
+            let level = if free_bytes < LITTLE_DISK_BYTES { Level::Note } else { Level::Good };
+            Finding::new(level, about, text)
+        }
+        Err(error) => {
+            let text = format!("{}: its free space is not known: {error}", dir.display());
+            Finding::new(Level::Note, about, text)
+        }
+    }
+}
+
+fn gib(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 30)
+}

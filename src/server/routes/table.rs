@@ -1,0 +1,302 @@
+//! Every route, with what `/v1/openapi.json` says about it. The router is made from this table, so that it has no route
+//! that the document does not have.
+
+use std::sync::Arc;
+
+use axum::extract::DefaultBodyLimit;
+use axum::handler::Handler;
+use axum::routing::{MethodFilter, MethodRouter, on};
+
+use crate::state::ServerState;
+
+use super::{
+    episodes, metrics, openapi, pushes, ready, sessions, tickets, twins, uploads, viewer, websocket,
+};
+
+/// A method of a path.
+#[derive(Clone, Copy)]
+#[cfg_attr(
+    not(test),
+    expect(dead_code, reason = "the test that writes the document reads the rest")
+)]
+pub(super) struct Operation {
+    pub(super) method: Method,
+    /// As axum and OpenAPI write it: `/v1/twins/{twin}`.
+    pub(super) path: &'static str,
+    /// The role that a token needs; none if no token is needed.
+    pub(super) role: Option<&'static str>,
+    /// What it does.
+    pub(super) summary: &'static str,
+    /// Status of success, and what is sent then.
+    pub(super) success: u16,
+    pub(super) answer: Content,
+    pub(super) body: Content,
+    /// Parameters beside those of the path.
+    pub(super) parameters: &'static [Parameter],
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Method {
+    Get,
+    Post,
+    Patch,
+    Delete,
+}
+
+/// What a body is.
+#[derive(Clone, Copy)]
+#[cfg_attr(
+    not(test),
+    expect(dead_code, reason = "the test that writes the document reads the rest")
+)]
+pub(super) enum Content {
+    None,
+    /// The schema of this name in `protocol/schema`.
+    Json(&'static str),
+    /// An object with a list of a schema's values under a name.
+    List(&'static str, &'static str),
+    /// An object without a schema of its own.
+    Object,
+    /// Anything else, by its media type.
+    Other(&'static str),
+}
+
+/// A parameter of the query or a header.
+#[derive(Clone, Copy)]
+#[cfg_attr(
+    not(test),
+    expect(dead_code, reason = "the test that writes the document reads the rest")
+)]
+pub(super) struct Parameter {
+    pub(super) name: &'static str,
+    /// `query` or `header`.
+    pub(super) place: &'static str,
+    /// `integer`, `number` or `string`.
+    pub(super) kind: &'static str,
+    pub(super) is_required: bool,
+    pub(super) description: &'static str,
+}
+
+/// A route: its description, and its handler.
+pub(super) struct Row {
+    pub(super) operation: Operation,
+    pub(super) handler: MethodRouter<Arc<ServerState>>,
+}
+
+impl Operation {
+    const fn new(
+        method: Method,
+        path: &'static str,
+        role: Option<&'static str>,
+        summary: &'static str,
+    ) -> Self {
+        Self {
+            method,
+            path,
+            role,
+            summary,
+            success: 200,
+            answer: Content::None,
+            body: Content::None,
+            parameters: &[],
+        }
+    }
+
+    const fn answers(self, success: u16, answer: Content) -> Self {
+        Self { success, answer, ..self }
+    }
+
+    const fn takes(self, body: Content) -> Self {
+        Self { body, ..self }
+    }
+
+    const fn with(self, parameters: &'static [Parameter]) -> Self {
+        Self { parameters, ..self }
+    }
+
+    fn does<H: Handler<T, Arc<ServerState>>, T: 'static>(self, handler: H) -> Row {
+        let method = match self.method {
+            Method::Get => MethodFilter::GET,
+            Method::Post => MethodFilter::POST,
+            Method::Patch => MethodFilter::PATCH,
+            Method::Delete => MethodFilter::DELETE,
+        };
+        Row { operation: self, handler: on(method, handler) }
+    }
+}
+
+const TICKET: Parameter = Parameter {
+    name: "ticket",
+    place: "query",
+    kind: "string",
+    is_required: false,
+    description: "A ticket instead of the header Authorization.",
+};
+
+const fn query(name: &'static str, kind: &'static str, description: &'static str) -> Parameter {
+    Parameter { name, place: "query", kind, is_required: false, description }
+}
+
+const DRIVE_PARAMETERS: &[Parameter] = &[
+    query("version", "integer", "Version of the twin; the latest if absent."),
+    query("from_m", "number", "Station of the first pose, in metres."),
+    query("to_m", "number", "Station of the last pose, in metres."),
+    query(
+        "every_m",
+        "number",
+        "Distance between two poses, in metres; the recorded keyframes if absent.",
+    ),
+];
+
+const UPLOAD_PARAMETERS: &[Parameter] = &[
+    Parameter {
+        name: "Upload-Offset",
+        place: "header",
+        kind: "integer",
+        is_required: true,
+        description: "Where the bytes of the body begin in the file.",
+    },
+    Parameter {
+        name: "Content-Digest",
+        place: "header",
+        kind: "string",
+        is_required: false,
+        description: "Digest of the body, as RFC 9530 says.",
+    },
+];
+
+const DRIVE: Option<&str> = Some("drive");
+const PUSH: Option<&str> = Some("push");
+const ADMIN: Option<&str> = Some("admin");
+const ANY: Option<&str> = Some("any");
+
+const TEXT: Content = Content::Other("text/plain");
+
+/// The routes that need a token on a server with tokens.
+pub(super) fn guarded() -> Vec<Row> {
+    use Content::{Json, List, Object, Other};
+    use Method::{Delete, Get, Patch, Post};
+    let op = Operation::new;
+    let mut rows = vec![
+        op(
+            Get,
+            "/v1/session",
+            DRIVE,
+            "Upgrade to the WebSocket of a session (subprotocol wildcity.v1).",
+        )
+        .answers(101, Content::None)
+        .with(&[TICKET])
+        .does(websocket::upgrade),
+        op(Get, "/v1/sessions", ADMIN, "All sessions.")
+            .answers(200, List("sessions", "session"))
+            .does(sessions::list),
+        op(
+            Get,
+            "/v1/sessions/{session}/watch",
+            DRIVE,
+            "Upgrade to a WebSocket with a session's observations.",
+        )
+        .answers(101, Content::None)
+        .with(&[TICKET])
+        .does(websocket::watch),
+        op(
+            Post,
+            "/v1/tickets",
+            ANY,
+            "A ticket, which stands for the token in the address of one WebSocket.",
+        )
+        .answers(201, Json("ticket"))
+        .does(tickets::issue),
+        op(Get, "/v1/episodes", ADMIN, "The newest recorded episodes, the newest first.")
+            .answers(200, List("episodes", "episode"))
+            .does(episodes::list),
+        op(Get, "/v1/episodes/{episode}", ADMIN, "The record of an episode, a JSON object a line.")
+            .answers(200, Other("application/x-ndjson"))
+            .does(episodes::show),
+        op(Get, "/v1/twins", ANY, "The latest version of every twin.")
+            .answers(200, List("twins", "answer#TwinInfo"))
+            .does(twins::list),
+        op(Get, "/v1/twins/{twin}", ANY, "The latest version of a twin.")
+            .answers(200, Json("answer#TwinInfo"))
+            .does(twins::show),
+        op(Get, "/v1/twins/{twin}/versions", ANY, "All versions of a twin, the latest last.")
+            .answers(200, List("versions", "version"))
+            .does(twins::versions),
+        op(Get, "/v1/twins/{twin}/trajectories/{name}", ANY, "Poses of a recorded drive.")
+            .answers(200, Json("drive"))
+            .with(DRIVE_PARAMETERS)
+            .does(twins::trajectory),
+        op(
+            Post,
+            "/v1/twins/{twin}/rollback",
+            ADMIN,
+            "Makes an old version the latest, under a new number.",
+        )
+        .takes(Json("rollback"))
+        .answers(200, Object)
+        .does(twins::rollback),
+        op(Post, "/v1/twins/{twin}/pushes", PUSH, "Makes a new version from uploads.")
+            .takes(Json("new_push"))
+            .answers(202, Json("push"))
+            .does(pushes::begin),
+        op(Get, "/v1/twins/{twin}/pushes/{id}", PUSH, "State of a push.")
+            .answers(200, Json("push"))
+            .does(pushes::show),
+        op(Delete, "/v1/twins/{twin}/pushes/{id}", PUSH, "Cancels a push.")
+            .answers(200, Json("push"))
+            .does(pushes::cancel),
+        op(
+            Post,
+            "/v1/uploads",
+            PUSH,
+            "Announces a file; 200 instead if all of its bytes are there already.",
+        )
+        .takes(Json("new_upload"))
+        .answers(201, Json("upload"))
+        .does(uploads::begin),
+        op(Get, "/v1/uploads/{id}", PUSH, "State of an upload.")
+            .answers(200, Json("upload"))
+            .does(uploads::show),
+        op(Delete, "/v1/uploads/{id}", PUSH, "Removes an upload.")
+            .answers(204, Content::None)
+            .does(uploads::delete),
+        op(Get, "/metrics", ADMIN, "Metrics for Prometheus.")
+            .answers(200, Other("application/openmetrics-text"))
+            .does(metrics::show),
+    ];
+    // The body of an upload is not held in memory: it is written to disk as it arrives.
+    let mut append = op(
+        Patch,
+        "/v1/uploads/{id}",
+        PUSH,
+        "Sends bytes of a file, from the offset that the upload is at.",
+    )
+    .takes(Other("application/octet-stream"))
+    .answers(200, Json("upload"))
+    .with(UPLOAD_PARAMETERS)
+    .does(uploads::append);
+    append.handler = append.handler.layer(DefaultBodyLimit::disable());
+    rows.push(append);
+    rows
+}
+
+/// The routes that need no token.
+pub(super) fn open() -> Vec<Row> {
+    use Method::Get;
+    let op = Operation::new;
+    let mut rows = vec![
+        op(Get, "/healthz", None, "Whether the process runs.")
+            .answers(200, TEXT)
+            .does(async || "ok\n"),
+        op(Get, "/readyz", None, "Whether sessions can be opened.").answers(200, TEXT).does(ready),
+        op(Get, "/v1/openapi.json", None, "This document.")
+            .answers(200, Content::Object)
+            .does(openapi::show),
+    ];
+    rows.extend(viewer::FILES.iter().map(|&file| {
+        let answer = Content::Other(file.media_type());
+        let summary = "A file of the viewer.";
+        op(Get, file.path, None, summary).answers(200, answer).does(async move || file.response())
+    }));
+    rows
+}

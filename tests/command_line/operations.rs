@@ -1,0 +1,84 @@
+//! `wildcity doctor` and `wildcity bench soak`.
+
+use std::fs;
+use std::path::Path;
+use std::process::Output;
+
+use serde_json::Value;
+
+use crate::city_twin::city;
+use crate::{support, wildcity};
+
+fn doctor(twins: &Path, episodes: &Path, uploads: &Path) -> Output {
+    let mut command = wildcity();
+    command.args(["doctor", "--json", "--twins"]).arg(twins);
+    command.arg("--episodes").arg(episodes).arg("--uploads").arg(uploads);
+    command.output().unwrap()
+}
+
+/// The findings of the doctor about one thing: their levels and texts.
+fn about(output: &Output, subject: &str) -> Vec<(String, String)> {
+    let findings: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let text = |finding: &Value, field: &str| finding[field].as_str().unwrap().to_owned();
+    let findings = findings.as_array().unwrap().iter();
+    let found = findings.filter(|finding| finding["about"] == subject);
+    found.map(|finding| (text(finding, "level"), text(finding, "text"))).collect()
+}
+
+#[test]
+fn the_doctor_finds_nothing_wrong_with_this_machine() {
+    let dir = tempfile::tempdir().unwrap();
+    let below = |name: &str| dir.path().join(name);
+    let output = doctor(&below("twins"), &below("episodes"), &below("uploads"));
+    assert!(output.status.success(), "{output:?}");
+    for subject in ["gpu", "processors", "memory", "clock", "episodes", "uploads", "twins"] {
+        let found = about(&output, subject);
+        assert!(!found.is_empty(), "nothing about {subject}");
+        assert!(found.iter().all(|(level, _)| level != "bad"), "{subject}: {found:?}");
+    }
+    // Looking creates nothing.
+    assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn the_doctor_names_what_is_wrong() {
+    let dir = tempfile::tempdir().unwrap();
+    let twins = support::twins();
+    fs::write(twins.path().join("test/log/0000000002"), "").unwrap();
+    let output = doctor(twins.path(), Path::new("/proc/episodes"), dir.path());
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let [(level, text)] = &about(&output, "episodes")[..] else { panic!("{output:?}") };
+    assert!(level == "bad" && text.contains("/proc cannot be written"), "{text}");
+    let damaged = about(&output, "twins");
+    let is_named = |(level, text): &(String, String)| {
+        level == "bad" && text.starts_with("test is damaged") && text.contains("fsck test")
+    };
+    assert!(damaged.iter().any(is_named), "{damaged:?}");
+}
+
+fn soak(arguments: &[&str]) -> Output {
+    let mut command = wildcity();
+    command.args(["bench", "soak", "city", "--backend", "cpu", "--sessions", "3", "--steps", "4"]);
+    command.args(["--memory-gib", "0.2", "--twins"]).arg(city().dir.path());
+    command.args(arguments).output().unwrap()
+}
+
+#[test]
+fn a_soak_repeats_rounds_and_compares_their_images() {
+    let output = soak(&["--minutes", "0.1", "--growth", "1000"]);
+    assert!(output.status.success(), "{output:?}");
+    let text = String::from_utf8(output.stdout).unwrap();
+    let line = text.lines().last().unwrap();
+    let rounds = line.split(" steps in ").nth(1).and_then(|rest| rest.split(' ').next());
+    assert!(rounds.unwrap().parse::<u32>().unwrap() > 3, "no session drove a second round: {line}");
+    assert!(line.contains("every image as in its first round"), "{line}");
+}
+
+#[test]
+fn a_soak_whose_memory_grows_fails() {
+    // No growth at all is still more than this.
+    let output = soak(&["--minutes", "0.02", "--growth=-1"]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let text = String::from_utf8(output.stderr).unwrap();
+    assert!(text.contains("memory grew by"), "{text}");
+}
