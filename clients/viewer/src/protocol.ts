@@ -119,9 +119,12 @@ export interface Metadata {
 /** A message that breaks the protocol. */
 export class ProtocolError extends Error {}
 
+/** Bytes of a value of each type of tensor. */
+const VALUE_BYTES = { U8: 1, U16: 2, F32: 4 };
+
 /** A tensor of an observation; its bytes are those of the message, not a copy. */
 export interface Tensor {
-  dtype: "U8" | "F32";
+  dtype: keyof typeof VALUE_BYTES;
   shape: number[];
   bytes: Uint8Array<ArrayBuffer>;
 }
@@ -162,10 +165,10 @@ export function parseObservation(message: ArrayBuffer): Observation {
   const ranges: [number, number][] = [];
   for (const [name, entry] of Object.entries(entries)) {
     const { dtype, shape, data_offsets: offsets } = entry ?? {};
-    if (dtype !== "U8" && dtype !== "F32") fail(`${name}: dtype ${dtype}`);
+    if (!Object.hasOwn(VALUE_BYTES, dtype)) fail(`${name}: dtype ${dtype}`);
     if (!isCounts(shape) || !isCounts(offsets) || offsets.length !== 2) return fail(`${name}: shape or offsets`);
     const [begin, end] = offsets as [number, number];
-    const size = shape.reduce((product, side) => product * side, dtype === "U8" ? 1 : 4);
+    const size = shape.reduce((product, side) => product * side, VALUE_BYTES[dtype as Tensor["dtype"]]);
     if (end < begin || end - begin !== size || start + end > message.byteLength) fail(`${name}: offsets`);
     tensors.set(name, { dtype, shape, bytes: new Uint8Array(message, start + begin, size) });
     ranges.push([begin, end]);
