@@ -13,10 +13,15 @@ use crate::message::Pose;
 #[serde(deny_unknown_fields)]
 pub struct NewUpload {
     /// Name of the file, for reports.
+    #[cfg_attr(
+        feature = "schema",
+        schemars(regex(pattern = r"^[^/\\\x00-\x1F\x7F-\x9F]{1,255}$"))
+    )]
     pub name: String,
     /// Size of the file, in bytes.
     pub size: u64,
     /// Digest of the file, as `blake3:` or `sha-256:` followed by 64 hex digits.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = "^(blake3|sha-256):[0-9a-f]{64}$")))]
     pub digest: String,
 }
 
@@ -43,8 +48,10 @@ pub struct Upload {
 pub struct NewPush {
     /// Id of the push, so that it can be sent again safely. If absent, it is made from the content.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = crate::message::NAME_PATTERN)))]
     pub id: Option<String>,
     /// The scene files, which are merged into one scene.
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
     pub files: Vec<PushFile>,
     /// The version that the push is based on. If absent, the latest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -55,15 +62,18 @@ pub struct NewPush {
     /// Storage format of a Gaussian: `f32`, `h52`, `q32` or `q24`. If absent, that of the base version;
     /// `q32` in a new twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = "^(f32|h52|q32|q24)$")))]
     pub record: Option<String>,
     /// Whether to build levels of detail.
     #[serde(default = "yes")]
     pub levels: bool,
     /// Changes of the render profile from the base version's, for example `near=0.2`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "schema", schemars(inner(regex(pattern = "^[a-z_]+=.+$"))))]
     pub profile: Vec<String>,
     /// A description of the version, for people.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(length(max = 1_000)))]
     pub note: Option<String>,
     /// Where to compare the images before and after the push.
     #[serde(default, rename = "golden")]
@@ -95,7 +105,7 @@ pub enum CellSelection {
     All(AllCells),
     /// A list of cells (x, y). Cell (i, j) is centred on (64 i, 64 j) m. Gaussians in other cells are left
     /// out.
-    Listed(Vec<[i32; 2]>),
+    Listed(#[cfg_attr(feature = "schema", schemars(length(min = 1)))] Vec<[i32; 2]>),
 }
 
 /// The string `all`.
@@ -117,6 +127,7 @@ pub enum AllCells {
 pub struct PreviewRequest {
     /// Poses of the rig, `world_from_rig`. If absent, a few along the twin's first trajectory.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(length(max = 32)))]
     pub poses: Option<Vec<Pose>>,
     /// Refuse the push if the PSNR at any pose is below this, in dB.
     #[serde(skip_serializing_if = "Option::is_none")]

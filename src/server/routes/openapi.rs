@@ -19,7 +19,7 @@ mod tests {
 
     use serde_json::{Map, Value, json};
 
-    use super::super::table::{self, Content, Method, Operation, Parameter};
+    use super::super::table::{self, Content, Kind, Method, Operation, Parameter};
     use super::*;
 
     fn protocol() -> PathBuf {
@@ -67,10 +67,14 @@ mod tests {
         }
     }
 
-    /// Lets references lead to the document's schemas, and collects their names.
+    /// Lets references lead to the document's schemas, and collects their names. Says how large integers may be, which
+    /// JSON Schema's formats do not.
     fn rename(prefix: &str, schema: &mut Value, named: &mut Vec<String>) {
         match schema {
             Value::Object(fields) => {
+                if fields.get("format").is_some_and(|format| format == "uint64") {
+                    fields.insert("maximum".to_owned(), u64::MAX.into());
+                }
                 for (key, value) in fields {
                     let definition = value.as_str().and_then(|text| text.strip_prefix("#/$defs/"));
                     if let (true, Some(name)) = (key == "$ref", definition.map(str::to_owned)) {
@@ -107,12 +111,24 @@ mod tests {
     fn parameters(operation: &Operation) -> Vec<Value> {
         let in_path = operation.path.split('{').skip(1).map(|rest| rest.split('}').next().unwrap());
         let in_path = in_path.map(|name| {
-            json!({ "name": name, "in": "path", "required": true, "schema": { "type": "string" } })
+            // A trajectory may have any name.
+            let mut schema = json!({ "type": "string" });
+            if name != "name" {
+                schema["pattern"] = "^[a-z0-9_-][a-z0-9._-]{0,63}$".into();
+            }
+            json!({ "name": name, "in": "path", "required": true, "schema": schema })
         });
         let others = operation.parameters.iter().map(|parameter| {
             let Parameter { name, place, kind, is_required, description } = parameter;
+            let most = u64::MAX;
+            let schema = match kind {
+                Kind::Count => json!({ "type": "integer", "minimum": 0, "maximum": most }),
+                Kind::Number => json!({ "type": "number" }),
+                Kind::Length => json!({ "type": "number", "exclusiveMinimum": 0 }),
+                Kind::Text => json!({ "type": "string" }),
+            };
             json!({ "name": name, "in": place, "required": is_required, "description": description,
-                    "schema": { "type": kind } })
+                    "schema": schema })
         });
         in_path.chain(others).collect()
     }

@@ -61,6 +61,17 @@ pub(super) enum Content {
     Other(&'static str),
 }
 
+/// What a parameter may be.
+#[derive(Clone, Copy)]
+pub(super) enum Kind {
+    /// An integer from 0.
+    Count,
+    Number,
+    /// A number above 0.
+    Length,
+    Text,
+}
+
 /// A parameter of the query or a header.
 #[derive(Clone, Copy)]
 #[cfg_attr(
@@ -71,8 +82,7 @@ pub(super) struct Parameter {
     pub(super) name: &'static str,
     /// `query` or `header`.
     pub(super) place: &'static str,
-    /// `integer`, `number` or `string`.
-    pub(super) kind: &'static str,
+    pub(super) kind: Kind,
     pub(super) is_required: bool,
     pub(super) description: &'static str,
 }
@@ -128,22 +138,22 @@ impl Operation {
 const TICKET: Parameter = Parameter {
     name: "ticket",
     place: "query",
-    kind: "string",
+    kind: Kind::Text,
     is_required: false,
     description: "A ticket instead of the header Authorization.",
 };
 
-const fn query(name: &'static str, kind: &'static str, description: &'static str) -> Parameter {
+const fn query(name: &'static str, kind: Kind, description: &'static str) -> Parameter {
     Parameter { name, place: "query", kind, is_required: false, description }
 }
 
 const DRIVE_PARAMETERS: &[Parameter] = &[
-    query("version", "integer", "Version of the twin; the latest if absent."),
-    query("from_m", "number", "Station of the first pose, in metres."),
-    query("to_m", "number", "Station of the last pose, in metres."),
+    query("version", Kind::Count, "Version of the twin; the latest if absent."),
+    query("from_m", Kind::Number, "Station of the first pose, in metres."),
+    query("to_m", Kind::Number, "Station of the last pose, in metres."),
     query(
         "every_m",
-        "number",
+        Kind::Length,
         "Distance between two poses, in metres; the recorded keyframes if absent.",
     ),
 ];
@@ -152,14 +162,14 @@ const UPLOAD_PARAMETERS: &[Parameter] = &[
     Parameter {
         name: "Upload-Offset",
         place: "header",
-        kind: "integer",
+        kind: Kind::Count,
         is_required: true,
         description: "Where the bytes of the body begin in the file.",
     },
     Parameter {
         name: "Content-Digest",
         place: "header",
-        kind: "string",
+        kind: Kind::Text,
         is_required: false,
         description: "Digest of the body, as RFC 9530 says.",
     },
