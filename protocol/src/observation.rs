@@ -9,11 +9,12 @@
 //! 1. `ego.history_xyz`, f32 `[16, 3]`, and `ego.history_rot`, f32 `[16, 3, 3]`.
 //! 2. For each image, as requested, `camera/<name>/depth`, `camera/<name>/opacity` and
 //!    `camera/<name>/normals`, all f32.
-//! 3. For each image `camera/<name>/rgb`, u8.
-//! 4. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
+//! 3. If requested, for each image `camera/<name>/instances`, u16.
+//! 4. For each image `camera/<name>/rgb`, u8.
+//! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
 //!
 //! Image names start with `pose/<k>/` if there are several poses (`observe`). The length of the header is a
-//! multiple of 8 and floats come first, so floats are aligned to 4 bytes and can be read in place.
+//! multiple of 8 and floats come first, so floats are aligned to 4 bytes, and instances to 2, and can be read in place.
 
 use serde::{Deserialize, Serialize};
 
@@ -174,6 +175,9 @@ pub struct Actor {
     pub name: String,
     /// `vehicle`, `pedestrian`, `bicycle` or `object`.
     pub kind: String,
+    /// Its number in the tensors `instances`.
+    #[serde(default)]
+    pub instance: u16,
     /// Length, width and height of its box, in metres.
     pub size: [f64; 3],
     /// `world_from_actor`: the box's origin is on the ground under its middle, x forward, z up.
@@ -197,7 +201,7 @@ pub struct Image {
     /// Number of this camera's frames since this one. 0, and therefore absent, in `images`.
     #[serde(default, skip_serializing_if = "is_now")]
     pub back: u64,
-    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity` or `normals` in
+    /// Name of the colour tensor. The names of the other tensors have `depth`, `opacity`, `normals` or `instances` in
     /// place of its final `rgb`.
     pub tensor: String,
     /// Encoding of the colour image.

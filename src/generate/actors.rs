@@ -7,7 +7,7 @@ use glam::DVec3;
 
 use wildcity_scene::{ActorBox, ActorClass, Gaussians};
 
-use super::car_kinds::{HATCHBACK, SEDAN, VAN};
+use super::car_kinds::{HATCHBACK, MOVING_VAN, SEDAN};
 use super::cars::Car;
 use super::light::Light;
 use super::pedestrian;
@@ -35,14 +35,14 @@ impl ActorModel {
 }
 
 /// Counts changes of the models: assets of another revision are made again.
-pub const ACTOR_REVISION: u32 = 2;
+pub const ACTOR_REVISION: u32 = 3;
 
 /// All models: a red hatchback, a silver sedan, a white van, and a pedestrian in mid-stride.
 pub fn actor_models() -> Vec<ActorModel> {
     let cars = [
         ("hatchback", &HATCHBACK, Paint::matt(0.62, 0.12, 0.11)),
         ("sedan", &SEDAN, Paint::matt(0.60, 0.62, 0.65)),
-        ("van", &VAN, Paint::matt(0.86, 0.87, 0.88)),
+        ("van", &MOVING_VAN, Paint::matt(0.86, 0.87, 0.88)),
     ];
     let light = Light::overhead();
     let mut models: Vec<ActorModel> = Vec::new();

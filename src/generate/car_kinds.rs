@@ -120,3 +120,20 @@ pub(super) const VAN: Kind = Kind {
     rear_glass: [0.012, 0.035],
     windscreen: [0.69, 0.84],
 };
+
+/// The van that moves: its rear window is in the steep tail.
+pub(super) const MOVING_VAN: Kind = Kind {
+    knots: &[
+        (0.000, 1.02, 1.04),
+        (0.012, 1.18, 1.74),
+        (0.020, 1.19, 1.88),
+        (0.045, 1.20, 1.96),
+        (0.600, 1.18, 1.98),
+        (0.680, 1.16, 1.90),
+        (0.850, 1.10, 1.20),
+        (0.970, 0.92, 0.98),
+        (1.000, 0.70, 0.72),
+    ],
+    rear_glass: [0.004, 0.0125],
+    ..VAN
+};

@@ -130,15 +130,32 @@ impl Car {
         }
     }
 
-    /// Break points along the car, in metres from the tail: at every feature, and evenly between.
+    /// Break points along the car, in metres from the tail: at every feature, and evenly between. Of a car that is
+    /// seen from near by, steep parts have as many as their slope is long.
     fn lengthwise(&self, painter: &Painter) -> Vec<f64> {
         let kind = self.kind;
         let mut xs = vec![0.0];
         for pair in kind.features().windows(2) {
-            let steps = painter.even(pair[0] * kind.length_m, pair[1] * kind.length_m, 0.14);
-            xs.extend(&steps[1..]);
+            let [from_m, to_m] = [pair[0] * kind.length_m, pair[1] * kind.length_m];
+            if painter.is_detailed() {
+                let count = painter.even(0.0, self.slope_m(from_m, to_m), 0.14).len() - 1;
+                let step_m = (to_m - from_m) / count as f64;
+                xs.extend((1..=count).map(|k| from_m + k as f64 * step_m));
+            } else {
+                let steps = painter.even(from_m, to_m, 0.14);
+                xs.extend(&steps[1..]);
+            }
         }
         xs
+    }
+
+    /// Length of the middle line between two places along the car, in metres.
+    fn slope_m(&self, from_m: f64, to_m: f64) -> f64 {
+        const PARTS: i32 = 32;
+        let part_m = (to_m - from_m) / f64::from(PARTS);
+        let top_m =
+            |k: i32| self.kind.middle_line_m((from_m + f64::from(k) * part_m) / self.kind.length_m);
+        (0..PARTS).map(|k| part_m.hypot(top_m(k + 1) - top_m(k))).sum()
     }
 
     /// Half width of the body at its belt: it narrows towards both ends.

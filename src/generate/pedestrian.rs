@@ -43,8 +43,8 @@ fn leg(painter: &mut Painter, side: f64, ahead: f64) {
     let lifted_m = if ahead > 0.0 { 0.0 } else { 0.09 };
     let [knee_x, ankle_x] = if ahead > 0.0 { [0.16, 0.22] } else { [0.02, -0.24] };
     let rings = [
-        ring(0.00, y, 0.93, 0.095, 0.115),
-        ring(0.05 * ahead, y, 0.80, 0.090, 0.100),
+        ring(0.00, y, 0.93, 0.085, 0.100),
+        ring(0.05 * ahead, y, 0.80, 0.080, 0.092),
         ring(0.7 * knee_x, y, 0.62, 0.076, 0.082),
         ring(knee_x, y, 0.49, 0.062, 0.066),
         ring(0.5 * (knee_x + ankle_x), y, 0.34 + 0.5 * lifted_m, 0.060, 0.066),
@@ -102,8 +102,8 @@ fn arm(painter: &mut Painter, side: f64, ahead: f64) {
 /// A coat to the middle of the thighs, open at the neck.
 fn trunk(painter: &mut Painter) {
     let rings = [
-        ring(0.0, 0.0, 0.76, 0.185, 0.150),
-        ring(0.0, 0.0, 0.90, 0.180, 0.140),
+        ring(0.0, 0.0, 0.76, 0.205, 0.185),
+        ring(0.0, 0.0, 0.90, 0.190, 0.160),
         ring(0.0, 0.0, 1.06, 0.165, 0.118),
         ring(0.0, 0.0, 1.22, 0.185, 0.122),
         ring(0.0, 0.0, 1.36, 0.200, 0.118),

@@ -97,6 +97,11 @@ impl<'a> Painter<'a> {
         Self { spacing: 1.0 / detail as f64, detail, ..Self::new(light, 1.0) }
     }
 
+    /// Whether it paints an object that is seen from near by.
+    pub(super) fn is_detailed(&self) -> bool {
+        self.detail > 1
+    }
+
     /// Break points with as many cells between two of them as the detail asks for.
     pub(super) fn refined(&self, points: &[f64]) -> Vec<f64> {
         let between = |pair: &[f64]| {

@@ -23,12 +23,18 @@ pub const OFF_MODEL_TRUST: f64 = 0.1;
 pub const JPEG_QUALITY: u8 = 90;
 
 /// Largest observation that a client accepts, 1.5 GiB: [`ANSWER_PIXELS`] at [`PIXEL_BYTES`] are 1,476 MB.
-/// Normals add 12 bytes a pixel, so that half as many pixels fit with them. Six raw 1440x928 images with
+/// Normals add 12 bytes a pixel, so that half as many pixels fit with them; instances 2, so that three quarters fit. Six raw 1440x928 images with
 /// depth and opacity are 88 MB.
 pub const OBSERVATION_BYTES: usize = 3 << 29;
 
-/// Most bytes per pixel without normals: raw colour, and depth and opacity as f32.
+/// Most bytes per pixel without normals and instances: raw colour, and depth and opacity as f32.
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
+
+/// Bytes per pixel of normals.
+pub const NORMAL_BYTES: u64 = 12;
+
+/// Bytes per pixel of instances.
+pub const INSTANCE_BYTES: u64 = 2;
 
 /// Largest header of an observation that a client accepts: 16 poses of 16 cameras are 256 images
 /// of at most 3.5 kB, together 0.9 MB.
@@ -177,9 +183,13 @@ const _: () = {
     assert!(LOAD_ATTEMPTS as u128 * attempt_ms + between_ms < STEP_TIMEOUT.as_millis());
 };
 
-// The largest answer of a session fits a message, with normals (12 bytes) at half of the pixels.
+// The largest answer of a session fits a message, with normals at half of the pixels, and with instances at three
+// quarters of them.
 const _: () = {
     let room_bytes = OBSERVATION_BYTES as u64 - OBSERVATION_HEADER_BYTES;
     assert!(ANSWER_PIXELS * PIXEL_BYTES <= room_bytes);
-    assert!(ANSWER_PIXELS / 2 * (PIXEL_BYTES + 12) <= room_bytes);
+    let with_instances = PIXEL_BYTES + INSTANCE_BYTES;
+    assert!(ANSWER_PIXELS / 2 * (PIXEL_BYTES + NORMAL_BYTES) <= room_bytes);
+    assert!(ANSWER_PIXELS * 3 / 4 * with_instances <= room_bytes);
+    assert!(ANSWER_PIXELS * 3 / 8 * (with_instances + NORMAL_BYTES) <= room_bytes);
 };

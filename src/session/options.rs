@@ -178,7 +178,7 @@ impl Outputs {
     }
 }
 
-/// Per-pixel f32 maps of an image beside its colour.
+/// Per-pixel maps of an image beside its colour; all but `instances` are f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PixelMaps {
     /// Expected depth in metres, `[height, width]`.
@@ -187,10 +187,12 @@ pub struct PixelMaps {
     pub opacity: bool,
     /// Unit normals in the camera's axes, `[height, width, 3]`.
     pub normals: bool,
+    /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, and actor k is k + 2.
+    pub instances: bool,
 }
 
 impl PixelMaps {
-    /// f32 values per pixel, all maps together.
+    /// f32 values per pixel, all f32 maps together.
     pub(crate) fn values(self) -> usize {
         usize::from(self.depth) + usize::from(self.opacity) + 3 * usize::from(self.normals)
     }

@@ -1,12 +1,12 @@
 //! The demo's scenarios on the demo street: what they promise happens, and a driver that keeps its distance meets
 //! nothing.
 
-use wildcity_generate::{StreetSettings, street_map};
-use wildcity_scene::Trajectory;
+use wildcity_generate::{ActorModel, StreetSettings, street_map};
 use wildcity_scene::geometry::Pose;
+use wildcity_scene::{ActorBox, ActorClass, Trajectory};
 use wildcity_sim::contact::{Contact, Detector};
 use wildcity_sim::map::Map;
-use wildcity_sim::scenario::{Document, EgoStart, Scenario, Surroundings};
+use wildcity_sim::scenario::{AssetInfo, Document, EgoStart, Scenario, Surroundings};
 use wildcity_sim::traffic::{ActorState, EgoMotion, EgoState, Idm, World, rolled};
 
 /// An episode of a scenario with a driver that follows the drive and keeps behind actors on it.
@@ -24,8 +24,14 @@ fn drive(file: &str, seed: u64, seconds: u32) -> Driven {
     let text = std::fs::read(crate::root::root().join("scenes").join(file)).unwrap();
     let document = Document::parse(&text).unwrap();
     assert!(document.cases().len() >= 5);
-    let nothing = |_: &str| None;
-    let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), asset: &nothing };
+    let asset = |name: &str| {
+        ActorModel::NAMES.contains(&name).then_some(AssetInfo {
+            hash: "0".repeat(64),
+            class: ActorClass::Vehicle,
+            box_: ActorBox::PEDESTRIAN,
+        })
+    };
+    let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), asset: &asset };
     let scenario =
         Scenario::resolve(document.with(&document.first_values()).unwrap(), seed, &around).unwrap();
     let Some(EgoStart::Station { station_m, .. }) = scenario.start else { panic!("a station") };

@@ -35,6 +35,7 @@ pub(crate) struct Recipe {
     /// Number of earlier frames of each camera.
     pub(crate) history: u64,
     pub(crate) normals: bool,
+    pub(crate) instances: bool,
     /// Whether the images come with their trust, and the first camera is behind a windshield.
     pub(crate) trust_and_windshield: bool,
 }
@@ -48,6 +49,7 @@ impl Recipe {
         depth: true,
         history: 0,
         normals: false,
+        instances: false,
         trust_and_windshield: false,
     };
 }
@@ -76,6 +78,11 @@ pub(crate) fn normal(x: u64, y: u64) -> [f32; 3] {
         (true, 0) => [0.0, 0.0, -1.0],
         (true, _) => [0.6, 0.0, -0.8],
     }
+}
+
+/// Whose Gaussian a pixel shows.
+pub(crate) fn instance(x: u64, y: u64) -> u16 {
+    [0, 1, 2, 257][((x + y) % 4) as usize]
 }
 
 /// Opacity of a pixel.
@@ -125,6 +132,14 @@ impl Frame {
                     let normals: Vec<f32> = grid.flat_map(|(x, y)| normal(x, y)).collect();
                     let shape = vec![camera.height, camera.width, 3];
                     tensors.push(f32_tensor(&format!("{stem}/normals"), shape, &normals));
+                }
+                if recipe.instances {
+                    let grid =
+                        (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+                    let bytes = grid.flat_map(|(x, y)| instance(x, y).to_le_bytes()).collect();
+                    let shape = vec![camera.height, camera.width];
+                    let name = format!("{stem}/instances");
+                    tensors.push(Tensor { name, dtype: "U16", shape, bytes });
                 }
                 let tensor = format!("{stem}/rgb");
                 let hash = hash.to_hex().to_string();

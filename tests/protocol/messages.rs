@@ -177,6 +177,7 @@ fn requests() -> Vec<(&'static str, Request)> {
             depth: true,
             opacity: true,
             normals: Some(true),
+            instances: Some(true),
             frames: Some(4),
             trust: Some(true),
             actors: None,

@@ -8,7 +8,7 @@ use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
 /// The golden frames: name, `seq` of the request vector that the frame answers, recipe.
-fn golden() -> [(&'static str, u64, Recipe); 8] {
+fn golden() -> [(&'static str, u64, Recipe); 9] {
     let raw = Recipe::RAW;
     [
         ("raw", 3, raw),
@@ -17,6 +17,7 @@ fn golden() -> [(&'static str, u64, Recipe); 8] {
         ("bundle", 3, Recipe { cameras: 1, depth: false, history: 2, ..raw }),
         ("two_poses", 5, Recipe { poses: 2, cameras: 1, depth: false, ..raw }),
         ("normals", 3, Recipe { cameras: 1, normals: true, ..raw }),
+        ("instances", 3, Recipe { cameras: 1, depth: false, instances: true, ..raw }),
         ("trust", 3, Recipe { depth: false, trust_and_windshield: true, ..raw }),
         // Between two decisions.
         ("no_images", 3, Recipe { cameras: 0, ..raw }),
@@ -131,6 +132,8 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
     let opacity = image.opacity();
     let normals = image.normals();
     assert_eq!(normals.is_some(), recipe.normals);
+    let instances = image.instances();
+    assert_eq!(instances.is_some(), recipe.instances);
     assert_eq!(depth_m.is_some(), recipe.depth);
     assert_eq!(opacity.is_some(), recipe.depth);
     for (pixel, rgb) in rgb.chunks_exact(3).enumerate() {
@@ -150,6 +153,9 @@ fn check_image(image: &ImageView<'_>, recipe: Recipe, number: u64) {
         }
         if let Some(normals) = &normals {
             assert_eq!(normals[3 * pixel..][..3], frames::normal(x, y));
+        }
+        if let Some(instances) = &instances {
+            assert_eq!(instances[pixel], frames::instance(x, y));
         }
     }
     assert_eq!(rgb.len(), 4 * 3 * 3);
@@ -179,9 +185,13 @@ fn expected(frame: &Frame, recipe: Recipe) -> Value {
                 let opacity = recipe.depth.then(|| frames::opacity(x, y));
                 let rgb = frames::color(recipe, image, x, y);
                 let normal = recipe.normals.then(|| frames::normal(x, y));
-                json!({
+                let mut pixel = json!({
                     "x": x, "y": y, "rgb": rgb, "depth_m": depth_m, "opacity": opacity, "normal": normal,
-                })
+                });
+                if recipe.instances {
+                    pixel["instance"] = frames::instance(x, y).into();
+                }
+                pixel
             });
             json!({"shape": [3, 4, 3], "pixels": pixels})
         })

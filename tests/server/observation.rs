@@ -74,7 +74,9 @@ async fn observations_tell_what_they_waited_for_and_hints_are_taken() {
 #[tokio::test]
 async fn raw_pixels_and_maps_are_the_renderers() {
     let server = TestServer::start().await;
-    let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true, "normals": true });
+    let outputs = json!({
+        "encoding": "raw", "depth": true, "opacity": true, "normals": true, "instances": true,
+    });
     let mut agent = open(&server, outputs).await;
     let seen = agent.step(2.0).await;
     let tensors = seen.tensors();
@@ -94,6 +96,9 @@ async fn raw_pixels_and_maps_are_the_renderers() {
         let normals = tensors.tensor(&format!("camera/{}/normals", camera.name)).unwrap();
         assert_eq!(normals.shape(), [h, w, 3]);
         assert_eq!(floats(normals.data()), vec![-0.5; 3 * w * h]);
+        let instances = tensors.tensor(&format!("camera/{}/instances", camera.name)).unwrap();
+        assert_eq!((instances.shape(), instances.dtype()), (&[h, w][..], safetensors::Dtype::U16));
+        assert_eq!(instances.data(), [7 + k as u8, 0].repeat(w * h));
 
         let image = &seen.meta["images"][k];
         assert_eq!(image["hash"], blake3::hash(&expected).to_hex().as_str());
@@ -102,7 +107,7 @@ async fn raw_pixels_and_maps_are_the_renderers() {
         assert_eq!((&image["width"], &image["fx"]), (&json!(w), &json!(10.0)));
         assert_eq!(image["shutter_end_us"], 100_000);
     }
-    assert_eq!(tensors.len(), 10);
+    assert_eq!(tensors.len(), 12);
     assert_eq!(seen.meta["timings"]["stages_ms"], json!([{ "name": "paint", "ms": 0.5 }]));
 }
 
@@ -127,7 +132,7 @@ async fn the_header_has_the_size_of_its_contents() {
     }
 }
 
-/// With normals, an answer has half of the pixels.
+/// With normals, an answer has half of the pixels, and with instances three quarters.
 #[tokio::test]
 async fn normals_halve_the_pixels_of_an_answer() {
     let server = TestServer::start().await;
@@ -135,11 +140,17 @@ async fn normals_halve_the_pixels_of_an_answer() {
     let most = agent.hello().await["limits"]["answer_pixels"].as_u64().unwrap();
     // 8 x 6 and 5 x 4 px: the sizes of the images make up the number of pixels exactly, or one row more.
     let width = 16_384;
-    for (normals, pixels) in [(true, most / 2), (false, most)] {
+    for (normals, instances, pixels) in [
+        (true, false, most / 2),
+        (true, true, most / 8 * 3),
+        (false, true, most / 4 * 3),
+        (false, false, most),
+    ] {
         for more in [0, 1] {
             let height = pixels / width + more;
             let outputs = json!({
-                "cameras": ["front"], "normals": normals, "depth": true, "opacity": true,
+                "cameras": ["front"], "normals": normals, "instances": instances,
+                "depth": true, "opacity": true,
                 "images": { "front": { "size": [width, height] } },
             });
             let answer = agent.try_open(json!({ "outputs": outputs })).await;

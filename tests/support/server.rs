@@ -92,6 +92,9 @@ impl Backend for Painter {
             if let Some(normals) = target.normals.as_deref_mut() {
                 normals.fill(-0.5);
             }
+            if let Some(instances) = target.instances.as_deref_mut() {
+                instances.fill(7 + k as u16);
+            }
             finished(k, target);
         }
         Ok(FrameStats { stages_ms: vec![("paint", 0.5)], ..FrameStats::default() })

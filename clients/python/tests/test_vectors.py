@@ -78,6 +78,7 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
             depth=True,
             opacity=True,
             normals=True,
+            instances=True,
             images={"front": ImagePart((1, 0, 3, 3), (6, 6))},
             frames=4,
             trust=True,
@@ -170,7 +171,9 @@ def with_unknown_fields(value: Any) -> Any:
     return {**fields, "since_next_year": [1, "x"]}
 
 
-@pytest.mark.parametrize("name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "trust", "no_images"])
+@pytest.mark.parametrize(
+    "name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "no_images"]
+)
 def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
     observation = Observation(frame(f"observations/{name}.bin"))
@@ -183,7 +186,7 @@ def test_observations_decode_to_their_contents(name: str) -> None:
     assert np.array_equal(observation.history_rot[-1], np.eye(3))
     for tensor in expected["tensors"]:
         array = observation.tensor(tensor["name"])
-        assert array.dtype == {"U8": np.uint8, "F32": np.float32}[tensor["dtype"]]
+        assert array.dtype == {"U8": np.uint8, "U16": np.uint16, "F32": np.float32}[tensor["dtype"]]
         assert tensor["shape"] in (None, list(array.shape))
     infos = observation.metadata.images
     for info, image in zip(infos, expected["images"], strict=True):
@@ -218,6 +221,11 @@ def check_image(
             else:
                 assert maps[camera].dtype == np.float32
                 assert np.array_equal(maps[camera][at], np.float32(pixel[name]))
+        if "instance" in pixel:
+            assert view.instances[camera].dtype == np.uint16
+            assert view.instances[camera][at] == pixel["instance"]
+        else:
+            assert camera not in view.instances
 
 
 def test_frames_of_a_camera_are_in_the_order_they_were_taken() -> None:
@@ -353,7 +361,7 @@ def test_vectors_obey_the_schemas() -> None:
             with pytest.raises(jsonschema.ValidationError):
                 jsonschema.validate(message, schema)
     schema = json.loads((PROTOCOL / "schema/observation.json").read_text())
-    for name in ("raw", "png", "jpeg", "two_poses", "normals", "trust", "no_images"):
+    for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "no_images"):
         metadata = vector(f"observations/{name}.expected.json")["observation"]
         jsonschema.validate(metadata, schema)
         del metadata["frame_hash"]

@@ -175,6 +175,10 @@ impl Observation {
                     self.check_tensor(&name, Dtype::F32, shape)?;
                 }
             }
+            let name = image.sibling_tensor("instances");
+            if self.tensors.info(&name).is_some() {
+                self.check_tensor(&name, Dtype::U16, &[height, width])?;
+            }
         }
         Ok(())
     }
@@ -255,6 +259,16 @@ impl<'a> ImageView<'a> {
     /// `[height, width, 3]`, 0 where there is no depth. `None` if the session did not ask for it.
     pub fn normals(&self) -> Option<Cow<'a, [f32]>> {
         self.map("normals")
+    }
+
+    /// Whose Gaussian each pixel shows, u16 `[height, width]`: 0 none, 1 the twin, else the
+    /// [`Actor::instance`](wildcity_protocol::observation::Actor::instance) of an actor. `None` if the session did not
+    /// ask for it.
+    pub fn instances(&self) -> Option<Vec<u16>> {
+        let name = self.sibling_tensor("instances");
+        self.observation.tensors.info(&name)?;
+        let bytes = self.observation.tensor_bytes(&name);
+        Some(bytes.chunks_exact(2).map(|two| u16::from_le_bytes([two[0], two[1]])).collect())
     }
 
     /// Width and height, in pixels.

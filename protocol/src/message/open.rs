@@ -303,6 +303,9 @@ pub struct Outputs {
     /// Whether to add `normals`, f32 `[height, width, 3]`: unit vectors in the camera's axes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub normals: Option<bool>,
+    /// Whether to add `instances`, u16 `[height, width]`: whose Gaussian each pixel shows. If absent, false.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub instances: Option<bool>,
     /// Number of last frames of each camera that an observation holds. If absent, 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 16)))]
@@ -329,6 +332,7 @@ impl Default for Outputs {
             depth: false,
             opacity: false,
             normals: None,
+            instances: None,
             frames: None,
             trust: None,
             actors: None,

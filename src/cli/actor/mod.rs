@@ -7,6 +7,8 @@ mod list;
 mod picture;
 mod show;
 
+pub(super) use generate::generated;
+
 /// Make, list and look at assets of actors: what other vehicles and pedestrians are drawn from.
 ///
 /// Assets lie beside the twins and are shared by all of them. An asset is identified by the BLAKE3 of its content.

@@ -22,7 +22,8 @@ const FOCAL_PX: f64 = 640.0;
 pub(super) fn draw_all_around(asset: &ActorAsset) -> anyhow::Result<Vec<u8>> {
     let ActorBox { length_m, width_m, height_m } = asset.description.box_;
     let middle_m = DVec3::new(0.0, 0.0, 0.5 * height_m);
-    let away_m = 1.25 * length_m.hypot(width_m).hypot(height_m).max(0.1);
+    // Far enough for its length across a picture, and for its height.
+    let away_m = (1.25 * length_m.hypot(width_m).hypot(height_m)).max(2.0 * height_m).max(0.1);
     let toward = [(0.9, 0.8, 0.35), (0.05, -1.0, 0.15), (-1.0, -0.25, 0.3), (-0.5, 0.6, 0.9)];
     let views = toward.map(|(x, y, z)| {
         let side = DVec3::new(x, y, z).normalize();

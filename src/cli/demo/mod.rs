@@ -1,6 +1,8 @@
 //! `wildcity demo`.
 
+mod driver;
 mod mosaic;
+mod scenario;
 
 use std::io::{self, ErrorKind, Write};
 use std::net::SocketAddr;
@@ -8,19 +10,26 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
+use clap::ValueEnum as _;
 use glam::DMat3;
 use serde_json::json;
 
-use wildcity_client::{Client, Observation, Open, Pose};
+use wildcity_client::protocol::message::ScenarioChoice;
+use wildcity_client::protocol::observation::Event;
+use wildcity_client::{Client, Movement, Observation, Open, Pose};
 use wildcity_generate::StreetSettings;
 use wildcity_scene::manifest::Provenance;
-use wildcity_scene::{ProfileOverrides, RecordFormat, Rig, Trajectory};
+use wildcity_scene::{ProfileOverrides, RecordFormat, Rig};
 use wildcity_server::Limits;
 use wildcity_twin::ingest::sky;
 use wildcity_twin::store::{
-    Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, Version,
+    Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, StoredActor, Version,
 };
 
+use self::driver::CarefulDriver;
+use self::scenario::DemoScenario;
+
+use super::actor::generated;
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::{output, progress};
@@ -30,12 +39,18 @@ use super::{output, progress};
 /// Builds the street on first use, serves it on a free loopback port, and drives along its recorded
 /// trajectory through the WebSocket, as any agent would. Writes a mosaic of the six cameras for every tenth
 /// step, the recorded episode, and report.json with the time of every step.
+///
+/// With --scenario, there is traffic: the agent keeps its distance from other vehicles and pedestrians.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {
-    /// Steps to drive, of 0.1 s each.
-    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    steps: u32,
+    /// Steps to drive, of 0.1 s each [default: 100; 280 for the scenario traffic]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    steps: Option<u32>,
+
+    /// Drive among other vehicles and pedestrians; their assets are made on first use.
+    #[arg(long, value_name = "NAME")]
+    scenario: Option<DemoScenario>,
 
     /// Directory for the images and the report; created if it is missing.
     #[arg(long, value_name = "DIR", default_value = "wildcity-demo")]
@@ -52,6 +67,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity demo
   wildcity demo --steps 20 --out /tmp/look
+  wildcity demo --scenario cut-in
   wildcity serve            (then an agent can open the twin \"demo\")";
 
 /// Name of the demo twin.
@@ -62,6 +78,8 @@ const EXACT_TWIN: &str = "demo-f32";
 const STREET: &str = "street ";
 /// Speed of the agent, in m/s.
 const SPEED_M_PER_S: f64 = 8.0;
+/// Steps of a drive without a scenario.
+const STEPS: u32 = 100;
 /// Number of steps between two mosaics.
 const MOSAIC_STEPS: u64 = 10;
 
@@ -69,6 +87,10 @@ impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
         let version = demo_twin(&twins, TWIN, StorageOptions::default())?;
+        let assets = match self.scenario {
+            Some(_) => generated(&self.twins.catalog()?)?,
+            None => Vec::new(),
+        };
         output::create_dir(&self.out)?;
         let config = wildcity_server::Config {
             listen: SocketAddr::from(([127, 0, 0, 1], 0)),
@@ -85,33 +107,61 @@ impl Demo {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let drive = runtime.block_on(async {
             let running = wildcity_server::start(config).await?;
-            let drive = self.drive(&running.url(), &version).await;
+            let drive = self.drive(&running.url(), &version, &assets).await;
             running.stop().await;
             drive
         })?;
         self.report(&version, &drive)
     }
 
-    /// The agent: follows the recorded trajectory at a constant speed, and checks every frame's hash.
-    async fn drive(&self, url: &str, version: &Version) -> anyhow::Result<Drive> {
+    /// The agent: follows the recorded trajectory, and checks every frame's hash. Without a scenario it drives at a
+    /// constant speed.
+    async fn drive(
+        &self,
+        url: &str,
+        version: &Version,
+        assets: &[StoredActor],
+    ) -> anyhow::Result<Drive> {
         let route = &version.manifest.trajectories[0];
         let mut client = Client::connect(url, "wildcity demo").await?;
-        let opened = client.open(Open::twin(TWIN)).await?;
+        let mut open = Open::twin(TWIN);
+        let mut driver = None;
+        if let Some(scenario) = self.scenario {
+            open.scenario = Some(ScenarioChoice::Object(scenario.with_assets(assets)?));
+            open.outputs.actors = Some(true);
+            driver = Some(CarefulDriver::new(route)?);
+        }
+        let opened = client.open(open).await?;
         let dt_s = opened.dt_us as f64 * 1e-6;
-        let mut drive = Drive { backend: opened.backend, steps: Vec::new(), mosaics: Vec::new() };
-        let first = client.reset(0, None).await?;
-        drive.write_mosaic(&first, &self.out)?;
+        let mut drive = Drive {
+            backend: opened.backend,
+            steps: Vec::new(),
+            mosaics: Vec::new(),
+            events: Vec::new(),
+        };
+        let mut seen = client.reset(0, None).await?;
+        drive.write_mosaic(&seen, &self.out)?;
+        let steps = self.steps.unwrap_or(self.scenario.map_or(STEPS, DemoScenario::steps));
         let bar = progress::count("driving");
-        bar.set_length(self.steps.into());
-        for step in 1..=self.steps {
-            let pose = pose_at(route, f64::from(step) * dt_s * SPEED_M_PER_S);
+        bar.set_length(steps.into());
+        for step in 1..=steps {
+            let movement = match &driver {
+                Some(driver) => Movement::Trajectory(driver.plan(seen.metadata())?),
+                None => Movement::Pose(wire_pose(
+                    &route.at_station(f64::from(step) * dt_s * SPEED_M_PER_S),
+                )),
+            };
             let start = Instant::now();
-            let seen = client.step(pose).await?;
+            seen = client.drive(movement, false).await?;
             let step_ms = start.elapsed().as_secs_f64() * 1e3;
             seen.verify()?;
             drive.steps.push(step_report(&seen, step_ms));
+            drive.events.extend(seen.metadata().events.iter().cloned());
             drive.write_mosaic(&seen, &self.out)?;
             bar.inc(1);
+            if seen.metadata().terminated {
+                break;
+            }
         }
         bar.finish_and_clear();
         client.close().await?;
@@ -124,7 +174,7 @@ impl Demo {
         steps_ms.sort_by(f64::total_cmp);
         let last = (steps_ms.len() - 1) as f64;
         let quantile_ms = |share: f64| steps_ms[(last * share).round() as usize];
-        let report = json!({
+        let mut report = json!({
             "twin": version.manifest.twin,
             "version": version.number,
             "version_hash": version.hash,
@@ -134,13 +184,17 @@ impl Demo {
             "steps": drive.steps,
             "mosaics": drive.mosaics,
         });
+        if let Some(scenario) = self.scenario.and_then(|scenario| scenario.to_possible_value()) {
+            report["scenario"] = scenario.get_name().into();
+            report["events"] = serde_json::to_value(&drive.events)?;
+        }
         let path = self.out.join("report.json");
         output::write(&path, format!("{report:#}\n").as_bytes())?;
         let mut out = io::stdout().lock();
         writeln!(
             out,
             "drove {} steps of six cameras: median {:.0} ms a step, 95 % within {:.0} ms",
-            self.steps,
+            drive.steps.len(),
             quantile_ms(0.5),
             quantile_ms(0.95)
         )?;
@@ -160,6 +214,8 @@ struct Drive {
     steps: Vec<serde_json::Value>,
     /// File names of the mosaics.
     mosaics: Vec<String>,
+    /// What happened in the scenario.
+    events: Vec<Event>,
 }
 
 impl Drive {
@@ -187,8 +243,7 @@ fn step_report(seen: &Observation, step_ms: f64) -> serde_json::Value {
     })
 }
 
-fn pose_at(route: &Trajectory, station_m: f64) -> Pose {
-    let pose = route.at_station(station_m);
+fn wire_pose(pose: &wildcity_scene::geometry::Pose) -> Pose {
     Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }
 }
 

@@ -71,7 +71,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
     let trajectory = section.map(|section| drive(&resident.version, section, "trajectory."));
     let profile = profile(session)?;
     let (encoding, quality) = encoding(session.encoding());
-    let PixelMaps { depth, opacity, normals } = session.maps();
+    let PixelMaps { depth, opacity, normals, instances } = session.maps();
     let names: Vec<_> = session.cameras().iter().map(|camera| camera.name.clone()).collect();
     let period_us = |(index, name): (usize, &String)| (name.clone(), session.period_us(index));
     let outputs = message::Outputs {
@@ -80,6 +80,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         depth,
         opacity,
         normals: Some(normals),
+        instances: instances.then_some(true),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
         actors: session.tells_actors().then_some(true),

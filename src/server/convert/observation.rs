@@ -10,6 +10,7 @@ use wildcity_protocol::observation::{
     self as wire, Actor, Ego, Event, Image, NavigationCommand, ObservationMetadata, Residency,
     Route, Stage, Timings, Trust,
 };
+use wildcity_render::FIRST_ACTOR_INSTANCE;
 use wildcity_scene::ActorBox;
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_session::{
@@ -36,12 +37,14 @@ pub(crate) fn observation(
             TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
             TensorKind::Normals(image) => format!("{}/normals", image_names[image]),
+            TensorKind::Instances(image) => format!("{}/instances", image_names[image]),
             TensorKind::Rgb(image) => format!("{}/rgb", image_names[image]),
             TensorKind::PastRgb(image) => past_tensor(session, &frame.history[image]),
         };
         let dtype = match tensor.dtype {
             DType::F32 => "F32",
             DType::U8 => "U8",
+            DType::U16 => "U16",
         };
         let data_offsets = [tensor.bytes.start, tensor.bytes.end];
         header.tensors.insert(name, TensorInfo { dtype, shape: &tensor.shape, data_offsets });
@@ -257,6 +260,7 @@ fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
             Actor {
                 name: spec.name.clone(),
                 kind: spec.class.name().to_owned(),
+                instance: FIRST_ACTOR_INSTANCE + state.index,
                 size: [length_m, width_m, height_m],
                 pose: pose(&state.world_from_actor),
                 velocity: state.velocity_mps.to_array(),

@@ -23,7 +23,7 @@ pub const HEADER_PREFIX_BYTES: usize = 8;
 /// 15 numbers of at most 24 digits, 16 stages of 60 bytes: below 2 kB.
 const HEADER_BASE_BYTES: usize = 4096;
 
-/// Room in the header per image: four tensors of at most 190 bytes, and 16 numbers of at most 24 digits,
+/// Room in the header per image: five tensors of at most 190 bytes, and 16 numbers of at most 24 digits,
 /// two names and a hash with their escaped keys, below 1,900 bytes; a lens of 12 numbers and a windshield
 /// of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
@@ -69,6 +69,8 @@ pub(crate) struct RigCapture {
 pub(super) struct InPlaceBytes {
     /// Of the float maps.
     pub(super) floats: usize,
+    /// Of the instances.
+    pub(super) instances: usize,
     /// Of raw pixels.
     pub(super) raw: usize,
 }
@@ -177,9 +179,13 @@ impl ObservationLayout {
     /// Checks that the images of so many rigs, which `field` of a request asks for, fit one answer.
     pub(super) fn check_size(&self, field: &'static str, rigs: usize) -> Result<(), SessionError> {
         let rig_pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
-        let limit = match self.maps.normals {
+        let with_normals = match self.maps.normals {
             true => limits::ANSWER_PIXELS / 2,
             false => limits::ANSWER_PIXELS,
+        };
+        let limit = match self.maps.instances {
+            true => with_normals / 4 * 3,
+            false => with_normals,
         };
         let pixels = rig_pixels * rigs as u64;
         if pixels > limit {
@@ -224,6 +230,7 @@ impl ObservationLayout {
         let pixels: usize = pixels.sum();
         InPlaceBytes {
             floats: 4 * pixels * self.maps.values(),
+            instances: if self.maps.instances { 2 * pixels } else { 0 },
             raw: if self.encoding == Encoding::Raw { 3 * pixels } else { 0 },
         }
     }

@@ -96,6 +96,8 @@ pub enum TensorKind {
     Opacity(usize),
     /// Unit normals in the camera's axes: `[height, width, 3]`.
     Normals(usize),
+    /// Whose Gaussian each pixel shows: `[height, width]`.
+    Instances(usize),
     /// Colour: `[height, width, 3]` pixels, or the `[n]` bytes of a file.
     Rgb(usize),
     /// Colour of an earlier image, by its index in [`Observation::history`]; shape as [`Self::Rgb`].
@@ -109,6 +111,8 @@ pub enum DType {
     F32,
     /// Byte.
     U8,
+    /// 16-bit unsigned integer, little-endian.
+    U16,
 }
 
 /// How long the parts of an observation took.
@@ -130,6 +134,7 @@ impl DType {
         match self {
             Self::F32 => 4,
             Self::U8 => 1,
+            Self::U16 => 2,
         }
     }
 }

@@ -116,6 +116,9 @@ pub struct RecordedOutputs {
     /// Whether there were normals.
     #[serde(default)]
     pub normals: bool,
+    /// Whether there were instances; absent if not.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub instances: bool,
 }
 
 /// One answer with images.

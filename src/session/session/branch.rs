@@ -165,8 +165,12 @@ impl Session {
         let overlays = engine.answer_budget().reserve(overlay_bytes(&cameras))?;
         let extent = rig_extent(&cameras);
         let outputs = header.outputs;
-        let maps =
-            PixelMaps { depth: outputs.depth, opacity: outputs.opacity, normals: outputs.normals };
+        let maps = PixelMaps {
+            depth: outputs.depth,
+            opacity: outputs.opacity,
+            normals: outputs.normals,
+            instances: outputs.instances,
+        };
         let layout = ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
         let layout = Arc::new(layout);
         let settings = SessionSettings {

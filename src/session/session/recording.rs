@@ -93,7 +93,7 @@ impl Session {
     ) -> Result<NewFile, SessionError> {
         let version = &pinned.resident.version;
         let settings = &self.settings;
-        let PixelMaps { depth, opacity, normals } = settings.layout.maps();
+        let PixelMaps { depth, opacity, normals, instances } = settings.layout.maps();
         let cameras = settings.layout.cameras().to_vec();
         let header = EpisodeHeader {
             format: EpisodeHeader::FORMAT,
@@ -112,6 +112,7 @@ impl Session {
                 depth,
                 opacity,
                 normals,
+                instances,
             },
             seed: episode.seed(),
             dynamics: episode.ego().dynamics(),

@@ -21,7 +21,11 @@ HEADER_BYTES = 1 << 20
 """Largest header that is accepted: 256 images take a quarter of it."""
 
 HISTORY_POSES = 16
-DTYPES: dict[str, np.dtype[Any]] = {"U8": np.dtype("u1"), "F32": np.dtype("<f4")}
+DTYPES: dict[str, np.dtype[Any]] = {
+    "U8": np.dtype("u1"),
+    "U16": np.dtype("<u2"),
+    "F32": np.dtype("<f4"),
+}
 
 
 class Observation:
@@ -83,6 +87,11 @@ class Observation:
         """Unit normals by camera, in its axes (x right, y down, z forward), 0 where there is no depth."""
         return self.views[0].normals
 
+    @property
+    def instances(self) -> Mapping[str, NDArray[np.uint16]]:
+        """Whose Gaussian each pixel shows, by camera: 0 none, 1 the twin, else `Actor.instance` of an actor."""
+        return self.views[0].instances
+
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
 
@@ -129,6 +138,8 @@ class Observation:
             for output, shape in (("depth", size), ("opacity", size), ("normals", (*size, 3))):
                 if _sibling(image, output) in self._tensors:
                     self._expect(_sibling(image, output), "F32", shape)
+            if _sibling(image, "instances") in self._tensors:
+                self._expect(_sibling(image, "instances"), "U16", size)
 
     def _expect(self, name: str, dtype: str, shape: tuple[int, ...] | None) -> None:
         """Checks type and shape of a tensor; with `shape` None, any one-dimensional one."""
@@ -163,19 +174,24 @@ class View:
     @cached_property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
         """float32 [height, width] by camera: camera z (distance for fisheye and f-theta), in metres."""
-        return self._floats("depth")
+        return self._maps("depth")
 
     @cached_property
     def opacity(self) -> Mapping[str, NDArray[np.float32]]:
         """float32 [height, width] by camera: accumulated opacity, if the session asked for it."""
-        return self._floats("opacity")
+        return self._maps("opacity")
 
     @cached_property
     def normals(self) -> Mapping[str, NDArray[np.float32]]:
         """float32 [height, width, 3] by camera: unit normals of the visible surface, if the session asked for them."""
-        return self._floats("normals")
+        return self._maps("normals")
 
-    def _floats(self, output: str) -> Mapping[str, NDArray[np.float32]]:
+    @cached_property
+    def instances(self) -> Mapping[str, NDArray[np.uint16]]:
+        """uint16 [height, width] by camera: 0 none, 1 the twin, else `Actor.instance`, if the session asked for them."""
+        return self._maps("instances")
+
+    def _maps(self, output: str) -> Mapping[str, NDArray[Any]]:
         tensors = self._observation._tensors
         present = {name: i for name, i in self._infos.items() if _sibling(i, output) in tensors}
         return _LazyArrays(present, lambda image: self._observation.tensor(_sibling(image, output)))

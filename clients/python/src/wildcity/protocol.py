@@ -251,7 +251,7 @@ class Outputs:
     `images` has crops and sizes that differ from the rig's, by camera name. `frames` is how many of the newest
     frames of each camera an observation has, 1 if None. `period_us` is the time between two frames of a camera, by
     name, for cameras that do not take one with every step. `trust` adds a confidence to each image. `actors` tells
-    where the actors of the scenario are.
+    where the actors of the scenario are. `instances` adds whose Gaussian each pixel shows.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -260,6 +260,7 @@ class Outputs:
     depth: bool = False
     opacity: bool = False
     normals: bool | None = None
+    instances: bool | None = None
     images: dict[str, ImagePart] | None = None
     frames: int | None = None
     trust: bool | None = None
@@ -543,7 +544,10 @@ class Route:
 
 @dataclass(frozen=True)
 class Actor:
-    """An actor of the scenario: its box stands on the ground at `pose`, x forward; `size` is length, width, height."""
+    """An actor of the scenario: its box stands on the ground at `pose`, x forward; `size` is length, width, height.
+
+    `instance` is its number in `Observation.instances`.
+    """
 
     name: str
     kind: str
@@ -551,6 +555,7 @@ class Actor:
     pose: Pose
     velocity: Vector
     yaw_rate: float
+    instance: int = 0
 
 
 @dataclass(frozen=True)

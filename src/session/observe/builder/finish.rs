@@ -116,7 +116,7 @@ impl ObservationBuilder {
         let poses = limits::HISTORY_POSES;
         tensors.push(TensorKind::HistoryXyz, DType::F32, vec![poses, 3]);
         tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
-        let PixelMaps { depth, opacity, normals } = layout.maps();
+        let PixelMaps { depth, opacity, normals, instances } = layout.maps();
         for (index, image) in shown.iter().enumerate() {
             let [height, width] = layout.size_px(image.info.camera);
             if depth {
@@ -128,6 +128,10 @@ impl ObservationBuilder {
             if normals {
                 tensors.push(TensorKind::Normals(index), DType::F32, vec![height, width, 3]);
             }
+        }
+        for (index, image) in shown.iter().enumerate().filter(|_| instances) {
+            let [height, width] = layout.size_px(image.info.camera);
+            tensors.push(TensorKind::Instances(index), DType::U16, vec![height, width]);
         }
         for (index, image) in shown.iter().enumerate() {
             let file_bytes = self.encoded[image.encoded].file.len();

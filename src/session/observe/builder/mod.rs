@@ -29,6 +29,8 @@ pub(crate) struct ObservationBuilder {
     history_count: usize,
     /// Where the next shown image's floats go, in bytes from the buffer's start.
     floats_at: usize,
+    /// Where the next shown image's instances go, in bytes from the buffer's start.
+    instances_at: usize,
     /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
     raw_at: usize,
     captures: Vec<RigCapture>,
@@ -53,14 +55,18 @@ impl ObservationBuilder {
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let history = history.concat();
 
-        // | header | ego history | floats of all captures | raw pixels of all captures |
+        // | header | ego history | floats of all captures | instances of all | raw pixels of all |
         let header = layout.header_bytes(captures);
         let floats_at = header + history.len();
         let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
-        let InPlaceBytes { floats, raw } = in_place.fold(InPlaceBytes::default(), |sum, one| {
-            InPlaceBytes { floats: sum.floats + one.floats, raw: sum.raw + one.raw }
+        let all = in_place.fold(InPlaceBytes::default(), |sum, one| InPlaceBytes {
+            floats: sum.floats + one.floats,
+            instances: sum.instances + one.instances,
+            raw: sum.raw + one.raw,
         });
-        let mut buffer = ObservationBuffer::zeroed(budget, floats_at + floats + raw, header)?;
+        let instances_at = floats_at + all.floats;
+        let raw_at = instances_at + all.instances;
+        let mut buffer = ObservationBuffer::zeroed(budget, raw_at + all.raw, header)?;
         buffer.bytes_mut()[header..floats_at].copy_from_slice(&history);
 
         let images = captures.iter().map(|capture| capture.cameras.len()).sum();
@@ -71,7 +77,8 @@ impl ObservationBuilder {
             buffer,
             history_count: count,
             floats_at,
-            raw_at: floats_at + floats,
+            instances_at,
+            raw_at,
             captures: Vec::with_capacity(captures.len()),
             encoded: Vec::with_capacity(images),
             timings: Timings::default(),
@@ -93,7 +100,7 @@ impl ObservationBuilder {
 
         // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
         // and normals are computed from depth.
-        let PixelMaps { depth, opacity, normals } = layout.maps();
+        let PixelMaps { depth, opacity, normals, .. } = layout.maps();
         let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
         let needs_depth = normals && !depth && capture.shown;
         let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
@@ -158,13 +165,17 @@ impl ObservationBuilder {
     ) -> Vec<Target<'a>> {
         let layout = &self.layout;
         let floats_at = self.floats_at;
+        let instances_at = self.instances_at;
         let raw_at = self.raw_at;
-        let InPlaceBytes { floats, raw } = layout.in_place_bytes(capture);
-        self.floats_at += floats;
-        self.raw_at += raw;
-        let (float_part, raw_part) = self.buffer.bytes_mut().split_at_mut(raw_at);
-        let mut float_part = &mut float_part[floats_at..floats_at + floats];
-        let mut raw_part = &mut raw_part[..raw];
+        let own = layout.in_place_bytes(capture);
+        self.floats_at += own.floats;
+        self.instances_at += own.instances;
+        self.raw_at += own.raw;
+        let (maps_part, raw_part) = self.buffer.bytes_mut().split_at_mut(raw_at);
+        let (float_part, instances_part) = maps_part.split_at_mut(instances_at);
+        let mut float_part = &mut float_part[floats_at..floats_at + own.floats];
+        let mut instances_part = &mut instances_part[..own.instances];
+        let mut raw_part = &mut raw_part[..own.raw];
 
         let mut targets = Vec::with_capacity(capture.cameras.len());
         for (&camera, scratch) in capture.cameras.iter().zip(scratch) {
@@ -175,10 +186,12 @@ impl ObservationBuilder {
                 (held && capture.shown).then(|| as_floats(split_off_front(&mut float_part, bytes)))
             };
             // In the order of the tensors.
-            let PixelMaps { depth, opacity, normals } = layout.maps();
+            let PixelMaps { depth, opacity, normals, instances } = layout.maps();
             let depth_m = map(depth, 1);
             let opacity = map(opacity, 1);
             let normals = map(normals, 3);
+            let instances = (instances && capture.shown)
+                .then(|| as_ids(split_off_front(&mut instances_part, 2 * pixels)));
             let rgb8 = if layout.encoding() == Encoding::Raw && capture.shown {
                 split_off_front(&mut raw_part, 3 * pixels)
             } else {
@@ -193,8 +206,8 @@ impl ObservationBuilder {
                 depth_m,
                 opacity,
                 normals,
+                instances,
                 appearance: Some(&camera.appearance),
-                ..Target::default()
             });
         }
         targets
@@ -241,5 +254,10 @@ fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
 /// The same bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's
 /// room, the ego history and the maps before them are multiples of 4 bytes.
 fn as_floats(bytes: &mut [u8]) -> &mut [f32] {
+    bytemuck::cast_slice_mut(bytes)
+}
+
+/// The same bytes as instances. They are aligned: all bytes before them are of floats, and of other instances.
+fn as_ids(bytes: &mut [u8]) -> &mut [u16] {
     bytemuck::cast_slice_mut(bytes)
 }
