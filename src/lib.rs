@@ -19,7 +19,7 @@
 //! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
-//! | [`wildcity_server`] | WebSocket and HTTP | protocol, push, render, scene, session, sim, twin |
+//! | [`wildcity_server`] | WebSocket and HTTP | episode, protocol, push, render, scene, session, sim, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,

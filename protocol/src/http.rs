@@ -333,6 +333,33 @@ pub struct SessionInfo {
     pub connected: bool,
 }
 
+/// A recorded episode: an entry of `GET /v1/episodes`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct EpisodeInfo {
+    /// Name of the episode: that of its session and a number.
+    pub episode: String,
+    /// Name of the twin.
+    pub twin: String,
+    /// Its version when the episode began.
+    pub version: u64,
+    /// Seed of the episode.
+    pub seed: u64,
+    /// Steps done.
+    pub steps: u64,
+    /// Size of the record, in bytes.
+    pub bytes: u64,
+    /// Why the episode ended. Absent while it runs, and if the server was killed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub outcome: Option<String>,
+    /// Name of the scenario, if there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<String>,
+    /// The verdict, if there was a scenario: `passed`, `failed`, `off_model` or `not_judged`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<String>,
+}
+
 /// Body of the answer to a refused request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]

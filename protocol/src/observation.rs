@@ -104,7 +104,7 @@ pub struct Event {
     pub time_us: i64,
     /// What.
     pub kind: EventKind,
-    /// Name of the actor, if it is about one.
+    /// Name of the actor, if it is about one. A contact without an actor is one with the twin.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actor: Option<String>,
     /// Name of the trigger, or the reason of an end: `time`, `off_route`, `contact`, `stuck` or `route_done`.
@@ -123,7 +123,7 @@ pub struct Event {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum EventKind {
-    /// The ego began to touch an actor.
+    /// The ego began to touch an actor, or the twin.
     Contact,
     /// A trigger of an actor fired.
     Trigger,

@@ -70,8 +70,7 @@ impl Replay {
         // With --out all images are rendered. Without it, the first difference decides the result.
         let extent =
             if self.out.is_some() { ReplayUntil::End } else { ReplayUntil::FirstDifference };
-        let mut open = |version| cache.open(&header.twin, Some(version));
-        let report = recording.replay(&mut open, &*backend, extent, &mut |image| {
+        let report = recording.replay(&cache, &*backend, extent, &mut |image| {
             bar.inc(1);
             match &self.out {
                 Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),

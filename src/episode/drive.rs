@@ -1,5 +1,7 @@
 //! An episode as the scores see it.
 
+use std::collections::BTreeMap;
+
 use glam::{DVec2, DVec3};
 
 use wildcity_scene::geometry::Pose;
@@ -13,15 +15,17 @@ use wildcity_sim::ego::EgoModel;
 use crate::file::EpisodeFile;
 use crate::lines::{ActorsLine, Event, ScenarioLine};
 
-/// The numbers of an episode that scores are made of; `None` if it has no frame.
+/// The numbers of an episode that scores are made of; `None` if it has no frame, or if a request followed a plan for
+/// several steps: the record has no poses of the steps between.
 pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
     let frames = episode.driven();
     let poses: Vec<Pose> = frames.iter().filter_map(|frame| frame.poses.last().copied()).collect();
-    if poses.is_empty() {
+    let steps: Vec<u64> = frames.iter().map(|frame| frame.step).collect();
+    let is_gapless = steps.windows(2).all(|pair| pair[1] == pair[0] + 1);
+    if poses.is_empty() || !is_gapless {
         return None;
     }
     let scenario = episode.scenario.as_ref();
-    let steps: Vec<u64> = frames.iter().map(|frame| frame.step).collect();
     let contacts = episode.events.iter().filter_map(|line| match &line.event {
         Event::Contact(event) => Some(event.contact(line.time_us)),
         _ => None,
@@ -113,8 +117,8 @@ where
 }
 
 fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<Track> {
-    // Where a session went back, the last line of a step holds.
-    let at_step = |step: u64| lines.iter().rev().find(|line| line.step == step);
+    // Where a session went back, and in a warm-up, the last line of a step holds.
+    let of_step: BTreeMap<u64, &ActorsLine> = lines.iter().map(|line| (line.step, line)).collect();
     let mut tracks: Vec<Track> = scenario
         .actors
         .iter()
@@ -124,11 +128,8 @@ fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<T
             samples: vec![None; steps.len()],
         })
         .collect();
-    let by_order = lines.len() == steps.len()
-        && lines.iter().zip(steps).all(|(line, &step)| line.step == step);
-    for (k, &step) in steps.iter().enumerate() {
-        let line = if by_order { lines.get(k) } else { at_step(step) };
-        let Some(line) = line else { continue };
+    for (k, step) in steps.iter().enumerate() {
+        let Some(line) = of_step.get(step) else { continue };
         for state in line.actors.iter().filter_map(|state| state.state()) {
             let index = usize::from(state.index);
             let (Some(track), Some(actor)) = (tracks.get_mut(index), scenario.actors.get(index))

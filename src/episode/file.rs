@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
 
@@ -236,6 +237,23 @@ impl EpisodeFile {
             Line::Other => {}
         }
         Ok(())
+    }
+
+    /// The rig of an episode's file, with intrinsics and places of the cameras; `None` if the header has names alone.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn rig(path: &Path) -> Result<Option<Rig>, ReadError> {
+        #[derive(Deserialize)]
+        struct WithRig {
+            rig: Rig,
+        }
+        let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
+        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        let mut text = Vec::new();
+        let line = read_line(&mut reader, limits::HEAD_BYTES, &mut text).map_err(failed)?;
+        let read = line.ok().and_then(|_| serde_json::from_slice::<WithRig>(&text).ok());
+        Ok(read.map(|read| read.rig))
     }
 
     /// The frames that the ego drove: the start and each step, in order. Where a session went back to an earlier

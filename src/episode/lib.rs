@@ -9,24 +9,30 @@
 //! | `file` | reading an episode's file |
 //! | `drive` | an episode as the scores see it |
 //! | `outcome` | the result of an episode |
+//! | `scenario` | the line of a scenario |
 //! | `diff` | where two episodes part |
+//! | `export` | an episode as MCAP |
 //! | `listing` | the episodes of a directory |
 //! | [`limits`] | limits |
 
 mod diff;
 mod drive;
+mod export;
 mod file;
 pub mod limits;
 mod lines;
 mod listing;
 mod outcome;
+mod scenario;
 
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
+pub use export::{ExportError, Exported, export};
 pub use file::{CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead};
 pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list};
+pub use listing::{Listed, list, text};
 pub use outcome::result;
+pub use scenario::{DriveStart, pose_at, scenario_line};

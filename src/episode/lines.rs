@@ -144,6 +144,16 @@ pub enum Event {
         /// Index of the trigger in its script.
         trigger: u32,
     },
+    /// An actor appeared.
+    Appeared {
+        /// The actor.
+        actor: u16,
+    },
+    /// An actor disappeared.
+    Left {
+        /// The actor.
+        actor: u16,
+    },
     /// A rule of the scenario ended the episode: `time`, `contact`, `off_route`, `route_done`, `stuck`, `off_model`.
     Ended {
         /// The rule.

@@ -50,3 +50,11 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
     listed.truncate(limits::LISTED);
     Ok(listed)
 }
+
+/// The text of an episode's file.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn text(path: &Path) -> io::Result<Vec<u8>> {
+    fs::read(path)
+}

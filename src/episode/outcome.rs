@@ -7,7 +7,7 @@ use crate::drive::drive_record;
 use crate::file::EpisodeFile;
 use crate::lines::{EpisodeResult, FaultLine, ScoreLine};
 
-/// Judges an episode and scores it. `None` if it has no frame.
+/// Judges an episode and scores it. `None` if the record has no frame, or not every step ([`drive_record`]).
 ///
 /// The same function serves the end of a session and `wildcity episode score`: a record is all that it needs.
 pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {

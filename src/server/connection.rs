@@ -244,8 +244,9 @@ impl Connection {
                 self.slot = None;
                 let name = session.name().to_owned();
                 tracing::info!(session = name, "closed");
+                let episode = session.episode_name();
                 let summary = session.close(Outcome::Completed).await;
-                let answer = Answer::Text(convert::closed(seq, &summary)?.into());
+                let answer = Answer::Text(convert::closed(seq, &summary, episode)?.into());
                 let last = AnsweredRequest { seq, answer: answer.clone() };
                 let owner = &self.grant.name;
                 self.state.sessions.remember_closed(name, owner, last, &summary);

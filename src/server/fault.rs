@@ -89,6 +89,12 @@ pub(crate) enum Fault {
         /// The names of the twin's trajectories.
         known: Vec<String>,
     },
+    /// There is no recorded episode of this name.
+    #[error("there is no recorded episode {name:?}; `GET /v1/episodes` lists them")]
+    UnknownEpisode {
+        /// The name asked for.
+        name: String,
+    },
     /// Another session has the name.
     #[error("there is a session {name:?} already; resume it, or choose another name")]
     SessionExists {

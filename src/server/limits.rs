@@ -101,3 +101,6 @@ const _: () = {
     assert!(session::HISTORY_POSES == wire::HISTORY_POSES);
     assert!(session::STEP_TIMEOUT.as_millis() == wire::STEP_TIMEOUT.as_millis());
 };
+
+/// Episodes of one list over HTTP, the newest. Reading one of 30 s takes some 10 ms: a second for all.
+pub const LISTED_EPISODES: usize = 100;

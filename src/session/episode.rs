@@ -271,6 +271,7 @@ impl Episode {
     ) -> EpisodeSummary {
         let completed = self.terminated
             || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
+        // Rules of a scenario are not evaluated by a replay: what a record says of them is believed.
         let failed = self.failed || outcome == Outcome::DrivingFailure;
         let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model, failed) {

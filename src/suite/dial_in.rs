@@ -8,7 +8,6 @@ use serde_json::json;
 use tokio::time::{Instant, sleep};
 
 use wildcity_episode::EpisodeFile;
-use wildcity_session::Start;
 
 use crate::case::Case;
 use crate::limits;
@@ -65,43 +64,15 @@ fn start(dialled: &Dialled<'_>, case: &Case) -> std::io::Result<Child> {
 /// The fields of the request `open` that the scenario gives.
 fn open_json(session: &str, case: &Case) -> serde_json::Value {
     let options = &case.options;
-    let mut open = json!({
+    json!({
         "session": session,
         "twin": options.twin,
+        "version": options.version,
         "seed": options.seed,
         "dt_us": options.dt_us,
-        "warm_up_us": options.warm_up_us,
-        "dynamics": {
-            "model": options.dynamics.model.name(),
-            "speed": options.dynamics.speed_m_s,
-            "reverse": options.dynamics.reverse,
-        },
-    });
-    if let Some(version) = options.version {
-        open["version"] = version.into();
-    }
-    match &options.start {
-        None => {}
-        Some(Start::Pose(pose)) => open["start"] = json!({ "pose": pose }),
-        Some(Start::Station { trajectory, station_m }) => {
-            open["start"] = json!({ "trajectory": trajectory, "station_m": station_m });
-        }
-        Some(Start::Random(random)) => {
-            let mut fields =
-                json!({ "lateral_m": random.lateral_m, "heading_rad": random.heading_rad });
-            if let Some(trajectory) = &random.trajectory {
-                fields["trajectory"] = trajectory.as_str().into();
-            }
-            if let Some(from_m) = random.from_m {
-                fields["from_m"] = from_m.into();
-            }
-            if let Some(to_m) = random.to_m {
-                fields["to_m"] = to_m.into();
-            }
-            open["start"] = json!({ "random": fields });
-        }
-    }
-    open
+        // With start, dynamics and warm-up.
+        "scenario": case.line.scenario,
+    })
 }
 
 /// Waits for a process without blocking others; kills it when its time is over.

@@ -2,13 +2,14 @@
 
 use glam::DVec3;
 
+use wildcity_episode::pose_at;
 use wildcity_scene::geometry::Pose;
-use wildcity_session::Episode;
+use wildcity_session::{Episode, Session};
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::traffic::{Idm, rolled};
 use wildcity_sim::{Command, EgoModel};
 
-use crate::case::{Case, pose_at};
+use crate::case::Case;
 
 /// Agents that come with the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,7 +54,8 @@ impl BuiltIn {
     ///
     /// # Errors
     /// The scenario has no recorded drive, which this agent follows.
-    pub(crate) fn command(self, case: &Case, episode: &Episode) -> Result<Command, String> {
+    pub(crate) fn command(self, case: &Case, session: &Session) -> Result<Command, String> {
+        let episode = session.episode();
         let teleports = episode.ego().dynamics().model == EgoModel::Teleport;
         let dt_us = case.options.dt_us.unwrap_or(wildcity_session::limits::DT_US);
         match self {
@@ -70,7 +72,7 @@ impl BuiltIn {
                 follow(teleports, episode, dt_us, &at)
             }
             Self::Idm => {
-                let plan = IdmPlan::new(case, episode)?;
+                let plan = IdmPlan::new(case, session)?;
                 follow(teleports, episode, dt_us, &|time_us| plan.at(time_us - episode.time_us()))
             }
         }
@@ -98,18 +100,55 @@ fn follow(
     Ok(Command::Path(path))
 }
 
-/// A plan of the Intelligent Driver Model along the route on a free road; the end of the route is a wall.
+/// A plan of the Intelligent Driver Model along the route, behind the nearest actor; the end of the route is a wall.
 struct IdmPlan<'a> {
     case: &'a Case,
     /// Station at each 10 ms from now.
     stations_m: Vec<f64>,
 }
 
+/// What the ego follows.
+#[derive(Clone, Copy)]
+struct Lead {
+    /// The station of the ego's origin at which its front would touch, in metres.
+    rear_m: f64,
+    /// Speed along the route, in m/s.
+    speed_mps: f64,
+}
+
+/// The nearest actor ahead in the corridor of the ego's width.
+fn lead(case: &Case, session: &Session, station_m: f64) -> Option<Lead> {
+    let traffic = session.traffic()?;
+    let course = &case.resolved.route.as_ref()?.course;
+    let ego = case.resolved.traffic.ego_box;
+    let front_m = ego.center_x_m + 0.5 * ego.box_.length_m;
+    let there = traffic.states().iter().filter(|state| state.present);
+    let leads = there.filter_map(|state| {
+        let spec = traffic.specs().get(usize::from(state.index))?;
+        let beside = course.nearest(state.world_from_actor.position_m);
+        let ahead = course.at(beside.station_m).rotation * DVec3::X;
+        let own_forward = state.world_from_actor.rotation * DVec3::X;
+        let cos = own_forward.dot(ahead).abs().min(1.0);
+        let sin = (1.0 - cos * cos).sqrt();
+        let half_along_m = 0.5 * (spec.box_.length_m * cos + spec.box_.width_m * sin);
+        let half_across_m = 0.5 * (spec.box_.length_m * sin + spec.box_.width_m * cos);
+        let reach_m = half_across_m + 0.5 * ego.box_.width_m + SIDE_M;
+        let is_ahead = beside.station_m > station_m && beside.left_m.abs() < reach_m;
+        let rear_m = beside.station_m - half_along_m - front_m;
+        is_ahead.then(|| Lead { rear_m, speed_mps: state.velocity_mps.dot(ahead).max(0.0) })
+    });
+    leads.min_by(|a, b| a.rear_m.total_cmp(&b.rear_m))
+}
+
+/// Room that `idm` keeps on each side, in metres.
+const SIDE_M: f64 = 0.3;
+
 /// Step of the plan, in microseconds.
 const IDM_STEP_US: i64 = 10_000;
 
 impl<'a> IdmPlan<'a> {
-    fn new(case: &'a Case, episode: &Episode) -> Result<Self, String> {
+    fn new(case: &'a Case, session: &Session) -> Result<Self, String> {
+        let episode = session.episode();
         let route = case.resolved.route.as_ref().ok_or("there is no route to follow")?;
         let course = &route.course;
         let length_m = course.length_m();
@@ -120,14 +159,20 @@ impl<'a> IdmPlan<'a> {
             false => Idm::WILDCITY.free_speed_mps,
         };
         let idm = Idm { free_speed_mps, ..Idm::WILDCITY };
+        let lead = lead(case, session, begin.station_m);
         let forward = episode.world_from_rig().rotation * DVec3::X;
         let mut speed_mps = episode.ego().velocity_m_s().dot(forward).max(0.0);
         let mut station_m = begin.station_m;
         let mut stations_m = vec![station_m];
         let plan_us = PLAN_POSES * PLAN_STEP_US + wildcity_session::limits::DT_MAX_US;
-        for _ in 0..plan_us / IDM_STEP_US {
-            let gap_m = length_m - station_m;
-            let acceleration = idm.acceleration(speed_mps, 0.0, gap_m);
+        for step in 0..plan_us / IDM_STEP_US {
+            let wall_m = length_m - station_m;
+            let mut acceleration = idm.acceleration(speed_mps, 0.0, wall_m);
+            if let Some(Lead { rear_m, speed_mps: lead_mps }) = lead {
+                let ahead_s = (step * IDM_STEP_US) as f64 * 1e-6;
+                let gap_m = rear_m + lead_mps * ahead_s - station_m;
+                acceleration = acceleration.min(idm.acceleration(speed_mps, lead_mps, gap_m));
+            }
             let [way_m, end_mps] = rolled(speed_mps, acceleration, IDM_STEP_US as f64 * 1e-6);
             station_m += way_m;
             speed_mps = end_mps;

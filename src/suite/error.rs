@@ -4,7 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use wildcity_server::ServerError;
-use wildcity_session::SessionError;
+use wildcity_session::{ScenarioError, SessionError};
 use wildcity_sim::scenario::FileError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
@@ -39,6 +39,14 @@ pub enum SuiteError {
         path: PathBuf,
         /// Where and why.
         cause: FileError,
+    },
+    /// A scenario does not fit its twin, or a file that it names is malformed.
+    #[error("{}: {cause}", path.display())]
+    Scenario {
+        /// The scenario's file.
+        path: PathBuf,
+        /// Where and why.
+        cause: ScenarioError,
     },
     /// The version of a twin that a scenario was made for is not there.
     #[error(

@@ -84,8 +84,11 @@ impl SuiteFile {
         let mut scenarios = Vec::new();
         for file in &suite.scenarios {
             let path = dir.join(file);
-            let document = Document::parse(&read(&path)?)
-                .map_err(|cause| SuiteError::File { path: path.clone(), cause })?;
+            let wrong = |cause| SuiteError::File { path: path.clone(), cause };
+            let document = Document::parse(&read(&path)?).map_err(wrong)?;
+            if path.parent() != Some(dir) {
+                check_alone(&document).map_err(wrong)?;
+            }
             scenarios.push(SuiteScenario { path, document });
         }
         Ok((suite, scenarios))
@@ -126,6 +129,19 @@ impl SuiteFile {
                 Err(mistake("at_least", format!("{rate:?}; a rate is from 0 to 1")))
             }
             _ => Ok(()),
+        }
+    }
+}
+
+/// Refuses a scenario that needs files beside it. Sessions look for them beside the suite.
+fn check_alone(document: &Document) -> Result<(), FileError> {
+    let file = document.with(&document.first_values())?;
+    let fields = [("map.file", file.map.is_some()), ("tracks.file", file.tracks.is_some())];
+    match fields.into_iter().find(|(_, is_named)| *is_named) {
+        None => Ok(()),
+        Some((field, _)) => {
+            let message = "is looked for beside the suite: put the scenario there too";
+            Err(mistake(field, message.to_owned()))
         }
     }
 }

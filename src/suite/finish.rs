@@ -1,10 +1,8 @@
-//! The record of an episode, completed with its scenario and its result.
+//! Judges the record of a driven episode.
 
-use std::fs;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use glam::DVec3;
 
 use wildcity_episode::{EndLine, EpisodeFile, EpisodeResult, result};
 
@@ -24,7 +22,7 @@ pub(crate) struct Finished {
     pub(crate) frames_hash: String,
 }
 
-/// Judges an episode from its record, and writes scenario and result into it.
+/// Judges an episode from its record.
 pub(crate) async fn finish(case: &Case, record: PathBuf) -> Result<Finished, Technical> {
     let case = case.clone();
     let finished = tokio::task::spawn_blocking(move || finish_file(&case, &record));
@@ -35,13 +33,9 @@ pub(crate) async fn finish(case: &Case, record: PathBuf) -> Result<Finished, Tec
 }
 
 fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
-    let mut episode =
+    let episode =
         EpisodeFile::read(record).map_err(|error| Technical::server(error.to_string()))?;
     check(case, &episode)?;
-    let is_written = episode.scenario.is_some();
-    if !is_written {
-        episode.scenario = Some((*case.line).clone());
-    }
     let end = episode.end.clone().ok_or_else(|| Technical {
         kind: "agent_lost",
         message: "the record has no end".to_owned(),
@@ -58,13 +52,10 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     }
     let judged = result(&episode).ok_or_else(|| Technical {
         kind: "agent_error",
-        message: "nothing was driven".to_owned(),
+        message:
+            "a verdict needs every step: nothing was driven, or several steps with one request"
+                .to_owned(),
     })?;
-    if !is_written {
-        write_lines(case, record, &judged).map_err(|error| {
-            Technical::server(format!("cannot complete {}: {error}", record.display()))
-        })?;
-    }
     let mut frames = blake3::Hasher::new();
     for frame in &episode.frames {
         frames.update(frame.frame_hash.as_bytes());
@@ -81,18 +72,17 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
 /// An agent must drive what was ordered.
 fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
     let header = &episode.header;
-    let options = &case.options;
-    let dt_us = options.dt_us.unwrap_or(header.dt_us);
+    let scenario = episode.scenario.as_ref().map(|scenario| scenario.hash.as_str());
+    let start_m = case.line.route.first().map(|point| DVec3::from_array(point.1));
+    let is_elsewhere = |start_m| header.start.position_m.distance(start_m) > START_M;
     let wrong = [
-        ("twin", header.twin != options.twin),
+        ("twin", header.twin != case.options.twin),
         ("version", header.version_hash != case.version_hash),
         ("seed", header.seed != case.seed),
-        ("dynamics", header.dynamics != options.dynamics),
-        ("dt_us", header.dt_us != dt_us),
-        (
-            "start",
-            case.start().is_some_and(|start_m| header.start.position_m.distance(start_m) > 1.0),
-        ),
+        ("scenario", scenario != Some(&case.line.hash)),
+        ("dynamics", header.dynamics != case.resolved.dynamics.unwrap_or_default()),
+        ("dt_us", Some(header.dt_us) != case.options.dt_us),
+        ("start", start_m.is_some_and(is_elsewhere)),
     ];
     match wrong.into_iter().find(|(_, wrong)| *wrong) {
         None => Ok(()),
@@ -103,38 +93,5 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
     }
 }
 
-impl Case {
-    /// Where the episode starts, in metres, if that is known beforehand.
-    fn start(&self) -> Option<glam::DVec3> {
-        self.line.route.first().map(|point| glam::DVec3::from_array(point.1))
-    }
-}
-
-/// Writes the scenario after the header and the result before the end. The file is replaced as a whole.
-fn write_lines(case: &Case, record: &Path, judged: &EpisodeResult) -> std::io::Result<()> {
-    let text = fs::read_to_string(record)?;
-    let mut lines: Vec<&str> = text.lines().collect();
-    let scenario = tagged("scenario", &*case.line)?;
-    let result = tagged("result", judged)?;
-    lines.insert(1.min(lines.len()), &scenario);
-    lines.insert(lines.len().saturating_sub(1), &result);
-    let temporary = record.with_extension("tmp");
-    let mut file = fs::File::create(&temporary)?;
-    for line in lines {
-        file.write_all(line.as_bytes())?;
-        file.write_all(b"\n")?;
-    }
-    drop(file);
-    fs::rename(&temporary, record)
-}
-
-/// A line with its kind.
-fn tagged(kind: &'static str, line: &impl Serialize) -> std::io::Result<String> {
-    #[derive(Serialize)]
-    struct Tagged<'a, T> {
-        kind: &'static str,
-        #[serde(flatten)]
-        line: &'a T,
-    }
-    Ok(serde_json::to_string(&Tagged { kind, line })?)
-}
+/// Distance between the ordered and the driven start that counts as the same place, in metres.
+const START_M: f64 = 1.0;

@@ -11,7 +11,7 @@
 //! | `driver` | the built-in agents: `log`, `stand`, `idm` |
 //! | `dial_in` | agents that are commands |
 //! | `run` | drives all cases, some at once, technical failures once more |
-//! | `finish` | writes scenario and result into the record of an episode |
+//! | `finish` | judges the record of a driven episode |
 //! | `verify` | renders all episodes again |
 //! | `technical` | failures that are not driving |
 //! | `result` | `result.json`: episodes, rates, means, exit code |
@@ -35,7 +35,7 @@ mod run;
 mod technical;
 mod verify;
 
-pub use case::{Case, cases};
+pub use case::{Case, CaseOptions, cases};
 pub use driver::BuiltIn;
 pub use error::SuiteError;
 pub use file::{SuiteFile, SuiteScenario};

@@ -82,9 +82,7 @@ fn picture(
     }
     let step = recording.frames[at].step;
     let mut found: Option<Picture> = None;
-    let twin = recording.header.twin.clone();
-    let mut open = |version| cache.open(&twin, Some(version));
-    let report = recording.replay(&mut open, backend, ReplayUntil::End, &mut |image| {
+    let report = recording.replay(cache, backend, ReplayUntil::End, &mut |image| {
         if found.is_none() {
             let size = &image.camera.camera;
             let jpeg = jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)?;

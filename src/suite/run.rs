@@ -54,6 +54,8 @@ pub struct RunSettings {
     pub twins: PathBuf,
     /// The cache on disk.
     pub cache: Option<DiskCacheSettings>,
+    /// Directory of the suite, with the tracks and maps that scenarios name.
+    pub scenarios: PathBuf,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// Where the episodes are recorded; must be empty.
@@ -150,7 +152,8 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
     Ok(Engine::start(EngineSettings {
         cache: Cache::new(settings.catalog.clone()),
         episodes: settings.episodes.clone(),
-        scenarios: Scenarios::in_dir(""),
+        // Scenarios come with their sessions; files that they name are beside the suite.
+        scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
     })?)
@@ -162,7 +165,7 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
         twins: settings.twins.clone(),
         cache: settings.cache.clone(),
         episodes: settings.episodes.clone(),
-        scenarios: settings.episodes.join(".scenarios"),
+        scenarios: settings.scenarios.clone(),
         uploads: settings.episodes.join(".uploads"),
         tokens: None,
         backend: settings.backend.clone(),
@@ -252,8 +255,12 @@ async fn steps(session: &mut Session, case: &Case, agent: BuiltIn) -> Result<(),
     let failed = |error: wildcity_session::SessionError| Technical::server(error.to_string());
     session.reset(case.seed, None).await.map_err(failed)?;
     for step in 1..=case.steps {
-        let command = agent.command(case, session.episode()).map_err(Technical::server)?;
+        let command = agent.command(case, session).map_err(Technical::server)?;
         session.step(command, step == case.steps).await.map_err(failed)?;
+        // A rule of the scenario may end the episode earlier.
+        if session.episode().terminated() {
+            break;
+        }
     }
     Ok(())
 }

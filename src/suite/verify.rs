@@ -32,9 +32,7 @@ fn differs(path: &Path, cache: &Cache, backend: &dyn Backend) -> Option<String> 
         Ok(recording) => recording,
         Err(error) => return Some(error.to_string()),
     };
-    let twin = &recording.header.twin;
-    let mut open = |version| cache.open(twin, Some(version));
-    match recording.replay(&mut open, backend, ReplayUntil::FirstDifference, &mut |_| Ok(())) {
+    match recording.replay(cache, backend, ReplayUntil::FirstDifference, &mut |_| Ok(())) {
         Err(error) => Some(error.to_string()),
         Ok(report) => {
             let diverged = report.diverged.map(|diverged| diverged.to_string());

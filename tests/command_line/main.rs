@@ -42,6 +42,7 @@ mod bombs;
 mod crash;
 mod demo;
 mod devices;
+mod episode;
 mod garbage;
 mod generate;
 mod import;

@@ -88,3 +88,11 @@ fn a_record_of_thirty_seconds_is_read_and_scored_in_50_ms() {
     let took = took.min().unwrap();
     assert!(took.as_millis() < 50, "{took:?}");
 }
+
+#[test]
+fn a_record_that_skips_steps_is_not_scored() {
+    let mut lines = Made::default().lines();
+    let skipped = lines.iter().position(|line| line["kind"] == "frame" && line["step"] == 7);
+    lines.remove(skipped.unwrap());
+    assert_eq!(result(&written::read(&lines)), None);
+}

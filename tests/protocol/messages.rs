@@ -374,6 +374,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         time_us: 200_000,
         distance_m: 1.75,
         least_trust: Some(0.0625),
+        episode: Some("agent-1".into()),
     };
     let refused = Answer::Error {
         seq: Some(3),

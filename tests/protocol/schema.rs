@@ -21,6 +21,7 @@ fn schemas_are_up_to_date() {
     check::<http::Push>("push");
     check::<http::VersionInfo>("version");
     check::<http::SessionInfo>("session");
+    check::<http::EpisodeInfo>("episode");
     check::<http::Refusal>("refusal");
 }
 

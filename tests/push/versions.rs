@@ -150,8 +150,7 @@ async fn a_session_switches_between_steps_and_its_episode_goes_on() {
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let cpu = Cpu::new(2, Simd::Best).unwrap();
     let replay = |recording: &RecordedEpisode| {
-        let mut open = |version| cache.open("test", Some(version));
-        recording.replay(&mut open, &cpu, ReplayUntil::End, &mut |_| Ok(())).unwrap()
+        recording.replay(&cache, &cpu, ReplayUntil::End, &mut |_| Ok(())).unwrap()
     };
     let report = replay(&recording);
     assert_eq!((report.difference, report.images, report.changes), (None, 10, vec![]));

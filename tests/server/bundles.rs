@@ -255,8 +255,7 @@ async fn what_was_drawn_for_later_is_rendered_again_in_a_replay() {
     let recording = RecordedEpisode::read(&server.recorded()[0]).unwrap();
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let replayed = |backend: &dyn Backend| {
-        let mut open = |version| cache.open("test", Some(version));
-        recording.replay(&mut open, backend, ReplayUntil::End, &mut |_| Ok(())).unwrap()
+        recording.replay(&cache, backend, ReplayUntil::End, &mut |_| Ok(())).unwrap()
     };
     let report = replayed(&Painter::default());
     assert_eq!(report.difference, None);

@@ -149,6 +149,37 @@ async fn health_and_twins() {
     assert_eq!(request(&server, "rubbish\n\n").await.0, 400);
 }
 
+#[tokio::test]
+async fn episodes_are_listed_and_fetched_by_the_name_that_closed_gives() {
+    let server = TestServer::start().await;
+    let body = |answer: &str| -> serde_json::Value {
+        serde_json::from_str(answer.split("\r\n\r\n").nth(1).unwrap()).unwrap()
+    };
+    let (_, none) = get(&server, "/v1/episodes").await;
+    assert_eq!(body(&none), serde_json::json!({ "episodes": [] }));
+    let mut agent = server.driver("a").await;
+    agent.step(1.0).await;
+    let closed = agent.ask(serde_json::json!({ "type": "close" })).await;
+    let name = closed["summary"]["episode"].as_str().unwrap().to_owned();
+    assert_eq!(name, "a-1");
+
+    let (status, listed) = get(&server, "/v1/episodes").await;
+    let listed = body(&listed);
+    let entry = &listed["episodes"][0];
+    assert_eq!(
+        (status, &entry["episode"], &entry["outcome"]),
+        (200, &name.clone().into(), &"completed".into())
+    );
+    assert_eq!((&entry["twin"], &entry["steps"]), (&"test".into(), &1.into()));
+    let (status, record) = get(&server, &format!("/v1/episodes/{name}")).await;
+    let text = std::fs::read_to_string(server.episodes.path().join("a-1.jsonl")).unwrap();
+    assert_eq!((status, record.split("\r\n\r\n").nth(1).unwrap()), (200, text.as_str()));
+    for wrong in ["a-2", "..%2Fa-1", "a-1.jsonl", "%00"] {
+        let (status, answer) = get(&server, &format!("/v1/episodes/{wrong}")).await;
+        assert_eq!(status, 404, "{wrong}: {answer}");
+    }
+}
+
 /// All files below a directory.
 fn walk(dir: &std::path::Path) -> Vec<std::path::PathBuf> {
     let paths = std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path());

@@ -26,8 +26,7 @@ pub(crate) fn replay(
 ) -> Result<ReplayReport, ReplayError> {
     let recording = RecordedEpisode::read(path)?;
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
-    let mut open = |version| cache.open(&recording.header.twin, Some(version));
-    recording.replay(&mut open, backend, ReplayUntil::FirstDifference, &mut |_| Ok(()))
+    recording.replay(&cache, backend, ReplayUntil::FirstDifference, &mut |_| Ok(()))
 }
 
 #[tokio::test]

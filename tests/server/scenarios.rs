@@ -180,7 +180,6 @@ async fn bad_scenarios_are_refused_with_their_place() {
         (with(&|f| f["actors"][1]["name"] = "car".into()), "scenario.actors[1].name"),
         (with(&|f| f["sweep"]["v"] = json!([])), "scenario.sweep.v"),
         (with(&|f| f["sweep"]["v"] = json!(["fast"])), "scenario.actors[1].path.speed"),
-        (with(&|f| f["end"]["contact"] = "static".into()), "scenario.end.contact"),
         (with(&|f| f["map"] = json!({"file": "none.json"})), "scenario.map.file"),
         (with(&|f| f["tracks"] = json!({"file": "../short.json"})), "scenario.tracks.file"),
     ] {

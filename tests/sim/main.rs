@@ -10,5 +10,6 @@ mod vectors;
 mod contact;
 mod driving;
 mod integrators;
+mod solids;
 mod study;
 mod traffic;

@@ -31,7 +31,7 @@ fn a_sweep_makes_a_case_of_each_combination() {
     let names: Vec<&str> = cases.iter().map(|case| case.name.as_str()).collect();
     assert_eq!(names, ["swept-0-0", "swept-0-1", "swept-1-0", "swept-1-1"]);
     assert_eq!(cases[2].values["v"], 10.0);
-    assert_eq!(cases[2].options.dynamics.speed_m_s, 10.0);
+    assert_eq!(cases[2].resolved.dynamics.unwrap().speed_m_s, 10.0);
 }
 
 #[test]
@@ -70,7 +70,8 @@ fn a_version_that_is_gone_is_an_error_unless_the_latest_will_do() {
     let error = bench.cases(&path).unwrap_err().to_string();
     assert!(error.contains("not in the store") && error.contains("--latest"), "{error}");
     let (suite, scenarios) = wildcity_suite::SuiteFile::read(&path).unwrap();
-    let latest = wildcity_suite::cases(&suite, &scenarios, &bench.catalog(), true).unwrap();
+    let latest = wildcity_suite::CaseOptions { latest: true, bare: false };
+    let latest = wildcity_suite::cases(&suite, &scenarios, &bench.catalog(), latest).unwrap();
     let there = bench.catalog().version("street", None).unwrap().hash;
     assert_eq!(latest[0].version_hash, there);
     pinned["twin"]["version_hash"] = json!(there);

@@ -4,3 +4,4 @@ mod dial_in;
 mod files;
 mod runs;
 mod street;
+mod traffic;

@@ -17,7 +17,8 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_suite::{
-    AgentChoice, BuiltIn, Case, RunSettings, SuiteError, SuiteFile, SuiteResult, cases, run,
+    AgentChoice, BuiltIn, Case, CaseOptions, RunSettings, SuiteError, SuiteFile, SuiteResult,
+    cases, run,
 };
 use wildcity_twin::store::{Catalog, NewVersion};
 
@@ -105,7 +106,7 @@ impl Bench {
     #[expect(clippy::result_large_err, reason = "the package's own error, built once per test")]
     pub(crate) fn cases(&self, path: &Path) -> Result<Vec<Case>, SuiteError> {
         let (suite, scenarios) = SuiteFile::read(path)?;
-        cases(&suite, &scenarios, &self.catalog(), false)
+        cases(&suite, &scenarios, &self.catalog(), CaseOptions::default())
     }
 
     pub(crate) fn settings(&self, agent: AgentChoice, jobs: usize, out: &str) -> RunSettings {
@@ -120,6 +121,7 @@ impl Bench {
             catalog: self.catalog(),
             twins: self.path("twins"),
             cache: None,
+            scenarios: self.dir.path().to_owned(),
             backend: Arc::new(cpu()),
             episodes: self.path(out),
             progress: Box::new(|_| {}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -108,6 +109,33 @@ def free_port() -> int:
         listener.bind(("127.0.0.1", 0))
         port: int = listener.getsockname()[1]
         return port
+
+
+def test_the_demo_suite_tells_drivers_apart(reader: dict[str, str], tmp_path: Path) -> None:
+    suite = ROOT / "scenes" / "suites" / "street" / "suite.json"
+    run(["wildcity", "actor", "generate"], tmp_path, reader)
+
+    def drive(agent: str, code: int, *options: str) -> dict[str, list[str]]:
+        """The faults of each episode of the suite."""
+        out = tmp_path / "-".join([agent, *options])
+        command = ["wildcity", "episode", "run", str(suite), "--agent", agent, "--out", str(out)]
+        done = subprocess.run([*command, *options], env=reader, capture_output=True, text=True)
+        assert done.returncode == code, f"{done.stdout}\n{done.stderr}"
+        episodes = json.loads((out / "result.json").read_text())["episodes"]
+        return {one["name"]: [fault["fault"] for fault in one["faults"]] for one in episodes}
+
+    bare = drive("log", 0, "--bare", "--jobs", "2")
+    assert not any(bare.values()), "each scenario can be passed"
+    assert drive("idm", 0, "--jobs", "1") == drive("idm", 0, "--jobs", "2") == bare
+    assert all("progress" in faults for faults in drive("stand", 1).values())
+    blind = drive("log", 1)
+    walkers = {name for name in blind if name.startswith("pedestrian")}
+    assert walkers == {name for name, faults in blind.items() if faults}
+    assert all(blind[name][0] == "contact.pedestrian" for name in walkers)
+    report = (tmp_path / "log" / "report.html").read_text()
+    assert report.count("data:image/jpeg;base64,") == len(walkers)
+    one, two = (tmp_path / f"idm---jobs-{jobs}" / "result.json" for jobs in (1, 2))
+    assert one.read_bytes() == two.read_bytes()
 
 
 def test_a_page_that_says_something_else_fails(reader: dict[str, str], tmp_path: Path) -> None:

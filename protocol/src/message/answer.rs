@@ -225,6 +225,9 @@ pub struct Summary {
     /// The lowest mean confidence of an observation's images. Only with `outputs.trust`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub least_trust: Option<f64>,
+    /// Name of the recorded episode, as in `GET /v1/episodes`. Absent if the session drove nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub episode: Option<String>,
 }
 
 /// Why an episode ended.

@@ -1,10 +1,12 @@
 //! `wildcity episode`: suites of scenarios, and recorded episodes.
 
 mod diff;
+mod export;
 mod list;
 mod run;
 mod score;
 mod show;
+mod video;
 
 use std::path::{Path, PathBuf};
 
@@ -14,7 +16,7 @@ use wildcity_episode::EpisodeFile;
 
 use super::directories::Episodes;
 
-/// Drive suites of scenarios; list, score and compare recorded episodes.
+/// Drive suites of scenarios; list, score, compare and export recorded episodes.
 #[derive(Debug, clap::Args)]
 pub(super) struct Episode {
     #[command(subcommand)]
@@ -28,6 +30,8 @@ enum Command {
     Show(show::Show),
     Score(score::Score),
     Diff(diff::Diff),
+    Export(export::Export),
+    Video(Box<video::Video>),
 }
 
 impl Episode {
@@ -38,6 +42,8 @@ impl Episode {
             Command::Show(command) => command.run(),
             Command::Score(command) => command.run(),
             Command::Diff(command) => command.run(),
+            Command::Export(command) => command.run(),
+            Command::Video(command) => command.run(),
         }
     }
 }

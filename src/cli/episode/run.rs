@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    AgentChoice, BuiltIn, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit, page,
-    pictures,
+    AgentChoice, BuiltIn, CaseOptions, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit,
+    page, pictures,
 };
 use wildcity_twin::store::Catalog;
 
@@ -67,6 +67,10 @@ pub(super) struct Run {
     #[arg(long)]
     latest: bool,
 
+    /// Leave out all actors: on the bare twin the agent log must pass.
+    #[arg(long)]
+    bare: bool,
+
     #[command(flatten)]
     twins: Twins,
 
@@ -78,7 +82,8 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity episode run scenes/suites/street/suite.json
   wildcity episode run suite.json --agent 'python drive.py' --jobs 4 --at-least 0.9
-  wildcity episode run pedestrian.json --agent stand --verify";
+  wildcity episode run pedestrian.json --agent stand --verify
+  wildcity episode run suite.json --agent log --bare        (each scenario tests itself)";
 
 impl Run {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -88,7 +93,8 @@ impl Run {
             return Err(usage("--at-least is a rate from 0 to 1"));
         }
         let catalog = self.twins.catalog()?;
-        let cases = cases(&suite, &scenarios, &catalog, self.latest).map_err(usage)?;
+        let options = CaseOptions { latest: self.latest, bare: self.bare };
+        let cases = cases(&suite, &scenarios, &catalog, options).map_err(usage)?;
         let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
         let agent = match BuiltIn::named(&agent) {
             Some(agent) => AgentChoice::BuiltIn(agent),
@@ -111,6 +117,7 @@ impl Run {
             catalog: catalog.clone(),
             twins: self.twins.dir()?,
             cache: self.twins.cache(),
+            scenarios: self.suite.parent().unwrap_or(Path::new(".")).to_owned(),
             backend: backend.clone(),
             episodes: episodes.clone(),
             progress: Box::new(move |_| counted.inc(1)),

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use anyhow::Context as _;
 use serde_json::json;
 
 use wildcity_episode::{EpisodeFile, EpisodeResult, result};
@@ -36,8 +37,12 @@ impl Score {
         for path in &self.episodes_to_score {
             let episode = super::read(path, &self.episodes)?;
             let name = EpisodeFile::name_of(path);
-            let scored = result(&episode)
-                .ok_or_else(|| anyhow::anyhow!("{name} has no frame: nothing was driven"))?;
+            let scored = result(&episode).with_context(|| {
+                format!(
+                    "{name} cannot be scored: it has no frame, or its agent drove several steps with one request, which \
+                     leaves no poses between"
+                )
+            })?;
             if self.json {
                 writeln!(out, "{}", json!({ "episode": name, "result": scored }))?;
             } else {

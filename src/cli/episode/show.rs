@@ -108,6 +108,8 @@ fn text(event: &Event, episode: &EpisodeFile) -> String {
         }
         Event::OffModel { trust } => format!("left the trained area: trust {trust:.3}"),
         Event::Triggered { actor, trigger } => format!("{} fires trigger {trigger}", name(*actor)),
+        Event::Appeared { actor } => format!("{} appears", name(*actor)),
+        Event::Left { actor } => format!("{} leaves", name(*actor)),
         Event::Ended { rule } => format!("ended by the rule {rule}"),
     }
 }

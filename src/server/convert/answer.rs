@@ -166,7 +166,11 @@ pub(crate) fn switched(seq: u64, session: &Session) -> Result<String, Fault> {
 }
 
 /// The answer to `close`.
-pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault> {
+pub(crate) fn closed(
+    seq: u64,
+    summary: &EpisodeSummary,
+    episode: Option<String>,
+) -> Result<String, Fault> {
     let EpisodeSummary { outcome, steps, time_us, distance_m, least_trust } = *summary;
     let outcome = match outcome {
         Outcome::Completed => message::Outcome::Completed,
@@ -177,7 +181,7 @@ pub(crate) fn closed(seq: u64, summary: &EpisodeSummary) -> Result<String, Fault
         Outcome::AgentLost => message::Outcome::AgentLost,
         Outcome::ServerError => message::Outcome::ServerError,
     };
-    let summary = message::Summary { outcome, steps, time_us, distance_m, least_trust };
+    let summary = message::Summary { outcome, steps, time_us, distance_m, least_trust, episode };
     text(&Answer::Closed { seq, summary })
 }
 

@@ -179,6 +179,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
         Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
         Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
+        // The list of codes is closed, and episodes are named by their sessions.
+        Fault::UnknownEpisode { .. } => at(Code::UnknownSession, "episode"),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {

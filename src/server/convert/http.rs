@@ -9,6 +9,7 @@ use crate::fault::Fault;
 use crate::limits;
 use crate::sessions::ListedSession;
 use crate::spool::{Announced, Upload};
+use wildcity_episode::{EpisodeFile, Listed};
 use wildcity_protocol::http;
 use wildcity_push::{
     CellChange, CellSelection, FileReport, PushError, PushReport, PushRequest, PushedVersion,
@@ -213,4 +214,20 @@ pub(crate) fn sessions(sessions: &[ListedSession]) -> Value {
         connected: *connected,
     };
     json!({ "sessions": sessions.iter().map(session).collect::<Vec<_>>() })
+}
+
+/// The body of `GET /v1/episodes`.
+pub(crate) fn episodes(episodes: &[(EpisodeFile, Listed)]) -> Value {
+    let info = |(episode, listed): &(EpisodeFile, Listed)| http::EpisodeInfo {
+        episode: listed.name.clone(),
+        twin: episode.header.twin.clone(),
+        version: episode.header.version,
+        seed: episode.header.seed,
+        steps: episode.driven().last().map_or(0, |frame| frame.step),
+        bytes: listed.bytes,
+        outcome: episode.end.as_ref().map(|end| end.outcome.clone()),
+        scenario: episode.scenario.as_ref().map(|scenario| scenario.name.clone()),
+        verdict: episode.result.as_ref().map(|result| result.verdict.clone()),
+    };
+    json!({ "episodes": episodes.iter().map(info).collect::<Vec<_>>() })
 }

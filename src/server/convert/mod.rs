@@ -26,7 +26,9 @@ mod rig;
 pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
-pub(crate) use http::{new_push, new_upload, push, rollback, sessions, upload, version, versions};
+pub(crate) use http::{
+    episodes, new_push, new_upload, push, rollback, sessions, upload, version, versions,
+};
 pub(crate) use observation::observation;
 pub(crate) use request::{BranchPoint, Command, Parsed, parse};
 

@@ -212,6 +212,11 @@ fn events(traffic: &EpisodeTraffic) -> Vec<Event> {
                 told.at_fault = (!contact.at_start).then_some(contact.ego_at_fault);
                 told.impact = Some(contact.impact_mps);
             }
+            EventKind::StaticContact { impact_mps, .. } => {
+                told.kind = wire::EventKind::Contact;
+                told.at_fault = Some(true);
+                told.impact = Some(*impact_mps);
+            }
             EventKind::Trigger { actor, trigger } => {
                 told.kind = wire::EventKind::Trigger;
                 told.actor = Some(name_of(*actor));

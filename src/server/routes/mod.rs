@@ -1,5 +1,6 @@
 //! HTTP routes.
 
+mod episodes;
 mod metrics;
 mod pushes;
 mod refusal;
@@ -31,6 +32,8 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
     Router::new()
         .route("/v1/session", get(websocket::upgrade))
         .route("/v1/sessions", get(sessions::list))
+        .route("/v1/episodes", get(episodes::list))
+        .route("/v1/episodes/{episode}", get(episodes::show))
         .route("/v1/twins", get(twins::list))
         .route("/v1/twins/{twin}", get(twins::show))
         .route("/v1/twins/{twin}/versions", get(twins::versions))

@@ -301,7 +301,8 @@ impl Engine {
         &self.answer_budget
     }
 
-    pub(crate) fn episodes(&self) -> &Path {
+    /// The directory of the recorded episodes.
+    pub fn episodes(&self) -> &Path {
         &self.episodes
     }
 }

@@ -261,7 +261,7 @@ impl FrameRecord {
     }
 
     /// The rendered cameras of a pose, by their index, of a rig with `rig_cameras`.
-    pub(crate) fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
+    pub fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
         self.cameras.get(pose).cloned().unwrap_or_else(|| (0..rig_cameras).collect())
     }
 }

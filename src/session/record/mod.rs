@@ -4,6 +4,7 @@
 //! rendered again. A replay drives the recorded commands, renders the recorded poses, and compares both with
 //! the record: poses to the bit, images by their hashes.
 
+mod actor_replay;
 pub(crate) mod branch_error;
 pub(crate) mod continuation;
 pub(crate) mod ego_replay;

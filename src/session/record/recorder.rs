@@ -8,8 +8,11 @@ use std::io::{self, Write as _};
 use std::path::Path;
 use std::sync::Arc;
 
+use wildcity_episode::{EpisodeFile, EpisodeResult};
+
 use super::error::RecordError;
 use super::format::Line;
+use crate::episode::EpisodeSummary;
 
 /// An episode's file, open for appending.
 #[derive(Clone, Debug)]
@@ -61,6 +64,14 @@ impl Recorder {
         }
     }
 
+    /// Verdict and scores of the episode so far, if it ends as its summary says; `None` if it cannot be read.
+    pub(crate) fn result(&self, summary: &EpisodeSummary) -> Option<EpisodeResult> {
+        let mut episode = EpisodeFile::read(&self.path).ok()?;
+        let end = serde_json::to_value(summary).ok()?;
+        episode.end = serde_json::from_value(end).ok();
+        wildcity_episode::result(&episode)
+    }
+
     /// Appends whole lines, or nothing.
     pub(crate) fn append(&self, lines: &[Line]) -> Result<(), RecordError> {
         self.try_append(lines).map_err(|cause| RecordError { path: self.path.to_path_buf(), cause })
@@ -84,7 +95,7 @@ impl Recorder {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::episode::{EpisodeSummary, Outcome};
+    use crate::episode::Outcome;
 
     fn end(steps: u64) -> Line {
         Line::End(EpisodeSummary {

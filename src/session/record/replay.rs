@@ -6,8 +6,9 @@ use wildcity_render::{Backend, Frame, RenderError, Target};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::rig::RigCamera;
 use wildcity_sim::Ground;
-use wildcity_twin::residency::{ResidencyError, Resident};
+use wildcity_twin::residency::{Cache, Resident};
 
+use super::actor_replay::ActorReplay;
 use super::ego_replay::EgoReplay;
 use super::format::{BUILD, FrameRecord, RecordedVersion, profile_hash};
 use super::recorded_episode::RecordedEpisode;
@@ -15,34 +16,35 @@ use super::replay_report::{
     ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
 };
 use super::values;
+use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::viewpoints;
-
-/// Opens a version of the episode's twin, by its number.
-type OpenVersion<'a> = dyn FnMut(u64) -> Result<Arc<Resident>, ResidencyError> + 'a;
 
 /// What the caller does with each image, before it is compared with the record.
 type VisitImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
 
 impl RecordedEpisode {
-    /// Drives and renders the episode again, on the versions of its twin that `open` returns.
+    /// Drives and renders the episode again, on the recorded versions of its twin.
     ///
     /// # Errors
     /// A version cannot be opened, a command cannot be executed, the backend refuses a frame, or `visit`
     /// fails.
     pub fn replay(
         &self,
-        open: &mut OpenVersion<'_>,
+        cache: &Cache,
         backend: &dyn Backend,
         until: ReplayUntil,
         visit: &mut VisitImage<'_>,
     ) -> Result<ReplayReport, ReplayError> {
-        let mut replay = Replay::new(self, open(self.header.version)?, backend);
+        let open = |version: u64| cache.open(&self.header.twin, Some(version));
+        let actors = ActorReplay::new(self, cache)?;
+        let mut replay = Replay::new(self, open(self.header.version)?, actors, backend);
         let mut switches = self.versions.iter().peekable();
         for (index, frame) in self.frames.iter().enumerate() {
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
             {
                 replay.switch_version(open(to.version)?, to);
             }
+            replay.actors.advance(index);
             replay.drive(frame, index)?;
             if until == ReplayUntil::FirstDifference && replay.report.diverged.is_some() {
                 return Ok(replay.report);
@@ -68,6 +70,7 @@ struct Replay<'a> {
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
     ego: EgoReplay,
+    actors: ActorReplay<'a>,
     /// Lines of the file, from 1, at which the frames are.
     frame_lines: &'a [usize],
     /// The RGB buffer of each camera.
@@ -85,6 +88,7 @@ impl<'a> Replay<'a> {
     fn new(
         episode: &'a RecordedEpisode,
         resident: Arc<Resident>,
+        actors: ActorReplay<'a>,
         backend: &'a dyn Backend,
     ) -> Self {
         let header = &episode.header;
@@ -103,6 +107,7 @@ impl<'a> Replay<'a> {
             resident,
             profile: &header.profile,
             ego: EgoReplay::new(header),
+            actors,
             frame_lines: &episode.frame_lines,
             pixels: cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect(),
             report: ReplayReport {
@@ -204,10 +209,13 @@ impl<'a> Replay<'a> {
         let step = frame.step;
         let taken_us = frame.taken_us(pose);
         let views = self.ego.episode().views(self.cameras, selected, frame.poses[pose], taken_us);
-        let scene = self
+        let viewpoints = viewpoints(&views);
+        let mut scene = self
             .resident
-            .scene(&viewpoints(&views), self.profile)
+            .scene(&viewpoints, self.profile)
             .map_err(|cause| ReplayError::Residency { step, cause })?;
+        let detail = FrameDetail { viewpoints: &viewpoints, profile: self.profile };
+        scene.place(self.actors.placed(taken_us, detail));
 
         let all = self.pixels.iter_mut().zip(self.cameras).enumerate();
         let mut targets: Vec<Target<'_>> = all

@@ -2,7 +2,8 @@
 
 pub(crate) mod assets;
 pub(crate) mod load;
-mod past;
+pub(crate) mod past;
+mod solids;
 mod traffic;
 
 use std::cell::RefCell;
@@ -11,15 +12,17 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use wildcity_sim::scenario::{AssetInfo, ContactRule, EgoStart, FileError, ScenarioFile};
+use wildcity_sim::contact::Solids;
+use wildcity_sim::scenario::{AssetInfo, EgoStart, ScenarioFile};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::Version;
+use wildcity_twin::store::{Catalog, Version};
 
 pub use assets::asset_info;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
 use self::assets::ActorAssets;
+use self::solids::solids_of;
 use crate::error::SessionError;
 use crate::options::Start;
 
@@ -38,6 +41,8 @@ pub(crate) struct SessionScenario {
     file: ScenarioFile,
     /// Whether episodes start where the scenario says: the request named no start.
     gives_start: bool,
+    /// The twin's solid Gaussians; only if a contact with them ends an episode.
+    solids: Option<Arc<Solids>>,
 }
 
 impl SessionScenario {
@@ -53,12 +58,7 @@ impl SessionScenario {
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
         let wrong = |cause| ScenarioError::File { file: "scenario".to_owned(), cause };
         let file = document.with(&chosen).map_err(wrong)?;
-        if file.end.contact == Some(ContactRule::Static) {
-            let path = "end.contact".to_owned();
-            let message = "\"static\" is not known to a session; write any, at_fault or pedestrian";
-            return Err(wrong(FileError { path, message: message.to_owned() }));
-        }
-        Ok(Self { scenarios, file, gives_start })
+        Ok(Self { scenarios, file, gives_start, solids: None })
     }
 
     /// The scenario of an episode with a seed, and the assets of its actors, in memory.
@@ -88,6 +88,22 @@ impl SessionScenario {
         for (actor, pinned) in self.file.actors.iter_mut().zip(&first.scenario.file.actors) {
             actor.asset.clone_from(&pinned.asset);
         }
+    }
+
+    /// Looks for the twin's solid Gaussians, if a contact with them ends an episode. Blocks.
+    pub(crate) fn find_solids(
+        &mut self,
+        first: &LoadedScenario,
+        catalog: &Catalog,
+        version: &Version,
+    ) -> Result<(), SessionError> {
+        self.solids = solids_of(&first.scenario, catalog, version)?;
+        Ok(())
+    }
+
+    /// The solid Gaussians that were found.
+    pub(crate) fn solids(&self) -> Option<Arc<Solids>> {
+        self.solids.clone()
     }
 
     /// Where an episode starts, if the scenario says.

@@ -23,6 +23,12 @@ impl ActorPast {
         }
     }
 
+    /// The last `count` of them, or as many as there are, by rising time.
+    pub(crate) fn last(&self, count: usize) -> impl Iterator<Item = (i64, &[ActorState])> {
+        let first = self.0.len().saturating_sub(count);
+        self.0.range(first..).map(|(time_us, states)| (*time_us, &**states))
+    }
+
     /// The pose of each actor at a time, by its index; `None` for one that is absent. Between two steps an actor is
     /// there if it is at both ends. Before the first time and after the last it is where it was then.
     pub(crate) fn poses_at(&self, time_us: i64) -> Vec<Option<Pose>> {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use wildcity_scene::ActorClass;
 use wildcity_scene::actor::PlacedChunk;
-use wildcity_sim::contact::{Body, Contact, Detector, LanePosition};
+use wildcity_sim::contact::{Body, Contact, Detector, LanePosition, Solids};
 use wildcity_sim::map::Map;
 use wildcity_sim::route::{NavigationRoute, RouteProgress, RouteView};
 use wildcity_sim::scenario::{ContactRule, EndInput, EndReason, Stuck};
@@ -27,6 +27,10 @@ pub struct EpisodeTraffic {
     stuck: Stuck,
     events: Vec<Event>,
     ended: Option<EndReason>,
+    /// The twin's solid Gaussians; only if a contact with them ends an episode.
+    solids: Option<Arc<Solids>>,
+    /// Whether the ego meets them now.
+    meets_twin: bool,
     assets: ActorAssets,
     /// The longest exposure of a camera, in microseconds.
     exposure_us: i64,
@@ -48,6 +52,13 @@ pub struct Event {
 pub enum EventKind {
     /// The ego began to touch an actor.
     Contact(Contact),
+    /// The ego began to meet the twin's solid Gaussians (`wildcity.static@1`).
+    StaticContact {
+        /// Their area, in m².
+        area_m2: f64,
+        /// The ego's speed, in m/s.
+        impact_mps: f64,
+    },
     /// A trigger of an actor's script fired.
     Trigger {
         /// Index of the actor.
@@ -100,11 +111,22 @@ impl EpisodeTraffic {
             stuck: Stuck::default(),
             events: contacts.into_iter().map(contact).collect(),
             ended: None,
+            solids: None,
+            meets_twin: false,
             assets,
             exposure_us,
             past,
             loaded,
         }
+    }
+
+    /// The same, and contact with solid Gaussians is looked for. Those that the ego meets at the start are no contact.
+    pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>, ego: &Ego) -> Self {
+        let ego_box = self.loaded.scenario.traffic.ego_box;
+        let area_m2 = |solids: &Arc<Solids>| solids.area_m2(&ego.world_from_rig(), &ego_box);
+        let is_met = |solids: &Arc<Solids>| solids.limit().is_exceeded_by(area_m2(solids));
+        let meets_twin = solids.as_ref().is_some_and(is_met);
+        Self { solids, meets_twin, ..self }
     }
 
     /// The traffic after a step of `dt_us` in which the ego went from one state to another.
@@ -121,10 +143,22 @@ impl EpisodeTraffic {
         let specs = &self.specs;
         let mut contacts: Vec<Contact> = Vec::new();
         let mut presence: Vec<Event> = Vec::new();
+        let mut with_twin: Vec<Event> = Vec::new();
         let before: Vec<Vec<Option<i64>>> = next.fired_us();
         next.world.step(dt_us, &motion, &mut |sub_step| {
             let lanes = map.map(|map| lane_position(map, &sub_step.ego[1], &ego_box));
             contacts.extend(next.detector.advance(sub_step, specs, lanes));
+            if let Some(solids) = &self.solids {
+                let [_, ego] = sub_step.ego;
+                let area_m2 = solids.area_m2(&ego.world_from_rig, &ego_box);
+                let is_met = solids.limit().is_exceeded_by(area_m2);
+                if is_met && !next.meets_twin {
+                    let impact_mps = ego.velocity_mps.length();
+                    let kind = EventKind::StaticContact { area_m2, impact_mps };
+                    with_twin.push(Event { time_us: sub_step.end_us, kind });
+                }
+                next.meets_twin = is_met;
+            }
             for (before, after) in sub_step.before.iter().zip(sub_step.after) {
                 let kind = match (before.present, after.present) {
                     (false, true) => EventKind::Appeared { actor: after.index },
@@ -145,7 +179,9 @@ impl EpisodeTraffic {
             }
         }
         next.events.append(&mut presence);
-        let has_contact = contacts.iter().any(|contact| self.ends_episode(contact));
+        let has_contact =
+            !with_twin.is_empty() || contacts.iter().any(|contact| self.ends_episode(contact));
+        next.events.append(&mut with_twin);
         next.events.extend(
             contacts.into_iter().map(|contact| Event {
                 time_us: contact.time_us,
@@ -236,6 +272,17 @@ impl EpisodeTraffic {
     /// The actors now, by their index.
     pub fn states(&self) -> &[ActorState] {
         self.world.states()
+    }
+
+    /// The actors at the end of each of the last `steps` steps, with its time in microseconds; those of the last
+    /// request, or fewer.
+    pub(crate) fn last_steps(&self, steps: usize) -> impl Iterator<Item = (i64, &[ActorState])> {
+        self.past.last(steps)
+    }
+
+    /// The actors at a time of the warm-up, in microseconds, which is below 0.
+    pub(crate) fn states_before(&self, time_us: i64) -> Vec<ActorState> {
+        self.world.states_before(time_us)
     }
 
     /// What a frame of a time since the last observation, or in the warm-up, draws of the actors.

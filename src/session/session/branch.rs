@@ -7,7 +7,7 @@ use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
 use super::open::{rig_extent, training_coverage};
-use super::recording::scenario_hash;
+use super::recording::traffic_lines;
 use super::requests::Moment;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
@@ -75,9 +75,10 @@ impl Session {
         }
 
         let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
-        let line = Line::Frame(record);
-        let scenario = scenario_hash(state.traffic.as_ref());
-        let file = self.create_file(version, origin.clone(), scenario, &episode, line).await?;
+        let traffic = state.traffic.as_ref();
+        let mut lines = traffic.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record));
+        lines.push(Line::Frame(record));
+        let file = self.create_file(version, origin.clone(), traffic, &episode, lines).await?;
         if let Some(bytes) = bytes
             && let Err(error) = self.reservation.exchange(version.resident.clone(), bytes)
         {

@@ -186,6 +186,11 @@ impl Session {
         self.settings.tells_actors
     }
 
+    /// Name of the current episode's record; `None` before its first frame.
+    pub fn episode_name(&self) -> Option<String> {
+        self.recorder.as_ref().map(|_| format!("{}-{}", self.name, self.episode_number))
+    }
+
     /// The current episode.
     pub fn episode(&self) -> &Episode {
         &self.state.episode

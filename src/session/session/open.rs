@@ -65,6 +65,7 @@ impl Session {
                     let mut scenario = read?;
                     let found = scenario.of_episode(seed, &version, engine.cache())?;
                     scenario.pin_assets(&found.loaded);
+                    scenario.find_solids(&found.loaded, engine.cache().catalog(), &version)?;
                     Ok::<_, SessionError>((asked, scenario, found))
                 })
                 .await??;
@@ -158,7 +159,9 @@ impl Session {
         let version = PinnedVersion::new(resident, profile, coverage);
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
+            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
+                .with_solids(solids, episode.ego())
         });
         let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
         Ok(Self::assembled(engine, name, Arc::new(settings), reservation, version, state))

@@ -1,5 +1,6 @@
 //! What a session writes to its episodes' files.
 
+use wildcity_episode::{self as episode, ActorsLine, EventLine, scenario_line};
 use wildcity_scene::Rig;
 
 use super::Session;
@@ -14,23 +15,30 @@ use crate::record::format::{
     RecordedSettings, RecordedVersion,
 };
 use crate::record::recorder::{NewFile, Recorder};
-use crate::scenario::EpisodeTraffic;
+use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{PinnedVersion, SessionSettings};
 
 impl Session {
     /// Appends a frame to the episode's file. The first frame of an episode creates the file.
-    pub(super) async fn record(&mut self, frame: FrameRecord) -> Result<(), SessionError> {
-        let frame = Line::Frame(frame);
+    /// `traffic` is that after a step; none for a frame that is no step.
+    pub(super) async fn record(
+        &mut self,
+        frame: FrameRecord,
+        traffic: Option<&EpisodeTraffic>,
+    ) -> Result<(), SessionError> {
+        let mut lines = traffic.map_or(Vec::new(), |traffic| traffic_lines(traffic, &frame));
+        lines.push(Line::Frame(frame));
         match self.recorder.clone() {
             Some(recorder) => {
                 let version = self.version_switched.then(|| self.version_line());
-                append(recorder, version.into_iter().chain([frame]).collect()).await?;
+                append(recorder, version.into_iter().chain(lines).collect()).await?;
             }
             None => {
-                let scenario = scenario_hash(self.state.traffic.as_ref());
                 let origin = self.origin.clone();
+                let before = &self.state;
+                let traffic = before.traffic.as_ref();
                 let file = self
-                    .create_file(&self.version, origin, scenario, &self.state.episode, frame)
+                    .create_file(&self.version, origin, traffic, &before.episode, lines)
                     .await?;
                 self.recorder = Some(file.recorder);
                 self.episode_number = file.number;
@@ -87,9 +95,9 @@ impl Session {
         &self,
         pinned: &PinnedVersion,
         origin: Option<RecordedOrigin>,
-        scenario: Option<String>,
+        traffic: Option<&EpisodeTraffic>,
         episode: &Episode,
-        first_frame: Line,
+        first_lines: Vec<Line>,
     ) -> Result<NewFile, SessionError> {
         let version = &pinned.resident.version;
         let settings = &self.settings;
@@ -121,12 +129,19 @@ impl Session {
             settings: recorded_settings(settings, pinned.coverage.is_some()),
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
-            scenario,
+            scenario: traffic.map(|traffic| traffic.loaded().hash.clone()),
         };
         let dir = self.engine.episodes().to_owned();
         let name = self.name.clone();
         let first_number = self.episode_number + 1;
-        let lines = [Line::Episode(Box::new(header)), first_frame];
+        let scenario = traffic.map(|traffic| {
+            let loaded = traffic.loaded();
+            let drives = &version.manifest.trajectories;
+            let line = scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives);
+            Line::Scenario(Box::new(line))
+        });
+        let head = [Line::Episode(Box::new(header))].into_iter().chain(scenario);
+        let lines: Vec<Line> = head.chain(first_lines).collect();
         let created =
             run_blocking(move || logged(Recorder::create(&dir, &name, first_number, &lines)));
         Ok(created.await??)
@@ -136,17 +151,50 @@ impl Session {
     /// way.
     pub(super) async fn end_recording(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
-        if let Err(error) =
-            append(recorder, vec![Line::End(self.state.episode.summary(outcome))]).await
-        {
+        let summary = self.state.episode.summary(outcome);
+        let mut lines = Vec::new();
+        if self.state.traffic.is_some() {
+            let recorder = recorder.clone();
+            // Without a result the record is still whole: `wildcity episode score` makes it again.
+            if let Ok(Some(result)) = run_blocking(move || recorder.result(&summary)).await {
+                lines.push(Line::Result(result));
+            }
+        }
+        lines.push(Line::End(summary));
+        if let Err(error) = append(recorder, lines).await {
             tracing::warn!(session = self.name, "the episode's summary was not recorded: {error}");
         }
     }
 }
 
-/// BLAKE3 of an episode's scenario, in hex.
-pub(super) fn scenario_hash(traffic: Option<&EpisodeTraffic>) -> Option<String> {
-    traffic.map(|traffic| traffic.loaded().hash.clone())
+/// The lines before the frame of a request: where the actors are at each frame of a warm-up and after each step, and
+/// what happened.
+pub(super) fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord) -> Vec<Line> {
+    let FrameRecord { step, steps, .. } = *frame;
+    let warm_up_us = frame.times_us.iter().copied().filter(|time_us| *time_us < 0);
+    let warm_up =
+        warm_up_us.map(|time_us| ActorsLine::new(step, time_us, &traffic.states_before(time_us)));
+    let before = (step + 1).saturating_sub(steps);
+    let of_steps = (before..).zip(traffic.last_steps(steps as usize));
+    let of_steps = of_steps.map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
+    let actors = warm_up.chain(of_steps).map(Line::Actors);
+    let event = |happened: &Event| {
+        let event = match &happened.kind {
+            EventKind::Contact(contact) => return EventLine::contact(step, contact),
+            EventKind::StaticContact { area_m2, impact_mps } => {
+                episode::Event::StaticContact { area_m2: *area_m2, impact_mps: *impact_mps }
+            }
+            EventKind::Trigger { actor, trigger } => {
+                episode::Event::Triggered { actor: *actor, trigger: *trigger as u32 }
+            }
+            EventKind::Appeared { actor } => episode::Event::Appeared { actor: *actor },
+            EventKind::Left { actor } => episode::Event::Left { actor: *actor },
+            EventKind::End(reason) => episode::Event::Ended { rule: reason.name().to_owned() },
+        };
+        EventLine { step, time_us: happened.time_us, event }
+    };
+    let events = traffic.events().iter().map(|happened| Line::Event(event(happened)));
+    actors.chain(events).collect()
 }
 
 /// The settings that the header does not have otherwise; `None` if all are the defaults.

@@ -13,7 +13,7 @@ use wildcity_sim::{Command, Ground};
 use wildcity_twin::residency::{PinnedScene, Viewpoint};
 
 use super::Session;
-use super::recording::scenario_hash;
+use super::recording::traffic_lines;
 use crate::blocking::run_blocking;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
@@ -28,7 +28,7 @@ use crate::options::{ResetOptions, Start, StepOptions};
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
@@ -93,7 +93,7 @@ impl Session {
             record.steps = steps as u64;
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
-        self.record(record).await?;
+        self.record(record, traffic.as_ref()).await?;
 
         next.add_trusts(rendered.trusts());
         let frame_history = rendered.frame_history;
@@ -135,7 +135,8 @@ impl Session {
         let captures = self.settings.layout.captures_at(&episode, poses);
         let moment = Moment { episode: &episode, traffic: self.state.traffic.as_ref() };
         let rendered = self.render(&self.version, moment, captures, None).await?;
-        self.record(self.frame_record(FrameRequest::Observe, &episode, &rendered)).await?;
+        let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
+        self.record(record, None).await?;
         Ok(rendered.observation)
     }
 
@@ -192,7 +193,9 @@ impl Session {
         let mut next = start.episode(seed, dynamics, settings.dt_us);
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
+            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
+                .with_solids(solids, next.ego())
         });
 
         let frame_history = FrameHistory::default();
@@ -200,10 +203,15 @@ impl Session {
         let moment = Moment { episode: &next, traffic: traffic.as_ref() };
         let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
-        let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
-        let scenario = scenario_hash(traffic.as_ref());
-        let line = Line::Frame(record);
-        let file = self.create_file(&self.version, None, scenario, &next, line).await?;
+        let mut record = self.frame_record(FrameRequest::Reset, &next, &rendered);
+        let before = traffic.as_ref();
+        if before.is_some() && rendered.captures.len() > 1 {
+            // Where the actors are in the warm-up depends on the time.
+            record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
+        }
+        let mut lines = before.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record));
+        lines.push(Line::Frame(record));
+        let file = self.create_file(&self.version, None, before, &next, lines).await?;
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());

@@ -8,6 +8,7 @@
 //! | `detector.rs` | the contacts of the ego, sub-step by sub-step |
 //! | `fault.rs` | which side of the ego was hit, and the fault |
 //! | `solid.rs` | contact with the twin's own Gaussians |
+//! | `solids.rs` | these Gaussians by place, and what the recorded drive meets of them |
 //!
 //! All of it is f64 and relative to the ego, so that a decision is the same at any distance from the world's
 //! origin. Boxes are closed sets: boxes that touch are in contact.
@@ -17,6 +18,7 @@ mod detector;
 mod fault;
 mod footprint;
 mod solid;
+mod solids;
 mod sweep;
 
 pub use body::Body;
@@ -29,4 +31,5 @@ pub use solid::{
     FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit,
     solid_area_m2,
 };
+pub use solids::Solids;
 pub use sweep::{Moving, overlap_s, time_to_contact_s};

@@ -45,12 +45,17 @@ impl SolidPoint {
 
     /// Whether it counts for a box of length, width and height, in metres.
     pub fn is_in(&self, size_m: DVec3) -> bool {
-        let DVec3 { x, y, z } = self.mean_m;
-        let within_length = x.abs() <= 0.5 * size_m.x - SIDE_MARGIN_M;
-        let within_width = y.abs() <= 0.5 * size_m.y - SIDE_MARGIN_M;
-        let within_height = (GROUND_MARGIN_M..=size_m.z).contains(&z);
-        self.opacity >= SOLID_OPACITY && within_length && within_width && within_height
+        self.opacity >= SOLID_OPACITY && is_met(self.mean_m, size_m)
     }
+}
+
+/// Whether a centre in the axes of the ego's box lies in the part of the box that is tested.
+pub(super) fn is_met(mean_m: DVec3, size_m: DVec3) -> bool {
+    let DVec3 { x, y, z } = mean_m;
+    let within_length = x.abs() <= 0.5 * size_m.x - SIDE_MARGIN_M;
+    let within_width = y.abs() <= 0.5 * size_m.y - SIDE_MARGIN_M;
+    let within_height = (GROUND_MARGIN_M..=size_m.z).contains(&z);
+    within_length && within_width && within_height
 }
 
 /// The area of the Gaussians in a box of length, width and height (metres), in m².

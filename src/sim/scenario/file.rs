@@ -619,7 +619,7 @@ pub enum ContactRule {
     AtFault,
     /// One with a pedestrian.
     Pedestrian,
-    /// One with the twin.
+    /// One with the twin's Gaussians beside the route. They are looked at in no other case.
     Static,
 }
 

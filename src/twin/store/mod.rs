@@ -57,6 +57,7 @@ mod diff;
 pub mod disk;
 mod error;
 mod fsck;
+mod full_detail;
 mod gc;
 mod layout;
 mod lease;

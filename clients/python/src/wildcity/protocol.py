@@ -398,6 +398,7 @@ class Summary:
     time_us: int
     distance_m: float
     least_trust: float | None = None
+    episode: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,150 @@
+//! The line of a scenario: what a record needs of it to be judged later.
+
+use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::route::Route;
+use wildcity_sim::map::{AreaKind, LaneKind, Map};
+use wildcity_sim::scenario::{ContactRule, EgoStart, Scenario};
+
+use crate::lines::{ActorLine, EgoLine, LaneLine, RoutePoint, ScenarioLine};
+
+/// Distance between two points of a route that was not driven, in metres.
+const SPACING_M: f64 = 2.0;
+/// Lanes farther than this from every point of the route are left out, in metres.
+const LANES_M: f64 = 60.0;
+
+/// The line of a resolved scenario. `hash` is its identity, `drives` are those of the twin.
+pub fn scenario_line(
+    resolved: &Scenario,
+    map: Option<&Map>,
+    hash: &str,
+    drives: &[Trajectory],
+) -> ScenarioLine {
+    let start = DriveStart::of(resolved, drives);
+    let limit_us = resolved.end.time_us.or(start.as_ref().map(DriveStart::left_us));
+    let route = match &start {
+        Some(start) => start.route(limit_us),
+        None => planned_route(resolved, limit_us),
+    };
+    let least_progress = resolved.file.verdict.progress;
+    let actors = resolved.traffic.actors.iter();
+    ScenarioLine {
+        name: resolved.file.name.clone(),
+        hash: hash.to_owned(),
+        // Texts, numbers and lists: this cannot fail.
+        scenario: serde_json::to_value(&resolved.file).unwrap_or_default(),
+        ego: EgoLine::new(&resolved.traffic.ego_box),
+        actors: actors.map(|actor| ActorLine::new(&actor.spec)).collect(),
+        lanes: map.map_or(Vec::new(), |map| lanes(map, &route)),
+        route,
+        limit_us,
+        least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
+        checks_static: resolved.end.contact == Some(ContactRule::Static),
+    }
+}
+
+/// The place on a recorded drive where an episode starts.
+#[derive(Clone, Debug)]
+pub struct DriveStart<'a> {
+    /// The drive.
+    pub drive: &'a Trajectory,
+    /// Its time at the start of the episode, in microseconds.
+    pub start_us: i64,
+}
+
+impl<'a> DriveStart<'a> {
+    /// The drive that an episode starts on; `None` if it starts at a pose, or the twin has no drive.
+    pub fn of(resolved: &Scenario, drives: &'a [Trajectory]) -> Option<Self> {
+        let (drive, station_m) = match &resolved.start {
+            Some(EgoStart::Pose(_)) => return None,
+            Some(EgoStart::Station { trajectory, station_m }) => {
+                (drives.iter().find(|drive| drive.name == *trajectory)?, *station_m)
+            }
+            None => (drives.first()?, 0.0),
+        };
+        let start_us = Route::new(drive).ok()?.at(station_m).time_us;
+        Some(Self { drive, start_us })
+    }
+
+    /// Time from the start to the end of the drive, in microseconds.
+    pub fn left_us(&self) -> i64 {
+        self.drive.keyframes.last().map_or(0, |last| last.time_us - self.start_us)
+    }
+
+    /// The pose of the drive at a time of the episode; constant beyond the ends of the drive.
+    pub fn pose_at(&self, time_us: i64) -> Pose {
+        pose_at(self.drive, self.start_us.saturating_add(time_us))
+    }
+
+    /// The drive from the start on, as long as the episode may take.
+    fn route(&self, limit_us: Option<i64>) -> Vec<RoutePoint> {
+        let end_us = limit_us.unwrap_or(i64::MAX).min(self.left_us()).max(0);
+        let at = |time_us: i64| RoutePoint(time_us, self.pose_at(time_us).position_m.to_array());
+        let times_us = self.drive.keyframes.iter().map(|key| key.time_us - self.start_us);
+        let between = times_us.filter(|time_us| (1..end_us).contains(time_us));
+        let mut route: Vec<RoutePoint> = std::iter::once(0).chain(between).map(at).collect();
+        if end_us > 0 {
+            route.push(at(end_us));
+        }
+        route
+    }
+}
+
+/// The pose of a drive at one of its times; constant beyond its ends.
+pub fn pose_at(drive: &Trajectory, time_us: i64) -> Pose {
+    let keys = &drive.keyframes;
+    let after = keys.partition_point(|key| key.time_us < time_us);
+    match (after.checked_sub(1).map(|before| &keys[before]), keys.get(after)) {
+        (None, Some(first)) => first.world_from_rig,
+        (Some(last), None) => last.world_from_rig,
+        (Some(_), Some(to)) if to.time_us == time_us => to.world_from_rig,
+        (Some(from), Some(to)) => {
+            let t = (time_us - from.time_us) as f64 / (to.time_us - from.time_us) as f64;
+            from.world_from_rig.interpolate(&to.world_from_rig, t)
+        }
+        (None, None) => Pose::IDENTITY,
+    }
+}
+
+/// A route that was not driven: due evenly over the time of the scenario.
+fn planned_route(resolved: &Scenario, limit_us: Option<i64>) -> Vec<RoutePoint> {
+    let (Some(route), Some(limit_us)) = (&resolved.route, limit_us) else { return Vec::new() };
+    let length_m = route.course.length_m();
+    let count = (length_m / SPACING_M).ceil().max(1.0) as i64;
+    let point = |k: i64| {
+        let share = k as f64 / count as f64;
+        let place_m = route.course.point_m(share * length_m);
+        RoutePoint((share * limit_us as f64) as i64, place_m.to_array())
+    };
+    (0..=count).map(point).collect()
+}
+
+/// The lanes and areas of a map near a route.
+fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
+    let near = |outline: &[[f64; 2]]| {
+        outline.iter().any(|[x, y]| {
+            route.iter().any(|point| (point.1[0] - x).hypot(point.1[1] - y) < LANES_M)
+        })
+    };
+    let flat = |point: &[f64; 3]| [point[0], point[1]];
+    let file = map.file();
+    let driving = file.lanes.iter().enumerate().filter(|(_, lane)| lane.kind == LaneKind::Driving);
+    let of_lanes = driving.map(|(index, lane)| {
+        let outline = lane.left.iter().chain(lane.right.iter().rev()).map(flat).collect();
+        let is_on = |point: &RoutePoint| {
+            let place_m = glam::DVec2::new(point.1[0], point.1[1]);
+            map.lanes_at(place_m).any(|at| at == index)
+        };
+        LaneLine { outline, route: route.iter().any(is_on), intersection: lane.intersection }
+    });
+    let of_areas = file.areas.iter().filter_map(|area| {
+        let intersection = match area.kind {
+            AreaKind::Drivable => false,
+            AreaKind::Intersection => true,
+            _ => return None,
+        };
+        let outline = area.outline.iter().map(flat).collect();
+        Some(LaneLine { outline, route: false, intersection })
+    });
+    of_lanes.chain(of_areas).filter(|lane| near(&lane.outline)).collect()
+}

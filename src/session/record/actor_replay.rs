@@ -1,0 +1,82 @@
+//! The actors of a recorded episode, as its frames show them.
+
+use std::iter::Peekable;
+use std::slice::Iter;
+
+use wildcity_episode::{ActorStateLine, ActorsLine};
+use wildcity_render::View;
+use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::traffic::ActorState;
+use wildcity_twin::residency::{Cache, ResidencyError};
+
+use super::recorded_episode::RecordedEpisode;
+use crate::scenario::assets::{ActorAssets, FrameDetail, exposure_start_us};
+use crate::scenario::past::ActorPast;
+
+/// Where the actors were up to a frame of a record.
+pub(super) struct ActorReplay<'a> {
+    assets: ActorAssets,
+    /// Number of actors.
+    count: usize,
+    /// The longest exposure of a camera, in microseconds.
+    exposure_us: i64,
+    /// What later frames show, each with the number of frames before it.
+    later: Peekable<Iter<'a, (usize, ActorsLine)>>,
+    past: ActorPast,
+}
+
+impl<'a> ActorReplay<'a> {
+    /// The actors before the first frame. Brings their assets into memory.
+    ///
+    /// # Errors
+    /// An asset cannot be read, or there is no room for it.
+    pub(super) fn new(episode: &'a RecordedEpisode, cache: &Cache) -> Result<Self, ResidencyError> {
+        let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
+        Ok(Self {
+            assets: ActorAssets::load(cache, actors.iter().map(|actor| actor.asset.as_deref()))?,
+            count: actors.len(),
+            exposure_us: View::longest_exposure_us(&episode.header.rig.cameras),
+            later: episode.actors.iter().peekable(),
+            past: ActorPast::default(),
+        })
+    }
+
+    /// Goes on to a frame, by its index.
+    pub(super) fn advance(&mut self, frame: usize) {
+        while let Some((_, line)) = self.later.next_if(|(before, _)| *before <= frame) {
+            self.past.drop_before(line.time_us - self.exposure_us - LONGEST_REQUEST_US);
+            self.past.push(line.time_us, &states(line, self.count));
+        }
+    }
+
+    /// What a frame of a time draws of the actors.
+    pub(super) fn placed(&self, taken_us: i64, frame: FrameDetail<'_>) -> Vec<PlacedChunk> {
+        if self.assets.is_empty() {
+            return Vec::new();
+        }
+        let at_start = self.past.poses_at(exposure_start_us(taken_us, self.exposure_us));
+        self.assets.placed(&self.past.poses_at(taken_us), &at_start, frame)
+    }
+}
+
+/// No request shows frames from longer ago than this, in microseconds.
+const LONGEST_REQUEST_US: i64 = crate::limits::PLAN_US + crate::limits::DT_MAX_US;
+
+/// All actors of a line, by their index; those that it leaves out are absent.
+fn states(line: &ActorsLine, count: usize) -> Vec<ActorState> {
+    let absent = |index: usize| ActorState {
+        index: index as u16,
+        world_from_actor: Pose::IDENTITY,
+        velocity_mps: glam::DVec3::ZERO,
+        yaw_rate_radps: 0.0,
+        present: false,
+    };
+    let mut states: Vec<ActorState> = (0..count).map(absent).collect();
+    for state in line.actors.iter().filter_map(ActorStateLine::state) {
+        if let Some(place) = states.get_mut(usize::from(state.index)) {
+            *place = state;
+        }
+    }
+    states
+}

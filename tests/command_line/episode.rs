@@ -1,0 +1,76 @@
+//! `wildcity episode`.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::json;
+
+use crate::support;
+
+fn wildcity(arguments: &[&str], dir: &Path) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+    command.arg("episode").args(arguments).current_dir(dir);
+    command.output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+#[test]
+fn a_suite_is_driven_and_its_records_are_read() {
+    let (twins, dir) = (support::twins(), tempfile::tempdir().unwrap());
+    let scenario = json!({
+        "format": "wildcity.scenario/1", "name": "short", "twin": { "name": "test" },
+        "ego": { "start": { "trajectory": "log", "station_m": 0.0 } }, "end": { "time_s": 0.8 },
+    });
+    std::fs::write(dir.path().join("short.json"), scenario.to_string()).unwrap();
+    let twins = twins.path().to_str().unwrap();
+    let run = |agent: &str, out: &str| {
+        let backend = ["--backend", "cpu", "--threads", "1", "--verify"];
+        let arguments = ["run", "short.json", "--twins", twins, "--agent", agent, "--out", out];
+        wildcity(&[&arguments[..], &backend].concat(), dir.path())
+    };
+
+    let log = run("log", "log");
+    let text = stdout(&log);
+    assert_eq!(log.status.code(), Some(0), "{text}{}", String::from_utf8_lossy(&log.stderr));
+    assert!(text.contains("passed      1 of 1") && text.contains("all episodes repeat"), "{text}");
+    for file in ["result.json", "junit.xml", "report.html", "episodes/short-0-1.jsonl"] {
+        assert!(dir.path().join("log").join(file).is_file(), "{file}");
+    }
+    let stand = run("stand", "stand");
+    assert_eq!(stand.status.code(), Some(1), "{}", stdout(&stand));
+    assert!(stdout(&stand).contains("progress"), "{}", stdout(&stand));
+    assert_eq!(run("log", "log").status.code(), Some(2), "the directory has another run");
+    assert_eq!(wildcity(&["run", "nowhere.json"], dir.path()).status.code(), Some(2));
+
+    let records = ["log", "stand"].map(|run| format!("{run}/episodes"));
+    let listed = stdout(&wildcity(&["list", "--episodes", &records[0]], dir.path()));
+    assert!(listed.contains("short-0-1") && listed.contains("short passed"), "{listed}");
+    let shown = stdout(&wildcity(&["show", "short-0-1", "--episodes", &records[0]], dir.path()));
+    assert!(shown.contains("scenario    short") && shown.contains("8 steps"), "{shown}");
+    let scored = stdout(&wildcity(&["score", "short-0-1", "--episodes", &records[1]], dir.path()));
+    assert!(
+        scored.contains("short-0-1: failed") && scored.contains("fault   progress"),
+        "{scored}"
+    );
+    let files = records.map(|records| format!("{records}/short-0-1.jsonl"));
+    let same = wildcity(&["diff", &files[0], &files[0]], dir.path());
+    assert_eq!(same.status.code(), Some(0));
+    let other = wildcity(&["diff", &files[0], &files[1]], dir.path());
+    assert_eq!(other.status.code(), Some(1));
+    let error = String::from_utf8(other.stderr).unwrap();
+    assert!(error.contains("step 1: ego"), "{error}");
+
+    let video = ["video", &files[0], "--out", "frames", "--twins", twins, "--backend", "cpu"];
+    let text = stdout(&wildcity(&video, dir.path()));
+    assert!(text.contains("9 pictures") && text.contains("ffmpeg -framerate 10 "), "{text}");
+    assert!(!text.contains("differs"), "{text}");
+    assert!(dir.path().join("frames/000008.png").is_file());
+
+    let exported = wildcity(&["export", &files[0], "--mcap", "log.mcap"], dir.path());
+    assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
+    let bytes = std::fs::read(dir.path().join("log.mcap")).unwrap();
+    assert!(bytes.starts_with(b"\x89MCAP0\r\n") && bytes.ends_with(b"\x89MCAP0\r\n"));
+}
