@@ -13,15 +13,17 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Shutter, ShutterDirection};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
 use wildcity_session::{
-    Encoding, Engine, Observation, Outputs, RigChoice, ScenarioError, ScenarioOptions,
-    ScenarioSource, Session, SessionError, SessionOptions, Start, StepOptions,
+    DType, Encoding, Engine, Observation, Outputs, RecordedEpisode, ReplayUntil, RigChoice,
+    ScenarioError, ScenarioOptions, ScenarioSource, Session, SessionError, SessionOptions, Start,
+    StepOptions, TensorKind,
 };
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::StoredActor;
+use wildcity_twin::store::{Catalog, NewVersion, StoredActor};
 
 use crate::driving::{Bench, bench, bench_with};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
@@ -31,28 +33,30 @@ const EGO_M: f64 = 100.0;
 /// Longest exposure of the rig with rolling shutters, in microseconds.
 const EXPOSURE_US: i64 = 60_000;
 
-/// A coloured box of 400 Gaussians, 4 m long, in the store of the demo street.
+/// A coloured box of 400 Gaussians, 4 m long.
+fn car_asset() -> ActorAsset {
+    let mut gaussians = Gaussians::with_capacity(0, 400);
+    for i in 0..400 {
+        let at = |k: usize| (i * k % 397) as f64 / 397.0;
+        gaussians.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
+        gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.ln_scales.push([0.15_f32.ln(); 3]);
+        gaussians.logit_opacities.push(4.0);
+        gaussians.sh.extend([1.5, -1.2 + (i % 5) as f32 * 0.3, -1.5]);
+    }
+    let description = AssetDescription {
+        name: "red-box".to_owned(),
+        class: ActorClass::Vehicle,
+        box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
+        provenance: Provenance::of("test".to_owned()),
+    };
+    ActorAsset::new(&gaussians, description).unwrap()
+}
+
+/// The car in the store of the demo street.
 fn car() -> &'static StoredActor {
     static CAR: OnceLock<StoredActor> = OnceLock::new();
-    CAR.get_or_init(|| {
-        let mut gaussians = Gaussians::with_capacity(0, 400);
-        for i in 0..400 {
-            let at = |k: usize| (i * k % 397) as f64 / 397.0;
-            gaussians.means_m.push([4.0 * at(31) - 2.0, 1.8 * at(57) - 0.9, 1.5 * at(71)]);
-            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            gaussians.ln_scales.push([0.15_f32.ln(); 3]);
-            gaussians.logit_opacities.push(4.0);
-            gaussians.sh.extend([1.5, -1.2 + (i % 5) as f32 * 0.3, -1.5]);
-        }
-        let description = AssetDescription {
-            name: "red-box".to_owned(),
-            class: ActorClass::Vehicle,
-            box_: ActorBox { length_m: 4.0, width_m: 1.8, height_m: 1.5 },
-            provenance: Provenance::of("test".to_owned()),
-        };
-        let asset = ActorAsset::new(&gaussians, description).unwrap();
-        demo().catalog().put_actor(&asset, RecordFormat::F32).unwrap()
-    })
+    CAR.get_or_init(|| demo().catalog().put_actor(&car_asset(), RecordFormat::F32).unwrap())
 }
 
 /// The cameras of the other tests.
@@ -324,6 +328,35 @@ async fn plans_and_warm_ups_draw_the_actors_of_each_frame() {
     assert_eq!(history(&last).len(), 6);
 }
 
+/// The ids of pixels are those of the scenario's actors, whatever is there.
+#[tokio::test(flavor = "multi_thread")]
+async fn instances_tell_whose_pixels_they_are() {
+    let bench = bench(unlimited());
+    let mut asked = options(&actors(&Value::from(&*car().hash)), false);
+    asked.outputs.maps.instances = true;
+    let mut session = open(&bench, "a", asked.clone()).await;
+    let seen = session.reset(0, None).await.unwrap();
+    let ids = |seen: &Observation| -> Vec<u16> {
+        let tensor = seen
+            .tensors
+            .iter()
+            .find(|tensor| tensor.kind == TensorKind::Instances(0))
+            .expect("the tensor of the front camera");
+        assert_eq!((tensor.dtype, &*tensor.shape), (DType::U16, &[64, 96][..]));
+        let header = seen.buffer.bytes().len() - seen.tensors.last().unwrap().bytes.end;
+        let bytes = &seen.buffer.bytes()[header..][tensor.bytes.clone()];
+        bytes.chunks_exact(2).map(|two| u16::from_le_bytes([two[0], two[1]])).collect()
+    };
+    let count = |seen: &[u16], id: u16| seen.iter().filter(|one| **one == id).count();
+    let first = ids(&seen);
+    assert!(count(&first, 2) > 20, "the car ahead: {}", count(&first, 2));
+    assert!(count(&first, 1) > 1000 && first.iter().all(|id| *id <= 3));
+    // The colours do not depend on it.
+    asked.outputs.maps.instances = false;
+    let mut plain = open(&bench, "b", asked).await;
+    assert_eq!(hashes(&plain.reset(0, None).await.unwrap()), hashes(&seen));
+}
+
 /// Assets take their room from the twins, once for all sessions, and give it back.
 #[tokio::test(flavor = "multi_thread")]
 async fn assets_count_against_the_memory_of_twins() {
@@ -351,6 +384,114 @@ async fn assets_count_against_the_memory_of_twins() {
     let opened = Session::open(small.engine.clone(), "a".to_owned(), options).await;
     let error = opened.err().map(|error| error.to_string()).unwrap_or_default();
     assert!(error.contains("red-box") && error.contains("--memory-gib"), "{error}");
+}
+
+/// A twin with a recorded drive of 60 m along x, and the car's asset beside it.
+fn straight() -> &'static (tempfile::TempDir, Catalog) {
+    static STRAIGHT: OnceLock<(tempfile::TempDir, Catalog)> = OnceLock::new();
+    STRAIGHT.get_or_init(|| {
+        let mut gaussians = Gaussians::with_capacity(0, 400);
+        for i in 0..400 {
+            let at = |k: usize| (i * k % 397) as f64 / 397.0;
+            gaussians.means_m.push([80.0 * at(31), 20.0 * at(57) - 10.0, 0.1 * at(71)]);
+            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            gaussians.ln_scales.push([1.0, 1.0, -3.0]);
+            gaussians.logit_opacities.push(3.0);
+            gaussians.sh.extend([at(13) as f32; 3]);
+        }
+        let keyframe = |k: i64| Keyframe {
+            time_us: 100_000 * k,
+            world_from_rig: Pose { position_m: DVec3::X * (0.6 * k as f64), ..Pose::IDENTITY },
+        };
+        let log =
+            Trajectory { name: "log".to_owned(), keyframes: (0..=100).map(keyframe).collect() };
+        let dir = tempfile::tempdir().unwrap();
+        let catalog = Catalog::open(dir.path()).unwrap();
+        let new = NewVersion {
+            profile: PROFILE,
+            trajectories: vec![log],
+            ..NewVersion::of("straight", &gaussians, Provenance::of("test".to_owned()))
+        };
+        catalog.commit(new, &mut |_, _| {}).unwrap();
+        catalog.put_actor(&car_asset(), RecordFormat::F32).unwrap();
+        (dir, catalog)
+    })
+}
+
+/// A record has where the actors were: in the warm-up, within plans, and when they come and go.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_recorded_episode_is_rendered_again_with_its_actors() {
+    let (_, catalog) = straight();
+    let asset = Value::from(&*car().hash);
+    let actors = json!([
+        {"name": "ahead", "asset": asset, "path": {"along": "log", "station_m": 20, "speed": 7},
+         "script": [{"when": {"time_s": 0.75}, "do": [{"remove": {}}]}]},
+        {"name": "crossing", "asset": asset, "present": false,
+         "collide": {"positions": [{"time_s": 0, "xyz": [24, -6, 0]}, {"time_s": 2, "xyz": [24, 6, 0]}]},
+         "script": [{"when": {"time_s": 0.25}, "do": [{"spawn": {}}]}]},
+        {"name": "passing", "asset": asset,
+         "collide": {"positions": [{"time_s": -1, "xyz": [8, 4, 0]}, {"time_s": 2, "xyz": [40, 4, 0]}]}}
+    ]);
+    let mut bundled = options(&actors, true);
+    bundled.outputs.frames = Some(3);
+    bundled.dynamics =
+        Dynamics { model: EgoModel::Kinematic, speed_m_s: 6.0, ..Dynamics::default() };
+    bundled.twin = "straight".to_owned();
+    bundled.start = Some(Start::Station { trajectory: "log".to_owned(), station_m: 6.0 });
+    bundled.warm_up_us = 400_000;
+    if let Some(ScenarioOptions {
+        source: ScenarioSource::Inline(file), warm_up, dynamics, ..
+    }) = &mut bundled.scenario
+    {
+        file["twin"]["name"] = "straight".into();
+        (*warm_up, *dynamics) = (false, false);
+    }
+    let bench = bench(Cache::new(catalog.clone()));
+    let still = || Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.01 });
+    let plan = |until_us| StepOptions { until_us: Some(until_us), ..StepOptions::default() };
+    // One episode from its reset, one from its first step.
+    for (name, resets) in [("reset", true), ("bare", false)] {
+        let mut session = open(&bench, name, bundled.clone()).await;
+        if resets {
+            session.reset(0, None).await.unwrap();
+        }
+        session.step(still(), false).await.unwrap();
+        session.follow(still(), plan(300_000)).await.unwrap();
+        session.observe(vec![session.start()]).await.unwrap();
+        session.take_snapshot("here".to_owned()).unwrap();
+        session.follow(still(), plan(500_000)).await.unwrap();
+        session.step(still(), false).await.unwrap();
+        session.restore("here").await.unwrap();
+        session.step(still(), false).await.unwrap();
+        session.close(wildcity_session::Outcome::Completed).await;
+        for number in [1, 2] {
+            let path = bench.episodes.path().join(format!("{name}-{number}.jsonl"));
+            let report = replay(&path, catalog);
+            assert_eq!((report.diverged, &report.wrong_value), (None, &None), "{name}-{number}");
+            assert_eq!(report.difference, None, "{name}-{number}");
+            assert!(report.images > 6, "{}", report.images);
+
+            // An actor that was recorded elsewhere is seen.
+            let text = std::fs::read_to_string(&path).unwrap();
+            let mut lines: Vec<Value> =
+                text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+            let has_actors = |line: &&mut Value| {
+                line["kind"] == "actors" && line["actors"].as_array().is_some_and(|a| !a.is_empty())
+            };
+            let last = lines.iter_mut().filter(has_actors).last().unwrap();
+            last["actors"][0][1][1] = json!(last["actors"][0][1][1].as_f64().unwrap() + 0.5);
+            let moved: Vec<String> = lines.iter().map(Value::to_string).collect();
+            std::fs::write(&path, moved.join("\n") + "\n").unwrap();
+            assert!(replay(&path, catalog).difference.is_some(), "{name}-{number}");
+        }
+    }
+}
+
+fn replay(path: &std::path::Path, catalog: &Catalog) -> wildcity_session::ReplayReport {
+    let recording = RecordedEpisode::read(path).unwrap();
+    let cache = Cache::new(catalog.clone());
+    let cpu = crate::images::cpu();
+    recording.replay(&cache, &cpu, ReplayUntil::End, &mut |_| Ok(())).unwrap()
 }
 
 /// The oracle of these tests places what it is given.
