@@ -14,7 +14,7 @@ use wildcity_scene::geometry::camera::{Shutter, ShutterDirection};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
-use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
+use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat, RenderProfile};
 use wildcity_session::{
     DType, Encoding, Engine, Observation, Outputs, RecordedEpisode, ReplayUntil, RigChoice,
     ScenarioError, ScenarioOptions, ScenarioSource, Session, SessionError, SessionOptions, Start,
@@ -23,9 +23,10 @@ use wildcity_session::{
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::{Catalog, NewVersion, StoredActor};
+use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoredActor};
 
 use crate::driving::{Bench, bench, bench_with};
+use crate::images::{psnr, render, view_along};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 
 /// Where the ego stands, along the street.
@@ -492,6 +493,66 @@ fn replay(path: &std::path::Path, catalog: &Catalog) -> wildcity_session::Replay
     let cache = Cache::new(catalog.clone());
     let cpu = crate::images::cpu();
     recording.replay(&cache, &cpu, ReplayUntil::End, &mut |_| Ok(())).unwrap()
+}
+
+/// A cut-out car at its old place looks as it did within the twin.
+#[test]
+fn what_was_cut_out_and_put_back_looks_as_before() {
+    let mut gaussians = Gaussians::with_capacity(1, 12_000);
+    for i in 0..12_000 {
+        let at = |k: usize| (i * k % 11_987) as f64 / 11_987.0;
+        gaussians.means_m.push([40.0 * at(3109), 12.0 * at(571) - 6.0, 2.5 * at(7127)]);
+        gaussians.quats_wxyz.push([1.0, at(13) as f32, at(17) as f32 - 0.5, at(19) as f32]);
+        gaussians.ln_scales.push([-2.0, -2.4, -3.0]);
+        gaussians.logit_opacities.push(1.0 + 2.0 * at(23) as f32);
+        gaussians.sh.extend((0..12).map(|k| at(29 + k) as f32 - 0.5));
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let new = NewVersion {
+        storage: StorageOptions { record: RecordFormat::F32, levels: false },
+        ..NewVersion::of("street", &gaussians, Provenance::of("test".to_owned()))
+    };
+    let base = catalog.commit(new, &mut |_, _| {}).unwrap();
+    let pose = Pose {
+        position_m: DVec3::new(14.0, 1.0, 0.0),
+        rotation: glam::DQuat::from_rotation_z(0.4),
+    };
+    let box_ = ActorBox { length_m: 5.0, width_m: 2.5, height_m: 2.0 };
+    let cut = catalog.cut(&base, &pose, &box_).unwrap();
+    assert!(cut.gaussians.len() > 100, "{}", cut.gaussians.len());
+    let description = AssetDescription {
+        name: "cut".to_owned(),
+        class: ActorClass::Vehicle,
+        box_,
+        provenance: Provenance::of("test".to_owned()),
+    };
+    let asset = ActorAsset::new(&cut.gaussians, description).unwrap();
+    let stored = catalog.put_actor(&asset, RecordFormat::F32).unwrap();
+    let asset = catalog.actor(&stored.hash).unwrap();
+
+    let cache = Cache::new(catalog);
+    let views = [(2.0, -3.0), (24.0, 4.0)].map(|(x, y)| {
+        let from_m = DVec3::new(x, y, 1.5);
+        let toward = (pose.position_m + DVec3::Z - from_m).normalize();
+        view_along([320, 200], 240.0, from_m, toward, -DVec3::Z)
+    });
+    let profile = RenderProfile { tau_px: 0.0, ..RenderProfile::default() };
+    let draw = |version: u64, placed: Vec<PlacedChunk>| {
+        let resident = cache.open("street", Some(version)).unwrap();
+        let mut scene = resident.scene(&eyes(&views), &profile).unwrap();
+        scene.place(placed);
+        render(&crate::images::cpu(), &scene, &profile, &views)
+    };
+    let put_back = PlacedChunk::at_rest(asset.levels[0].chunk.clone(), pose, 0);
+    let before = draw(1, Vec::new());
+    let after = draw(2, vec![put_back]);
+    let without = draw(2, Vec::new());
+    for ((before, after), without) in before.iter().zip(&after).zip(&without) {
+        let db = psnr(&before.rgba, &after.rgba);
+        assert!(db >= 70.0, "{db:.1} dB");
+        assert!(psnr(&before.rgba, &without.rgba) < 40.0, "the cut must be seen");
+    }
 }
 
 /// The oracle of these tests places what it is given.

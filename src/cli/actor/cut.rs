@@ -1,6 +1,7 @@
 //! `wildcity actor cut`.
 
 use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Context;
@@ -11,6 +12,10 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{ActorBox, ActorClass, RecordFormat};
+use wildcity_sim::limits::MAP_BYTES;
+use wildcity_sim::scenario::TracksFile;
+use wildcity_twin::ingest;
+use wildcity_twin::store::{Catalog, CutPlace, Version};
 
 use super::import::parse_class;
 use crate::cli::directories::{TwinVersion, Twins};
@@ -30,11 +35,17 @@ pub(super) struct Cut {
     /// The box: the point on the ground under its middle and its heading, in world axes (metres, and degrees to the
     /// left from x), and its length, width and height in metres.
     #[arg(long = "box", value_name = "X,Y,Z,DEGREES,L,W,H", allow_hyphen_values = true)]
-    region: Region,
+    #[arg(required_unless_present = "tracks", conflicts_with = "tracks", requires = "name")]
+    region: Option<Region>,
 
-    /// Name of the asset, made of a-z 0-9 . _ -.
-    #[arg(long, value_name = "NAME")]
-    name: String,
+    /// Cut what the recorded actors of a file wildcity.tracks/1 swept, in place of a box: what was driven through is
+    /// no wall. Makes no asset, since a moving car leaves a smear.
+    #[arg(long, value_name = "FILE")]
+    tracks: Option<PathBuf>,
+
+    /// Name of the asset, made of a-z 0-9 . _ -; with --box.
+    #[arg(long, value_name = "NAME", conflicts_with = "tracks")]
+    name: Option<String>,
 
     /// What it is: vehicle, pedestrian, bicycle or object.
     #[arg(long, default_value = "vehicle", value_parser = parse_class)]
@@ -47,7 +58,13 @@ pub(super) struct Cut {
 const EXAMPLES: &str = "\
 Examples:
   wildcity actor cut street --box 31.2,-4.8,0,0,4.6,1.9,1.6 --name parked
-  wildcity actor cut street@2 --box=-12,7.5,0.1,178,5.2,2.0,2.1 --name van";
+  wildcity actor cut street@2 --box=-12,7.5,0.1,178,5.2,2.0,2.1 --name van
+  wildcity actor cut street --tracks recorded.tracks.json";
+
+/// Most that a swept box moves between two places at which it is cut, in metres.
+const SWEEP_STEP_M: f64 = 0.25;
+/// Most places of all tracks together: 25 km of driving.
+const SWEEP_PLACES: usize = 100_000;
 
 /// A box on the ground.
 #[derive(Clone, Copy, Debug)]
@@ -78,20 +95,47 @@ impl FromStr for Region {
 
 impl Cut {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        anyhow::ensure!(
-            is_name(&self.name),
-            "{:?} cannot be the name of an actor: names have 1 to 64 of a-z 0-9 . _ - and do not start with .",
-            self.name
-        );
-        let Region { world_from_box, box_ } = self.region;
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.twin.name, self.twin.number)?;
-        let cut = catalog.cut(&base, &world_from_box, &box_)?;
+        match (&self.region, &self.tracks) {
+            (Some(region), _) => self.cut_box(&catalog, &base, region),
+            (None, Some(path)) => self.cut_tracks(&catalog, &base, path),
+            (None, None) => anyhow::bail!("give --box or --tracks"),
+        }
+    }
+
+    fn cut_tracks(&self, catalog: &Catalog, base: &Version, path: &Path) -> anyhow::Result<()> {
+        let context = || format!("{}", path.display());
+        let bytes = ingest::read_whole(path, MAP_BYTES as u64).with_context(context)?;
+        let file = TracksFile::parse(&bytes).with_context(context)?;
+        let places = swept(&file).with_context(context)?;
+        let option = format!("cut=tracks {}", blake3::hash(&bytes).to_hex());
+        let cut = catalog.cut_all(base, &places, option)?;
+        writeln!(
+            io::stdout().lock(),
+            "twin {} version {}: without {} Gaussians that {} tracks swept\nblake3 {}",
+            self.twin.name,
+            cut.version.number,
+            cut.gaussians.len(),
+            file.tracks.len(),
+            cut.version.hash,
+        )?;
+        Ok(())
+    }
+
+    fn cut_box(&self, catalog: &Catalog, base: &Version, region: &Region) -> anyhow::Result<()> {
+        let name = self.name.clone().unwrap_or_default();
+        anyhow::ensure!(
+            is_name(&name),
+            "{name:?} cannot be the name of an actor: names have 1 to 64 of a-z 0-9 . _ - and do not start with .",
+        );
+        let Region { world_from_box, box_ } = *region;
+        let cut = catalog.cut(base, &world_from_box, &box_)?;
 
         // Exact, since the twin's own record has rounded its values already.
         let source = format!("cut from twin {} version {}", self.twin.name, base.hash);
         let provenance = Provenance::of(source);
-        let description = AssetDescription { name: self.name, class: self.class, box_, provenance };
+        let description = AssetDescription { name, class: self.class, box_, provenance };
         let asset = ActorAsset::new(&cut.gaussians, description).context("cannot make an asset")?;
         let stored = catalog.put_actor(&asset, RecordFormat::F32)?;
         writeln!(
@@ -108,4 +152,30 @@ impl Cut {
         )?;
         Ok(())
     }
+}
+
+/// The places of all boxes on their tracks, so close that nothing is left between two of them.
+fn swept(file: &TracksFile) -> anyhow::Result<Vec<CutPlace>> {
+    let mut places = Vec::new();
+    for section in &file.tracks {
+        let [length_m, width_m, height_m] = section.size;
+        let box_ = ActorBox { length_m, width_m, height_m };
+        let track = section.shifted(0)?;
+        let place = |world_from_box: Pose| CutPlace { world_from_box, box_ };
+        for pair in track.keyframes().windows(2) {
+            let [from, to] = [pair[0].world_from_actor, pair[1].world_from_actor];
+            // The corners also move as the box turns.
+            let turned_m = 0.5 * length_m.hypot(width_m) * from.rotation.angle_between(to.rotation);
+            let moved_m = from.position_m.distance(to.position_m) + turned_m;
+            let count = (moved_m / SWEEP_STEP_M).ceil().max(1.0) as usize;
+            anyhow::ensure!(
+                places.len() + count <= SWEEP_PLACES,
+                "the tracks sweep more than {SWEEP_PLACES} places {SWEEP_STEP_M} m apart: give fewer tracks"
+            );
+            places
+                .extend((0..count).map(|k| place(from.interpolate(&to, k as f64 / count as f64))));
+        }
+        places.extend(track.keyframes().last().map(|last| place(last.world_from_actor)));
+    }
+    Ok(places)
 }

@@ -4,7 +4,7 @@ use anyhow::Context;
 use glam::DVec3;
 
 use wildcity_client::TimedPose;
-use wildcity_client::protocol::observation::Metadata;
+use wildcity_client::protocol::observation::ObservationMetadata;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::traffic::{Course, Idm, rolled};
@@ -33,7 +33,7 @@ impl CarefulDriver {
     }
 
     /// Where to drive in the next two seconds, in the rig's frame.
-    pub(super) fn plan(&self, seen: &Metadata) -> anyhow::Result<Vec<TimedPose>> {
+    pub(super) fn plan(&self, seen: &ObservationMetadata) -> anyhow::Result<Vec<TimedPose>> {
         let world_from_rig = Pose::checked(seen.ego.pose.xyz, seen.ego.pose.q)?;
         let mut station_m = self.course.nearest(world_from_rig.position_m).station_m;
         let velocity_mps = DVec3::from_array(seen.ego.velocity);

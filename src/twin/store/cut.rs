@@ -25,6 +25,15 @@ pub struct Cut {
     pub gaussians: Gaussians,
 }
 
+/// A box to cut out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CutPlace {
+    /// Where it is: its origin is on the ground under the middle.
+    pub world_from_box: Pose,
+    /// Its size.
+    pub box_: ActorBox,
+}
+
 impl Catalog {
     /// Makes a version without the Gaussians whose centres lie in a box, from [`CUT_ABOVE_M`] above its bottom. Cells
     /// that the box does not touch stay as they are; in the others the Gaussians that stay are encoded again.
@@ -37,18 +46,46 @@ impl Catalog {
         world_from_box: &Pose,
         box_: &ActorBox,
     ) -> Result<Cut, StoreError> {
+        let DVec3 { x, y, z } = world_from_box.position_m;
+        let option = format!(
+            "cut={:.3},{:.3},{:.3} {:.3}x{:.3}x{:.3}",
+            x, y, z, box_.length_m, box_.width_m, box_.height_m
+        );
+        let place = CutPlace { world_from_box: *world_from_box, box_: *box_ };
+        let mut cut = self.cut_all(base, &[place], option)?;
+        cut.gaussians.transform(&world_from_box.inverse());
+        Ok(cut)
+    }
+
+    /// As [`Catalog::cut`], with many boxes: what lies in any of them goes, and is returned in world axes. `option` is
+    /// noted in the provenance.
+    ///
+    /// # Errors
+    /// As [`Catalog::cut`].
+    pub fn cut_all(
+        &self,
+        base: &Version,
+        places: &[CutPlace],
+        option: String,
+    ) -> Result<Cut, StoreError> {
         let manifest = &base.manifest;
-        let reach_m = DVec3::new(box_.length_m, box_.width_m, box_.height_m).length();
-        let near = |bounds: &Bounds| bounds.distance_m(world_from_box.position_m) <= reach_m;
-        let box_from_world = world_from_box.inverse();
+        let places: Vec<(CutPlace, Pose)> =
+            places.iter().map(|place| (*place, place.world_from_box.inverse())).collect();
         let mut staying = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
         let mut cut = staying.clone();
         let mut cells = BTreeSet::new();
-        for chunk in manifest.chunks.iter().filter(|chunk| near(&chunk.bounds)) {
+        for chunk in &manifest.chunks {
+            let near: Vec<&(CutPlace, Pose)> =
+                places.iter().filter(|(place, _)| place.is_near(&chunk.bounds)).collect();
+            if near.is_empty() {
+                continue;
+            }
             let all = self.full_detail(base, chunk)?;
             let (inside, outside): (Vec<usize>, Vec<usize>) = (0..all.len()).partition(|&index| {
                 let mean_m = DVec3::from_array(all.means_m[index]);
-                is_inside(box_, box_from_world.transform_point(mean_m))
+                near.iter().any(|(place, box_from_world)| {
+                    place.has(box_from_world.transform_point(mean_m))
+                })
             });
             if inside.is_empty() {
                 continue;
@@ -68,15 +105,10 @@ impl Catalog {
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
         let mut provenance = manifest.provenance.clone();
-        let DVec3 { x, y, z } = world_from_box.position_m;
-        provenance.options.push(format!(
-            "cut={:.3},{:.3},{:.3} {:.3}x{:.3}x{:.3}",
-            x, y, z, box_.length_m, box_.width_m, box_.height_m
-        ));
+        provenance.options.push(option);
         let change =
             VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance };
         let version = commit.change(base.number, change)?;
-        cut.transform(&box_from_world);
         Ok(Cut { version, gaussians: cut })
     }
 
@@ -91,9 +123,19 @@ impl Catalog {
     }
 }
 
-fn is_inside(box_: &ActorBox, at_m: DVec3) -> bool {
-    let ActorBox { length_m, width_m, height_m } = *box_;
-    at_m.x.abs() <= 0.5 * length_m
-        && at_m.y.abs() <= 0.5 * width_m
-        && (CUT_ABOVE_M..=height_m).contains(&at_m.z)
+impl CutPlace {
+    /// Whether a part of some bounds may be in the box.
+    fn is_near(&self, bounds: &Bounds) -> bool {
+        let ActorBox { length_m, width_m, height_m } = self.box_;
+        let reach_m = DVec3::new(length_m, width_m, height_m).length();
+        bounds.distance_m(self.world_from_box.position_m) <= reach_m
+    }
+
+    /// Whether a point in the box's axes is cut, in metres.
+    fn has(&self, at_m: DVec3) -> bool {
+        let ActorBox { length_m, width_m, height_m } = self.box_;
+        at_m.x.abs() <= 0.5 * length_m
+            && at_m.y.abs() <= 0.5 * width_m
+            && (CUT_ABOVE_M..=height_m).contains(&at_m.z)
+    }
 }

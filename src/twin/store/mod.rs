@@ -73,7 +73,7 @@ mod sky;
 pub use actors::{StoredActor, StoredLevel};
 pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
-pub use cut::{CUT_ABOVE_M, Cut};
+pub use cut::{CUT_ABOVE_M, Cut, CutPlace};
 pub use diff::{CellDiff, CellSize, Diff};
 pub use error::StoreError;
 pub use fsck::{DamagedObject, FsckReport, RecordSetAside, VerifyReport};
