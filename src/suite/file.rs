@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use wildcity_sim::scenario::{Document, FileError, ScenarioFile};
+use wildcity_sim::scenario::{Document, FileError, ScenarioFile, check_format};
 
 use crate::error::SuiteError;
 use crate::limits;
@@ -69,7 +69,7 @@ impl SuiteFile {
         let bytes = read(path)?;
         let wrong = |cause| SuiteError::File { path: path.to_owned(), cause };
         let value: serde_json::Value = serde_json::from_slice(&bytes)
-            .map_err(|error| wrong(mistake("suite", format!("not JSON: {error}"))))?;
+            .map_err(|error| wrong(FileError::new("suite", format!("not JSON: {error}"))))?;
         if value.get("format").and_then(serde_json::Value::as_str) == Some(ScenarioFile::FORMAT) {
             let document = Document::from_json(value).map_err(wrong)?;
             let suite = Self::of_one(path);
@@ -77,7 +77,7 @@ impl SuiteFile {
         }
         let suite: Self = serde_path_to_error::deserialize(value).map_err(|error| {
             let at = error.path().to_string();
-            wrong(mistake(&at, error.into_inner().to_string()))
+            wrong(FileError::new(at, error.into_inner().to_string()))
         })?;
         suite.check().map_err(wrong)?;
         let dir = path.parent().unwrap_or(Path::new("."));
@@ -112,21 +112,19 @@ impl SuiteFile {
     }
 
     fn check(&self) -> Result<(), FileError> {
-        if self.format != Self::FORMAT {
-            return Err(mistake("format", format!("{:?}; write {:?}", self.format, Self::FORMAT)));
-        }
+        check_format(Some(&self.format), Self::FORMAT)?;
         if self.scenarios.is_empty() {
-            return Err(mistake("scenarios", "is empty; name at least one scenario".to_owned()));
+            return Err(FileError::new("scenarios", "is empty; name at least one scenario"));
         }
         if let Some([first, last]) = self.seeds
             && first > last
         {
             let message = format!("[{first}, {last}]; write the first and the last seed");
-            return Err(mistake("seeds", message));
+            return Err(FileError::new("seeds", message));
         }
         match self.at_least {
             Some(rate) if !(0.0..=1.0).contains(&rate) => {
-                Err(mistake("at_least", format!("{rate:?}; a rate is from 0 to 1")))
+                Err(FileError::new("at_least", format!("{rate:?}; a rate is from 0 to 1")))
             }
             _ => Ok(()),
         }
@@ -141,13 +139,9 @@ fn check_alone(document: &Document) -> Result<(), FileError> {
         None => Ok(()),
         Some((field, _)) => {
             let message = "is looked for beside the suite: put the scenario there too";
-            Err(mistake(field, message.to_owned()))
+            Err(FileError::new(field, message))
         }
     }
-}
-
-fn mistake(path: &str, message: String) -> FileError {
-    FileError { path: path.to_owned(), message }
 }
 
 /// Reads a file of at most [`limits::FILE_BYTES`].

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::limits;
 use crate::scenario::FileError;
-use crate::scenario::error::{in_range, json, typed};
+use crate::scenario::error::{check_format, in_range, json, typed};
 
 /// Lanes and areas.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -141,10 +141,7 @@ impl MapFile {
     /// # Errors
     /// Names the place of the first mistake.
     pub fn check(&self) -> Result<(), FileError> {
-        if self.format != Self::FORMAT {
-            let message = format!("{:?}; write {:?}", self.format, Self::FORMAT);
-            return Err(FileError::new("format", message));
-        }
+        check_format(Some(&self.format), Self::FORMAT)?;
         let mut indices: BTreeMap<&str, usize> = BTreeMap::new();
         for (index, lane) in self.lanes.iter().enumerate() {
             let within = |error: FileError| error.within(&format!("lanes[{index}]"));

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
 
-use super::error::{FileError, json, typed};
+use super::error::{FileError, check_format, json, typed};
 use super::file::{ScenarioFile, SweepSection};
 use crate::limits;
 
@@ -38,11 +38,7 @@ impl Document {
     /// # Errors
     /// As [`Self::parse`].
     pub fn from_json(mut value: Value) -> Result<Self, FileError> {
-        let format = value.get("format").and_then(Value::as_str);
-        if format != Some(ScenarioFile::FORMAT) {
-            let message = format!("{format:?}; write {:?}", ScenarioFile::FORMAT);
-            return Err(FileError::new("format", message));
-        }
+        check_format(value.get("format").and_then(Value::as_str), ScenarioFile::FORMAT)?;
         remove_notes(&mut value);
         let sweep = match value.as_object_mut().and_then(|fields| fields.remove("sweep")) {
             None => SweepSection::default(),

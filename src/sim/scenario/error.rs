@@ -11,7 +11,8 @@ pub struct FileError {
 }
 
 impl FileError {
-    pub(crate) fn new(path: impl Into<String>, message: impl Into<String>) -> Self {
+    /// A mistake at `path`.
+    pub fn new(path: impl Into<String>, message: impl Into<String>) -> Self {
         Self { path: path.into(), message: message.into() }
     }
 
@@ -50,6 +51,18 @@ pub(crate) fn json(
     serde_json::from_slice(bytes).map_err(|error| {
         FileError::new(root, format!("not JSON: {error}; correct the syntax there"))
     })
+}
+
+/// Checks the field `format` of a file.
+///
+/// # Errors
+/// It is another format, or absent.
+pub fn check_format(found: Option<&str>, wanted: &str) -> Result<(), FileError> {
+    if found == Some(wanted) {
+        return Ok(());
+    }
+    let found = found.map_or("it is absent".to_owned(), |found| format!("{found:?}"));
+    Err(FileError::new("format", format!("{found}; write {wanted:?}")))
 }
 
 /// Checks that a number is within bounds; NaN is not.

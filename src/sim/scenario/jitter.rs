@@ -6,8 +6,8 @@ use glam::{DQuat, DVec3};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
 
+use super::actor_file::{JitterDraw, JitterSection};
 use super::error::{FileError, in_range};
-use super::file::{JitterDraw, JitterSection};
 
 /// The displacement of an actor; nothing without jitter. What a resolved file says was drawn is drawn again.
 pub(super) fn drawn(

@@ -2,14 +2,18 @@
 //!
 //! | module | what it does |
 //! |---|---|
-//! | `file`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
+//! | `file`, `actor_file`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
 //! | `document` | reads a scenario, and puts in the values of its sweep |
-//! | `resolve`, `around`, `actors`, `jitter` | checks a scenario against its twin, and sets up its traffic |
+//! | `resolve`, `around` | checks a scenario against its twin |
+//! | `actors`, `courses`, `collide`, `script`, `jitter`, `pose` | checks its actors, and sets them up |
 //! | `end` | the rules that end an episode |
 //! | `error` | mistakes, with their place in the file |
 
+mod actor_file;
 mod actors;
 mod around;
+mod collide;
+mod courses;
 mod document;
 mod end;
 pub(crate) mod error;
@@ -17,12 +21,15 @@ mod file;
 mod jitter;
 mod pose;
 mod resolve;
+mod script;
 mod tracks;
 
+pub use actor_file::*;
 pub use around::{AssetInfo, EgoStart, Surroundings};
 pub use document::{Case, Document};
 pub use end::{EndInput, EndReason, EndRules, Stuck};
-pub use error::FileError;
+pub use error::{FileError, check_format};
 pub use file::*;
+pub use pose::PoseSection;
 pub use resolve::Scenario;
 pub use tracks::{KeyframeSection, TrackSection, TracksFile};

@@ -1,11 +1,26 @@
 //! Poses of scenario files.
 
 use glam::DQuat;
+use serde::{Deserialize, Serialize};
 
 use wildcity_scene::geometry::Pose;
 
 use super::error::FileError;
-use super::file::PoseSection;
+
+/// A pose: a position, and a heading or a whole rotation.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct PoseSection {
+    /// Position in the world, in metres.
+    pub xyz: [f64; 3],
+    /// Heading from the world's x axis, in radians, positive to the left. If absent, 0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub yaw_rad: Option<f64>,
+    /// Rotation as a unit quaternion (w, x, y, z), instead of a heading.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub q: Option<[f64; 4]>,
+}
 
 /// A pose of a file, checked.
 pub(super) fn pose_of(path: &str, section: &PoseSection) -> Result<Pose, FileError> {

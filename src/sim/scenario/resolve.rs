@@ -6,10 +6,11 @@ use wildcity_scene::random::Random;
 use wildcity_scene::route::Route;
 use wildcity_scene::{ActorBox, Trajectory};
 
-use super::actors::{Courses, actors_of};
+use super::actors::actors_of;
 use super::around::{EgoStart, Surroundings, drive_named};
+use super::courses::Courses;
 use super::end::EndRules;
-use super::error::{FileError, hashed, in_range, named};
+use super::error::{FileError, check_format, hashed, in_range, named};
 use super::file::{
     DynamicsSection, EgoSection, EndSection, FilePin, ModelSection, RouteSection, ScenarioFile,
 };
@@ -101,10 +102,7 @@ impl Scenario {
 
 /// Checks names and hashes that do not need the twin.
 fn check_names(file: &ScenarioFile) -> Result<(), FileError> {
-    if file.format != ScenarioFile::FORMAT {
-        let message = format!("{:?}; write {:?}", file.format, ScenarioFile::FORMAT);
-        return Err(FileError::new("format", message));
-    }
+    check_format(Some(&file.format), ScenarioFile::FORMAT)?;
     named("name", &file.name)?;
     named("twin.name", &file.twin.name)?;
     if let Some(hash) = &file.twin.version_hash {

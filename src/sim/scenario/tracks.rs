@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_scene::{ActorBox, ActorClass};
 
-use super::error::{FileError, hashed, json, named, typed};
-use super::file::PoseSection;
+use super::error::{FileError, check_format, hashed, json, named, typed};
+use super::pose::PoseSection;
 use super::pose::pose_of;
 use crate::limits;
 use crate::traffic::{Track, TrackKeyframe};
@@ -31,7 +31,7 @@ pub struct TrackSection {
     /// Id within the file, `[a-z0-9._-]+`.
     pub id: String,
     /// Its kind.
-    #[cfg_attr(feature = "schema", schemars(with = "super::file::ClassSchema"))]
+    #[cfg_attr(feature = "schema", schemars(with = "super::actor_file::ClassSchema"))]
     pub class: ActorClass,
     /// Length, width and height, in metres.
     pub size: [f64; 3],
@@ -73,10 +73,7 @@ impl TracksFile {
     /// # Errors
     /// Names the place of the first mistake.
     pub fn check(&self) -> Result<(), FileError> {
-        if self.format != Self::FORMAT {
-            let message = format!("{:?}; write {:?}", self.format, Self::FORMAT);
-            return Err(FileError::new("format", message));
-        }
+        check_format(Some(&self.format), Self::FORMAT)?;
         let keyframes: usize = self.tracks.iter().map(|track| track.keyframes.len()).sum();
         if keyframes > limits::TRACK_KEYFRAMES {
             let message =

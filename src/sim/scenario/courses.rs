@@ -1,0 +1,69 @@
+//! The lines that actors and routes of a scenario follow.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use super::around::{Surroundings, drive_named, points_of};
+use super::error::FileError;
+use crate::Ground;
+use crate::traffic::Course;
+
+/// The lines of a scenario; each recorded drive is one course, which its actors share.
+pub(super) struct Courses<'a> {
+    around: &'a Surroundings<'a>,
+    drives: BTreeMap<(String, bool), Arc<Course>>,
+}
+
+impl<'a> Courses<'a> {
+    pub(super) fn new(around: &'a Surroundings<'a>) -> Self {
+        Self { around, drives: BTreeMap::new() }
+    }
+
+    /// The line of a recorded drive, points or lanes, of which exactly one is given. `field` names the drive's field.
+    pub(super) fn line(
+        &mut self,
+        field: &str,
+        along: Option<&str>,
+        points: Option<&[[f64; 3]]>,
+        lanes: Option<&[String]>,
+        reverse: bool,
+    ) -> Result<Arc<Course>, FileError> {
+        let none = || "leads nowhere: it needs two places at least 1 cm apart";
+        let course = match (along, points, lanes) {
+            (Some(name), None, None) => {
+                let key = (name.to_owned(), reverse);
+                if let Some(course) = self.drives.get(&key) {
+                    return Ok(course.clone());
+                }
+                let drive = drive_named(field, name, self.around.drives)?;
+                let course = Course::from_drive(drive);
+                let course = course.ok_or_else(|| FileError::new(field, none()))?;
+                let course = Arc::new(if reverse { course.reversed() } else { course });
+                self.drives.insert(key, course.clone());
+                return Ok(course);
+            }
+            (None, Some(points), None) => {
+                let points_m = points_of("points", points)?;
+                let ground = Ground::from_drives(self.around.drives);
+                Course::from_points(&points_m, &ground)
+                    .ok_or_else(|| FileError::new("points", none()))?
+            }
+            (None, None, Some(ids)) => {
+                let map = self.around.map.ok_or_else(|| {
+                    FileError::new("lanes", "need a map: write \"map\": {\"file\": ..}")
+                })?;
+                let points_m = map.center_of(ids).map_err(|(index, message)| {
+                    FileError::new(format!("lanes[{index}]"), message)
+                })?;
+                // The lanes have heights; the ground of recorded drives may be of another level.
+                Course::from_points(&points_m, &Ground::from_drives(&[]))
+                    .ok_or_else(|| FileError::new("lanes", none()))?
+            }
+            _ => {
+                let message = format!("write exactly one of {field}, points and lanes");
+                return Err(FileError::new(field, message));
+            }
+        };
+        Ok(Arc::new(if reverse { course.reversed() } else { course }))
+    }
+}
