@@ -11,18 +11,25 @@ pub(super) struct UnpackBudget {
     stop: StopFlag,
     packed: u64,
     unpacked: u128,
+    /// Bytes beyond those of the compressed content, for what the caller asked for.
+    asked_for: u64,
 }
 
 impl UnpackBudget {
     /// Nothing was read.
     pub(super) fn new(limits: &ReadLimits<'_>) -> Self {
         let ReadLimits { memory_bytes, stop, .. } = limits.clone();
-        Self { memory_bytes, stop, packed: 0, unpacked: 0 }
+        Self { memory_bytes, stop, packed: 0, unpacked: 0, asked_for: 0 }
     }
 
     /// Counts compressed bytes that were read.
     pub(super) fn read(&mut self, packed: u64) {
         self.packed = self.packed.saturating_add(packed);
+    }
+
+    /// Allows bytes that the caller of the reader asked for, and not the file.
+    pub(super) fn allow(&mut self, bytes: u64) {
+        self.asked_for = self.asked_for.saturating_add(bytes);
     }
 
     /// Counts bytes that are about to be unpacked, before memory is allocated for them.
@@ -37,7 +44,7 @@ impl UnpackBudget {
     ) -> Result<(), IngestError> {
         self.check_stop()?;
         self.unpacked = self.unpacked.saturating_add(bytes);
-        if self.unpacked > u128::from(limit_bytes(self.packed)) {
+        if self.unpacked > u128::from(self.limit_bytes()) {
             return Err(IngestError::DecompressionBomb {
                 format,
                 place: place.into(),
@@ -62,8 +69,12 @@ impl UnpackBudget {
 
     /// The most bytes that may still be unpacked.
     pub(super) fn left_bytes(&self) -> u64 {
-        let most = limit_bytes(self.packed).min(self.memory_bytes);
+        let most = self.limit_bytes().min(self.memory_bytes);
         most.saturating_sub(u64::try_from(self.unpacked).unwrap_or(u64::MAX))
+    }
+
+    fn limit_bytes(&self) -> u64 {
+        limit_bytes(self.packed).saturating_add(self.asked_for)
     }
 }
 

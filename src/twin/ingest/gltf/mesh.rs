@@ -23,6 +23,11 @@ use crate::ingest::scene_files::SceneFiles;
 use crate::limits;
 use wildcity_scene::Gaussians;
 
+/// Bytes of a Gaussian of a mesh in memory.
+const GAUSSIAN_BYTES: u64 = 56;
+/// Small triangles, and rounding to whole cells, make up to so many Gaussians of each one that was asked for.
+const MOST_PER_ASKED: u64 = 4;
+
 /// Covers all triangles of the scene.
 pub(super) fn read(
     json: &[u8],
@@ -78,7 +83,10 @@ pub(super) fn read(
     });
     let triangles: Vec<Triangle> = halved.collect();
     let count: u128 = triangles.iter().map(|t| u128::from(t.cuts(share_m2)).pow(2)).sum();
-    uris.parts().budget().unpack(FORMAT, "meshes", 56 * count)?;
+    // The caller may ask for more Gaussians than a file of this size would be allowed.
+    let more = uris.parts().mesh_gaussians().saturating_sub(limits::MESH_GAUSSIANS);
+    uris.parts().budget().allow(GAUSSIAN_BYTES * MOST_PER_ASKED * u64::from(more));
+    uris.parts().budget().unpack(FORMAT, "meshes", u128::from(GAUSSIAN_BYTES) * count)?;
     let mut all = Gaussians::with_capacity(0, count as usize);
     for triangle in &triangles {
         triangle.cover(triangle.cuts(share_m2), &mut all);
