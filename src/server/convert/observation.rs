@@ -7,8 +7,9 @@ use serde::Serialize;
 use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
 use wildcity_protocol::observation::{
-    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+    Ego, Geo, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
 };
+use wildcity_scene::geo::{GeoPoint, GeoPose};
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_session::{DType, HEADER_PREFIX_BYTES, PastImageInfo, Session, TensorKind};
 
@@ -40,7 +41,7 @@ pub(crate) fn observation(
         let data_offsets = [tensor.bytes.start, tensor.bytes.end];
         header.tensors.insert(name, TensorInfo { dtype, shape: &tensor.shape, data_offsets });
     }
-    let observation = text(&metadata(seq, session, &frame, &image_names))?;
+    let observation = text(&metadata(seq, session, &frame, &image_names)?)?;
     header.metadata.insert("observation", observation);
     let header = text(&header)?;
 
@@ -96,7 +97,7 @@ fn metadata(
     session: &Session,
     frame: &wildcity_session::Observation,
     image_names: &[String],
-) -> ObservationMetadata {
+) -> Result<ObservationMetadata, Fault> {
     let episode = session.episode();
     let version = &session.resident().version;
     let time_us = episode.time_us();
@@ -144,7 +145,10 @@ fn metadata(
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
-    ObservationMetadata {
+    let anchor = version.manifest.geo.as_ref();
+    let located = anchor.map(|anchor| anchor.locate(&episode.world_from_rig())).transpose();
+    let located = located.map_err(|error| Fault::Internal(error.to_string()))?;
+    Ok(ObservationMetadata {
         seq,
         step: episode.step(),
         time_us,
@@ -165,6 +169,7 @@ fn metadata(
             steering: episode.ego().steering_rad(),
             history_count: frame.history_count as u64,
         },
+        geo: located.map(geo),
         images: frame.images.iter().zip(image_names).map(drawn).collect(),
         history: frame.history.iter().map(past).collect(),
         timings: Timings {
@@ -179,6 +184,16 @@ fn metadata(
             waited_for: frame.residency.waited_for as u64,
             waited_us: frame.residency.waited.as_micros() as u64,
         },
+    })
+}
+
+fn geo(located: GeoPose) -> Geo {
+    let GeoPoint { latitude_deg, longitude_deg, altitude_m } = located.point;
+    Geo {
+        latitude: latitude_deg,
+        longitude: longitude_deg,
+        altitude: altitude_m,
+        heading: located.heading_deg,
     }
 }
 

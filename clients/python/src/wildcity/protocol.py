@@ -425,6 +425,16 @@ class Ego:
 
 
 @dataclass(frozen=True)
+class Geo:
+    """Place of the ego on the earth (WGS84): degrees, metres above the ellipsoid, and degrees from north to the east."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+    heading: float
+
+
+@dataclass(frozen=True)
 class Trust:
     """Confidence in an image: `value` is 1 at a recorded pose, 0 where nothing is known.
 
@@ -520,6 +530,7 @@ class Metadata:
     timings: Timings
     residency: Residency
     history: tuple[ImageInfo, ...] = ()
+    geo: Geo | None = None
 
 
 ANSWERS: dict[str, type[Any]] = {
