@@ -52,6 +52,9 @@ pub struct ObservationMetadata {
     pub frame_hash: String,
     /// State of the ego at this time.
     pub ego: Ego,
+    /// Place and heading of the ego on the earth. Only if the twin says where it lies.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub geo: Option<Geo>,
     /// The images, in order. Empty between two decisions.
     pub images: Vec<Image>,
     /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none.
@@ -186,6 +189,20 @@ pub struct Actor {
     pub velocity: [f64; 3],
     /// Yaw rate, positive to the left, in rad/s.
     pub yaw_rate: f64,
+}
+
+/// Place and heading of the ego on the earth (WGS84).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Geo {
+    /// Latitude, in degrees, positive to the north.
+    pub latitude: f64,
+    /// Longitude, in degrees, positive to the east.
+    pub longitude: f64,
+    /// Height of the rig's origin above the ellipsoid, in metres.
+    pub altitude: f64,
+    /// Direction of the rig's x axis, in degrees from true north to the east, 0 to 360.
+    pub heading: f64,
 }
 
 /// One image.

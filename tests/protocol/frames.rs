@@ -322,6 +322,7 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationM
             steering: Some(-0.0625),
             history_count: 3,
         },
+        geo: None,
         images,
         history: Vec::new(),
         timings: Timings {

@@ -15,8 +15,8 @@ const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels
 
 /// The settings of `street`.
 fn settings() -> VersionSettings {
-    let NewVersion { profile, rig, trajectories, sky, provenance, .. } = street(&EMPTY);
-    VersionSettings { profile, rig, trajectories, sky, provenance }
+    let NewVersion { profile, rig, trajectories, sky, geo, provenance, .. } = street(&EMPTY);
+    VersionSettings { profile, rig, trajectories, sky, geo, provenance }
 }
 
 static EMPTY: Gaussians = Gaussians {
@@ -32,7 +32,7 @@ static EMPTY: Gaussians = Gaussians {
 fn change(source: &str) -> VersionChange {
     let mut provenance = settings().provenance;
     provenance.source = source.to_owned();
-    VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
+    VersionChange { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance }
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.

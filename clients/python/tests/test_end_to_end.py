@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import os
 import queue
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 import wildcity
 from PIL import Image
@@ -24,13 +26,17 @@ from wildcity import (
     Action,
     Camera,
     Disconnected,
+    DriveSection,
     Dynamics,
     Exposure,
     Observation,
     Outputs,
     Pose,
+    RandomStart,
+    RecordedPoint,
     Refused,
     Rig,
+    SnapshotPoint,
     Station,
     TimedPose,
     Trajectory,
@@ -52,6 +58,10 @@ PAIR = Rig(
 RAW = Outputs(encoding="raw", depth=True, opacity=True, normals=True)
 
 
+ORIGIN = (52.5162, 13.3777, 34.0)
+"""Latitude, longitude and altitude of the twin's origin."""
+
+
 @dataclass(frozen=True)
 class Server:
     url: str
@@ -71,7 +81,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     write_corridor(folder / "corridor.ply")
     write_log(folder / "log.json")
     twins = ["--twins", str(folder / "twins")]
-    files = ["--trajectory", str(folder / "log.json")]
+    files = ["--trajectory", str(folder / "log.json"), "--geo", ",".join(map(str, ORIGIN))]
     importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
     subprocess.run([*importing, *twins, *files], check=True, timeout=60)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
@@ -127,6 +137,72 @@ def test_frames_of_the_recorded_and_the_driven_part(connect: Connect, server: Se
     assert on_route is not None and beside is not None
     assert on_route.distance_m == pytest.approx(0.0, abs=1e-9) and beside.distance_m == pytest.approx(1.0)
     assert beside.value < on_route.value <= 1.0
+
+
+def test_knows_where_it_is_on_the_earth(connect: Connect, server: Server) -> None:
+    latitude, longitude, altitude = ORIGIN
+    plane = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude} +lon_0={longitude} +h_0={altitude}"
+    steps = f"+step +inv {plane} +step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    to_earth = pyproj.Transformer.from_pipeline(f"+proj=pipeline {steps}")
+    geod = pyproj.Geod(ellps="WGS84")
+    with connect(server.url) as client, client.open("corridor", rig=PAIR, outputs=RAW) as session:
+        for x, y, yaw in ((0.0, 0.0, 0.0), (1500.0, -800.0, 2.0), (-20_000.0, 9000.0, -0.5)):
+            pose = Pose((x, y, 1.0), (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)))
+            geo = session.step(pose).metadata.geo
+            assert geo is not None
+            east, north, up = to_earth.transform(x, y, 1.0)
+            assert (geo.longitude, geo.latitude) == pytest.approx((east, north), abs=1e-11)
+            assert geo.altitude == pytest.approx(up, abs=1e-6)
+            # The heading is the azimuth of a point a metre ahead.
+            ahead = to_earth.transform(x + math.cos(yaw), y + math.sin(yaw), 1.0)
+            azimuth = geod.inv(east, north, ahead[0], ahead[1])[0]
+            assert (geo.heading - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-3)
+
+
+def test_returns_to_a_snapshot_and_branches(connect: Connect, server: Server) -> None:
+    log = Station("log", 2.0)
+    name = f"tree-{time.time_ns()}"
+    with connect(server.url) as client:
+        dynamics = Dynamics("dynamic", 5.0)
+        with client.open(
+            "corridor", rig=PAIR, outputs=RAW, start=log, dynamics=dynamics, session=name
+        ) as session:
+            session.reset(seed=1)
+            before = session.step(Action(1.0, 0.05), until_us=300_000, notes={"why": "to the fork"})
+            assert (before.metadata.step, before.metadata.time_us) == (3, 300_000)
+            session.snapshot("fork")
+            left = session.step(Action(0.0, 0.1))
+            again = session.restore("fork")
+            assert again.metadata.ego == before.metadata.ego
+            assert np.array_equal(again.images["front"], before.images["front"])
+            with connect(server.url) as other:
+                with other.branch(SnapshotPoint(name, "fork")) as branch:
+                    assert branch.opened.dynamics == dynamics
+                    same = branch.step(Action(0.0, 0.1))
+            assert same.frame[-1000:] == left.frame[-1000:]
+            assert same.metadata.ego == left.metadata.ego
+        with client.branch(RecordedPoint(f"{name}-1", 3)) as branch:
+            same = branch.step(Action(0.0, 0.1))
+            assert same.metadata.ego == left.metadata.ego
+            assert same.metadata.frame_hash == left.metadata.frame_hash
+        with pytest.raises(Refused, match="no recorded episode"):
+            client.branch(RecordedPoint("nothing-1", 0))
+
+
+def test_reads_the_recorded_drive_and_starts_along_it(connect: Connect, server: Server) -> None:
+    http = server.url.replace("ws://", "http://").removesuffix("/v1/session")
+    drive = wildcity.recorded_drive("corridor", "log", from_m=1.0, to_m=2.0, every_m=0.5, server=http)
+    assert [pose.station_m for pose in drive.poses] == [1.0, 1.5, 2.0]
+    assert drive.poses[1].pose.xyz == pytest.approx((1.5, 0.0, 0.0))
+    with connect(server.url) as client:
+        start = RandomStart("log", 1.0, 2.0, lateral_m=0.25)
+        section = DriveSection("log", 1.0, 2.0, 0.5)
+        with client.open("corridor", rig=PAIR, start=start, trajectory=section) as session:
+            assert session.opened.trajectory == drive
+            places = {session.reset(seed).ego.pose.xyz for seed in range(5)}
+            assert len(places) == 5
+            assert all(1.0 <= x <= 2.0 and abs(y) <= 0.25 for x, y, _ in places)
+            assert session.reset(3, dynamics="kinematic", speed=4.0).ego.velocity[0] == pytest.approx(4.0)
 
 
 def test_drives_a_car(connect: Connect, server: Server) -> None:

@@ -326,6 +326,7 @@ fn of_store(error: &StoreError) -> WireFault {
         | StoreError::DuplicateCell { .. }
         | StoreError::SideFileSize { .. }
         | StoreError::Rig(_)
+        | StoreError::Geo(_)
         | StoreError::Trajectory(_)
         | StoreError::DuplicateTrajectory { .. } => at(Code::TwinDamaged, "twin"),
     }

@@ -107,7 +107,7 @@ impl Catalog {
         let mut provenance = manifest.provenance.clone();
         provenance.options.push(option);
         let change =
-            VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance };
+            VersionChange { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance };
         let version = commit.change(base.number, change)?;
         Ok(Cut { version, gaussians: cut })
     }

@@ -449,6 +449,16 @@ class Ego:
 
 
 @dataclass(frozen=True)
+class Geo:
+    """Place of the ego on the earth (WGS84): degrees, metres above the ellipsoid, and degrees from north to the east."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+    heading: float
+
+
+@dataclass(frozen=True)
 class Trust:
     """Confidence in an image: `value` is 1 at a recorded pose, 0 where nothing is known.
 
@@ -587,6 +597,7 @@ class Metadata:
     events: tuple[Event, ...] = ()
     route: Route | None = None
     actors: tuple[Actor, ...] | None = None
+    geo: Geo | None = None
 
 
 ANSWERS: dict[str, type[Any]] = {
