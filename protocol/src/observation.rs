@@ -13,12 +13,16 @@
 //! 4. For each image `camera/<name>/rgb`, u8.
 //! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
 //!
+//! The answer to `step_many` has the same layout: its header has `{"many": "<JSON of ManyMetadata>"}`, and its tensors are
+//! u8 `[n]`, each a whole observation.
+//!
 //! Image names start with `pose/<k>/` if there are several poses (`observe`). The length of the header is a
 //! multiple of 8 and floats come first, so floats are aligned to 4 bytes, and instances to 2, and can be read in place.
 
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Lens, Windshield};
+use crate::error::Code;
 use crate::message::{Encoding, Pose};
 
 /// Everything that an observation holds beside its tensors.
@@ -73,6 +77,44 @@ pub struct ObservationMetadata {
     pub timings: Timings,
     /// Memory of the server, and how long the observation waited for loading.
     pub residency: Residency,
+}
+
+/// What the answer to `step_many` holds beside the observations.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(rename = "Many"))]
+pub struct ManyMetadata {
+    /// Number of the request.
+    pub seq: u64,
+    /// What each step gave, in the order of the request.
+    pub answers: Vec<SessionAnswer>,
+}
+
+/// What one step of a `step_many` gave: an observation or a refusal.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct SessionAnswer {
+    /// Name of the session.
+    pub session: String,
+    /// Name of the tensor that is the observation. Absent if the step was refused.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tensor: Option<String>,
+    /// Why the step was refused. The session is as it was before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<SessionRefusal>,
+}
+
+/// Why a step of a `step_many` was refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct SessionRefusal {
+    /// Error code.
+    pub code: Code,
+    /// What went wrong and how to fix it, for people.
+    pub message: String,
+    /// The field at fault, for example `steps[3].pose.q`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
 }
 
 /// State of the ego vehicle at one time.

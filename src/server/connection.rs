@@ -1,5 +1,7 @@
 //! One agent, in lock step: read a request, answer it.
 //!
+//! A connection may have several sessions. They share its numbers, so that they can be resumed together.
+//!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
 //! repeats one that was refused since the last one that was carried out. A request that was carried out is
 //! never carried out again: if its number is repeated, the stored answer is sent again.
@@ -7,15 +9,17 @@
 use std::future::pending;
 use std::sync::Arc;
 
+use futures_util::future::{join_all, select_all};
 use tokio::time::{Instant, sleep_until, timeout};
 
-use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions};
+use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions, StepOptions};
 
 use crate::auth::Grant;
-use crate::convert::{self, BranchPoint, Command, DriveRequest, Parsed};
+use crate::convert::{self, AlsoResumed, BranchPoint, Command, DriveRequest, Parsed, SessionStep, Stepped};
 use crate::fault::Fault;
 use crate::inbox::Inbox;
 use crate::limits;
+use crate::metrics::Metrics;
 use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
 use crate::socket::{Disconnect, Incoming, Socket};
 use crate::state::ServerState;
@@ -31,7 +35,7 @@ pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Gr
         hello_done: false,
         answered_seq: None,
         last: None,
-        slot: None,
+        slots: Vec::new(),
     };
     let reason = connection.run(&mut inbox).await;
     connection.end(inbox.socket, reason).await;
@@ -47,7 +51,8 @@ struct Connection {
     answered_seq: Option<u64>,
     /// The last request carried out, and its answer.
     last: Option<AnsweredRequest>,
-    slot: Option<SlotGuard>,
+    /// The sessions, in the order in which they were opened.
+    slots: Vec<SlotGuard>,
 }
 
 /// A request that was refused.
@@ -92,10 +97,11 @@ impl Connection {
             if self.hello_done { Instant::now() + idle } else { self.hello_deadline };
         loop {
             let released = async {
-                match &self.slot {
-                    Some(slot) => slot.release.notified().await,
-                    None => pending().await,
+                if self.slots.is_empty() {
+                    return pending().await;
                 }
+                let each = self.slots.iter().map(|slot| Box::pin(slot.release.notified()));
+                select_all(each).await;
             };
             let fault = tokio::select! {
                 incoming = inbox.next() => match incoming? {
@@ -124,8 +130,8 @@ impl Connection {
             let parsed = tokio::task::spawn_blocking(move || convert::parse(&text)).await;
             parsed.unwrap_or_else(|error| Parsed::Unnumbered(Fault::Internal(error.to_string())))
         };
-        let (seq, command) = match parsed {
-            Parsed::Numbered { seq, command } => (seq, command),
+        let (seq, session, command) = match parsed {
+            Parsed::Numbered { seq, session, command } => (seq, session, command),
             Parsed::Unnumbered(fault) => return Err(Refusal { seq: None, fault }),
         };
 
@@ -140,22 +146,18 @@ impl Connection {
 
         // Carries the request out.
         self.answered_seq = Some(seq);
-        if let Some(slot) = &mut self.slot {
+        for slot in &mut self.slots {
             slot.answered_seq = seq;
         }
         let command = command.map_err(refusal)?;
         // `resume` itself sets the numbers: they continue those of the session.
         let is_resume = matches!(command, Command::Resume { .. });
-        let answer = self.carry_out(seq, command).await.map_err(refusal)?;
+        let answer = self.carry_out(seq, session.as_deref(), command).await.map_err(refusal)?;
 
-        // Stores the answer in the slot too, where it survives the connection.
-        if let Some(slot) = &self.slot {
-            slot.update_view();
-            slot.show(&answer);
-        }
+        // Stores the answer in the slots too, where it survives the connection.
         if !is_resume {
             self.last = Some(AnsweredRequest { seq, answer: answer.clone() });
-            if let Some(slot) = &mut self.slot {
+            for slot in &mut self.slots {
                 slot.last = self.last.clone();
                 slot.answered_seq = seq;
             }
@@ -187,62 +189,78 @@ impl Connection {
         Err(Fault::SeqOutOfOrder { field: "seq", seq, expected })
     }
 
-    async fn carry_out(&mut self, seq: u64, command: Command) -> Result<Answer, Fault> {
+    /// Carries out a request. `named` is the session that it is for, if it names one.
+    async fn carry_out(
+        &mut self,
+        seq: u64,
+        named: Option<&str>,
+        command: Command,
+    ) -> Result<Answer, Fault> {
         match command {
             Command::Hello { client } => self.hello(seq, client).await,
             _ if !self.hello_done => Err(Fault::WrongOrder("the first request is hello")),
-            Command::Open { .. } | Command::Branch { .. } | Command::Resume { .. }
-                if self.slot.is_some() =>
-            {
+            Command::Open { name, opening, drive } => {
+                self.check_room(name.as_ref())?;
+                self.open(seq, name, *opening, drive).await
+            }
+            Command::Branch { name, from } => {
+                self.check_room(name.as_ref())?;
+                self.branch(seq, name, from).await
+            }
+            Command::Resume { .. } if !self.slots.is_empty() => {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Open { name, opening, drive } => self.open(seq, name, *opening, drive).await,
-            Command::Branch { name, from } => self.branch(seq, name, from).await,
-            Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
+            Command::Resume { session, last_seq, with } => {
+                self.resume(seq, &session, last_seq, &with).await
+            }
+            Command::StepMany { steps } => self.step_many(seq, steps).await,
             Command::Step { movement, options } => {
-                let begun = Instant::now();
-                let session = self.session()?;
-                let done = session.episode().step();
-                let frame = session.follow(movement, options).await?;
-                let steps = session.episode().step() - done;
+                let slot = self.slot(named)?;
                 let metrics = &self.state.metrics;
-                metrics.steps.inc_by(steps);
-                metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
-                metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
-                self.observation(seq, frame)
+                let session = self.slots[slot].session.as_mut().ok_or(NO_SESSION)?;
+                let frame = step(metrics, session, movement, options).await?;
+                self.observation(seq, slot, frame)
             }
             Command::Observe { poses } => {
-                let frame = self.session()?.observe(poses).await?;
-                self.observation(seq, frame)
+                let slot = self.slot(named)?;
+                let frame = self.session(slot)?.observe(poses).await?;
+                self.observation(seq, slot, frame)
             }
             Command::Prefetch { poses } => {
-                self.session()?.prefetch(poses)?;
+                let slot = self.slot(named)?;
+                self.session(slot)?.prefetch(poses)?;
                 Ok(Answer::Text(convert::ok(seq)?.into()))
             }
             Command::Snapshot { name } => {
-                self.session()?.take_snapshot(name)?;
+                let slot = self.slot(named)?;
+                self.session(slot)?.take_snapshot(name)?;
                 Ok(Answer::Text(convert::ok(seq)?.into()))
             }
             Command::Restore { name } => {
-                let frame = self.session()?.restore(&name).await?;
-                self.observation(seq, frame)
+                let slot = self.slot(named)?;
+                let frame = self.session(slot)?.restore(&name).await?;
+                self.observation(seq, slot, frame)
             }
             Command::Reset { options } => {
-                let frame = self.session()?.reset_with(options).await?;
-                self.observation(seq, frame)
+                let slot = self.slot(named)?;
+                let frame = self.session(slot)?.reset_with(options).await?;
+                self.observation(seq, slot, frame)
             }
             Command::SwitchVersion { version } => {
+                let slot = self.slot(named)?;
                 let max_wait = self.state.limits.step;
-                let switched = timeout(max_wait, self.session()?.switch_version(version)).await;
+                let switched = timeout(max_wait, self.session(slot)?.switch_version(version)).await;
                 switched.map_err(|_| SessionError::DeadlineExceeded)??;
                 self.state.metrics.versions_switched.inc();
-                let text = convert::switched(seq, self.session()?)?;
+                self.slots[slot].update_view();
+                let text = convert::switched(seq, self.session(slot)?)?;
                 Ok(Answer::Text(text.into()))
             }
             Command::Close => {
-                let session = self.slot.as_mut().and_then(|slot| slot.session.take());
-                let session = session.ok_or(NO_SESSION)?;
-                self.slot = None;
+                let slot = self.slot(named)?;
+                let session = self.slots[slot].session.take().ok_or(NO_SESSION)?;
+                // Dropping the slot frees the name.
+                drop(self.slots.remove(slot));
                 let name = session.name().to_owned();
                 tracing::info!(session = name, "closed");
                 let episode = session.episode_name();
@@ -254,6 +272,66 @@ impl Connection {
                 Ok(answer)
             }
         }
+    }
+
+    /// Checks that another session of this name can be opened: the second one of a connection needs one, so that a
+    /// client that has forgotten to close the first is told.
+    fn check_room(&self, name: Option<&String>) -> Result<(), Fault> {
+        let limit = limits::CONNECTION_SESSIONS;
+        if !self.slots.is_empty() && name.is_none() {
+            return Err(Fault::SessionState(
+                "a session is open on this connection; close it first, or name the next one",
+            ));
+        }
+        if self.slots.len() >= limit {
+            return Err(Fault::Busy { what: "sessions on this connection", limit });
+        }
+        Ok(())
+    }
+
+    /// Carries out steps of several sessions at once: their frames wait for the renderer together.
+    async fn step_many(&mut self, seq: u64, steps: Vec<SessionStep>) -> Result<Answer, Fault> {
+        if self.slots.is_empty() {
+            return Err(NO_SESSION);
+        }
+        let open = self.names();
+        let named = |slot: &&SlotGuard| steps.iter().any(|step| step.session == slot.name());
+        let sessions = self.slots.iter().filter(named).filter_map(|slot| slot.session.as_ref());
+        let pixels: u64 = sessions.map(Session::step_pixels).sum();
+        let limit = wildcity_session::limits::ANSWER_PIXELS;
+        if pixels > limit {
+            return Err(SessionError::AnswerTooLarge { field: "steps", pixels, limit }.into());
+        }
+
+        let metrics = &self.state.metrics;
+        let mut slots: Vec<_> = self.slots.iter_mut().map(Some).collect();
+        let carried_out = steps.into_iter().map(|SessionStep { session: name, step: asked }| {
+            let slot = open.iter().position(|known| *known == name);
+            let slot = slot.and_then(|slot| slots[slot].take());
+            let open = &open;
+            async move {
+                let result = async {
+                    let (movement, options) = asked?;
+                    let unknown =
+                        || Fault::NotOnConnection { name: name.clone(), open: open.clone() };
+                    let slot = slot.ok_or_else(unknown)?;
+                    let session = slot.session.as_mut().ok_or(NO_SESSION)?;
+                    let frame = self::step(metrics, session, movement, options).await?;
+                    let frame = Arc::new(convert::observation(seq, session, frame)?);
+                    slot.update_view();
+                    slot.show(&frame);
+                    Ok(frame)
+                };
+                let result = result.await;
+                Stepped { session: name, result }
+            }
+        });
+        let stepped = join_all(carried_out).await;
+        for fault in stepped.iter().filter_map(|step| step.result.as_ref().err()) {
+            tracing::debug!(seq, "refused: {fault}");
+            metrics.refused(&convert::code(fault).0);
+        }
+        Ok(Answer::Many(Arc::new(convert::many(seq, stepped)?)))
     }
 
     async fn hello(&mut self, seq: u64, client: String) -> Result<Answer, Fault> {
@@ -324,13 +402,22 @@ impl Connection {
         tracing::info!(session = session.name(), "opened");
         slot.share_snapshots(&session);
         slot.session = Some(session);
-        self.slot = Some(slot);
+        slot.update_view();
+        self.slots.push(slot);
         Ok(Answer::Text(text.into()))
     }
 
-    /// Continues a session, or the numbers of one whose `close` was carried out: its answer may have been lost.
-    async fn resume(&mut self, seq: u64, name: &str, last_seq: u64) -> Result<Answer, Fault> {
+    /// Continues sessions of a connection that was lost, or the numbers of one whose `close` was carried out: its answer
+    /// may have been lost.
+    async fn resume(
+        &mut self,
+        seq: u64,
+        name: &str,
+        last_seq: u64,
+        with: &[String],
+    ) -> Result<Answer, Fault> {
         let max_wait = self.state.limits.step;
+        let owner = &self.grant.name;
         let check = |answered_seq: u64| {
             if last_seq > answered_seq {
                 let expected = format!("{answered_seq} is the session's last answer");
@@ -338,32 +425,77 @@ impl Connection {
             }
             Ok(())
         };
-        if let Some(closed) = self.state.sessions.closed(name, &self.grant.name) {
+        if with.is_empty()
+            && let Some(closed) = self.state.sessions.closed(name, owner)
+        {
             check(closed.last.seq)?;
-            let text = convert::resumed(seq, name, closed.last.seq, Err(&closed))?;
+            let text = convert::resumed(seq, name, closed.last.seq, Err(&closed), &[])?;
             self.answered_seq = Some(closed.last.seq);
             self.last = Some(closed.last);
             return Ok(Answer::Text(text.into()));
         }
-        let slot = self.state.sessions.resume(name, &self.grant.name, max_wait).await?;
-        check(slot.answered_seq)?;
-        let carried_out = slot.last.as_ref().map_or(slot.answered_seq, |last| last.seq);
-        let session = slot.session.as_ref().ok_or(NO_SESSION)?;
-        let text = convert::resumed(seq, name, carried_out, Ok(session))?;
-        tracing::info!(session = session.name(), "resumed");
-        self.last = slot.last.clone();
-        self.answered_seq = Some(slot.answered_seq);
-        self.slot = Some(slot);
+        let first = self.state.sessions.resume("session", name, owner, max_wait).await?;
+        check(first.answered_seq)?;
+        let mut slots = vec![first];
+        for (index, name) in with.iter().enumerate() {
+            let field = format!("with[{index}]");
+            let slot = self.state.sessions.resume(&field, name, owner, max_wait).await?;
+            // The sessions of a connection share its numbers.
+            if slot.answered_seq != slots[0].answered_seq {
+                let seq = slot.answered_seq;
+                return Err(Fault::OtherConnection { field, name: name.clone(), seq });
+            }
+            slots.push(slot);
+        }
+        let opened: Vec<&Session> =
+            slots.iter().map(|slot| slot.session.as_ref().ok_or(NO_SESSION)).collect::<Result<_, _>>()?;
+        let also = |(name, session)| AlsoResumed { name, session };
+        let also: Vec<_> =
+            with.iter().map(String::as_str).zip(opened[1..].iter().copied()).map(also).collect();
+        let first = &slots[0];
+        let carried_out = first.last.as_ref().map_or(first.answered_seq, |last| last.seq);
+        let text = convert::resumed(seq, name, carried_out, Ok(opened[0]), &also)?;
+        for slot in &slots {
+            tracing::info!(session = slot.name(), "resumed");
+            slot.update_view();
+        }
+        self.last = first.last.clone();
+        self.answered_seq = Some(first.answered_seq);
+        self.slots = slots;
         Ok(Answer::Text(text.into()))
     }
 
-    fn session(&mut self) -> Result<&mut Session, Fault> {
-        self.slot.as_mut().and_then(|slot| slot.session.as_mut()).ok_or(NO_SESSION)
+    /// Index of the session that a request names, or of the only one.
+    fn slot(&self, named: Option<&str>) -> Result<usize, Fault> {
+        match (named, &self.slots[..]) {
+            (_, []) => Err(NO_SESSION),
+            (None, [_]) => Ok(0),
+            (None, _) => Err(Fault::InvalidRequest {
+                field: Some("session".to_owned()),
+                reason: format!("session: name one of {}", self.names().join(", ")),
+            }),
+            (Some(name), slots) => {
+                let unknown =
+                    || Fault::NotOnConnection { name: name.to_owned(), open: self.names() };
+                slots.iter().position(|slot| slot.name() == name).ok_or_else(unknown)
+            }
+        }
     }
 
-    fn observation(&mut self, seq: u64, frame: Observation) -> Result<Answer, Fault> {
-        let frame = convert::observation(seq, self.session()?, frame)?;
-        Ok(Answer::Observation(Arc::new(frame)))
+    /// Names of the open sessions.
+    fn names(&self) -> Vec<String> {
+        self.slots.iter().map(|slot| slot.name().to_owned()).collect()
+    }
+
+    fn session(&mut self, slot: usize) -> Result<&mut Session, Fault> {
+        self.slots[slot].session.as_mut().ok_or(NO_SESSION)
+    }
+
+    fn observation(&mut self, seq: u64, slot: usize, frame: Observation) -> Result<Answer, Fault> {
+        let frame = Arc::new(convert::observation(seq, self.session(slot)?, frame)?);
+        self.slots[slot].update_view();
+        self.slots[slot].show(&frame);
+        Ok(Answer::Observation(frame))
     }
 
     async fn send(&self, socket: &mut Socket, answer: &Answer) -> Result<(), Disconnect> {
@@ -372,7 +504,14 @@ impl Connection {
             Answer::Observation(frame) => {
                 let bytes = frame.buffer.bytes();
                 self.state.metrics.observation_bytes.inc_by(bytes.len() as u64);
-                socket.send_binary(bytes).await
+                socket.send_binary(&[bytes]).await
+            }
+            Answer::Many(many) => {
+                let frames = many.frames.iter().map(|frame| frame.buffer.bytes());
+                let parts: Vec<&[u8]> = std::iter::once(&*many.header).chain(frames).collect();
+                let bytes = parts.iter().map(|part| part.len() as u64).sum();
+                self.state.metrics.observation_bytes.inc_by(bytes);
+                socket.send_binary(&parts).await
             }
         }
     }
@@ -399,7 +538,7 @@ impl Connection {
             Disconnect::Fault(_) => Outcome::AgentError,
         };
         // The session first: a client that resumes it need not wait for this connection to close.
-        if let Some(mut slot) = self.slot.take() {
+        for mut slot in self.slots.drain(..) {
             tracing::info!(?reason, "the connection of a session ended");
             slot.outcome = outcome;
         }
@@ -414,4 +553,20 @@ impl Connection {
             Disconnect::SendTimedOut => {}
         }
     }
+}
+
+/// Carries out a step of a session, and counts it.
+async fn step(
+    metrics: &Metrics,
+    session: &mut Session,
+    movement: wildcity_sim::Command,
+    options: StepOptions,
+) -> Result<Observation, Fault> {
+    let begun = Instant::now();
+    let done = session.episode().step();
+    let frame = session.follow(movement, options).await?;
+    metrics.steps.inc_by(session.episode().step() - done);
+    metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
+    metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
+    Ok(frame)
 }
