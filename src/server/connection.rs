@@ -210,8 +210,8 @@ impl Connection {
             Command::Resume { .. } if !self.slots.is_empty() => {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Resume { session, last_seq, with } => {
-                self.resume(seq, &session, last_seq, &with).await
+            Command::Resume { session, last_seq, also } => {
+                self.resume(seq, &session, last_seq, &also).await
             }
             Command::StepMany { steps } => self.step_many(seq, steps).await,
             Command::Step { movement, options } => {
@@ -414,7 +414,7 @@ impl Connection {
         seq: u64,
         name: &str,
         last_seq: u64,
-        with: &[String],
+        also: &[String],
     ) -> Result<Answer, Fault> {
         let max_wait = self.state.limits.step;
         let owner = &self.grant.name;
@@ -425,7 +425,7 @@ impl Connection {
             }
             Ok(())
         };
-        if with.is_empty()
+        if also.is_empty()
             && let Some(closed) = self.state.sessions.closed(name, owner)
         {
             check(closed.last.seq)?;
@@ -437,8 +437,8 @@ impl Connection {
         let first = self.state.sessions.resume("session", name, owner, max_wait).await?;
         check(first.answered_seq)?;
         let mut slots = vec![first];
-        for (index, name) in with.iter().enumerate() {
-            let field = format!("with[{index}]");
+        for (index, name) in also.iter().enumerate() {
+            let field = format!("also[{index}]");
             let slot = self.state.sessions.resume(&field, name, owner, max_wait).await?;
             // The sessions of a connection share its numbers.
             if slot.answered_seq != slots[0].answered_seq {
@@ -449,12 +449,12 @@ impl Connection {
         }
         let opened: Vec<&Session> =
             slots.iter().map(|slot| slot.session.as_ref().ok_or(NO_SESSION)).collect::<Result<_, _>>()?;
-        let also = |(name, session)| AlsoResumed { name, session };
-        let also: Vec<_> =
-            with.iter().map(String::as_str).zip(opened[1..].iter().copied()).map(also).collect();
+        let one = |(name, session)| AlsoResumed { name, session };
+        let resumed_also: Vec<_> =
+            also.iter().map(String::as_str).zip(opened[1..].iter().copied()).map(one).collect();
         let first = &slots[0];
         let carried_out = first.last.as_ref().map_or(first.answered_seq, |last| last.seq);
-        let text = convert::resumed(seq, name, carried_out, Ok(opened[0]), &also)?;
+        let text = convert::resumed(seq, name, carried_out, Ok(opened[0]), &resumed_also)?;
         for slot in &slots {
             tracing::info!(session = slot.name(), "resumed");
             slot.update_view();

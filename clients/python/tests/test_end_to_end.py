@@ -38,6 +38,7 @@ from wildcity import (
     Rig,
     SnapshotPoint,
     Station,
+    Step,
     TimedPose,
     Trajectory,
     png_data_uri,
@@ -157,6 +158,36 @@ def test_knows_where_it_is_on_the_earth(connect: Connect, server: Server) -> Non
             ahead = to_earth.transform(x + math.cos(yaw), y + math.sin(yaw), 1.0)
             azimuth = geod.inv(east, north, ahead[0], ahead[1])[0]
             assert (geo.heading - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-3)
+
+
+def test_steps_several_sessions_at_once(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client, connect(server.url) as other:
+        car = Dynamics("kinematic", 5.0)
+        left = client.open("corridor", rig=PAIR, outputs=RAW, session="left")
+        right = client.open("corridor", rig=PAIR, outputs=RAW, session="right", dynamics=car)
+        alone = other.open("corridor", rig=PAIR, outputs=RAW)
+        here = Pose((1.0, 0.5, 0.0))
+        seen = client.step_many({"left": here, "right": Step(Action(1.0, 0.0), 300_000, {"why": "test"})})
+        same = alone.step(here)
+        assert seen["left"].metadata.frame_hash == same.metadata.frame_hash
+        for name in ("front", "rear"):
+            assert np.array_equal(seen["left"].images[name], same.images[name])
+        assert seen["right"].metadata.step == 3
+        seen = client.step_many({"left": Action(0.0, 0.0), "right": Action(0.0, 0.0), "gone": here})
+        assert seen["right"].metadata.step == 4
+        assert (seen["left"].code, seen["left"].field) == ("session_state", "steps[0].action")
+        assert (seen["gone"].code, seen["gone"].field) == ("unknown_session", "steps[2].session")
+        with pytest.raises(Refused, match="session_state"):
+            client.open("corridor")
+        assert left.reset().metadata.session == "left"
+        # After a lost connection both are resumed.
+        client.close()
+        assert right.resume().also[0].session == "right"
+        assert left.step(here).metadata.session == "left"
+        assert left.close().steps == 1
+        assert right.step(Action(0.0, 0.0)).metadata.step == 5
+        right.close()
+        alone.close()
 
 
 def test_returns_to_a_snapshot_and_branches(connect: Connect, server: Server) -> None:

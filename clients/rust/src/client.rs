@@ -150,7 +150,7 @@ pub struct Resumed {
     /// The settings of the session, as [`Client::open`] returned them; `None` if it is closed.
     pub opened: Option<Box<Opened>>,
     /// The other sessions of the connection.
-    pub with: Vec<ResumedSession>,
+    pub also: Vec<ResumedSession>,
 }
 
 /// The server's answer to `switch_version`: the version that the session shows from the next step on.
@@ -219,10 +219,10 @@ impl Client {
     pub async fn resume_with(
         &mut self,
         session: &str,
-        with: &[String],
+        also: &[String],
         last_seq: u64,
     ) -> Result<Resumed, ClientError> {
-        self.sessions = std::iter::once(session.to_owned()).chain(with.iter().cloned()).collect();
+        self.sessions = std::iter::once(session.to_owned()).chain(also.iter().cloned()).collect();
         self.selected = Some(session.to_owned());
         self.next_seq = last_seq.saturating_add(1);
         self.resume_sessions(last_seq).await
@@ -515,7 +515,7 @@ impl Client {
         let mut connection = self.take_connection()?;
         let mut names = self.sessions.iter().cloned();
         let session = names.next().unwrap_or_default();
-        let request = Request::Resume { seq: 1, session, last_seq, with: names.collect() };
+        let request = Request::Resume { seq: 1, session, last_seq, also: names.collect() };
         let incoming = match connection.exchange(&request, 1, self.answer_timeout).await {
             Ok(incoming) => incoming,
             Err(error) => {
@@ -540,11 +540,11 @@ impl Client {
                 step,
                 time_us,
                 opened,
-                with,
+                also,
                 ..
             }) if session_seq == last_seq || Some(session_seq) == last_seq.checked_add(1) => {
                 self.connection = Some(connection);
-                Ok(Resumed { last_seq: session_seq, step, time_us, opened, with })
+                Ok(Resumed { last_seq: session_seq, step, time_us, opened, also })
             }
             other => Err(self.unexpected_answer("resumed, at most one request ahead", &other)),
         }

@@ -47,7 +47,7 @@ pub enum Answer {
         opened: Option<Box<Opened>>,
         /// The other sessions that the request named, in its order.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
-        with: Vec<ResumedSession>,
+        also: Vec<ResumedSession>,
     },
     /// Answer to `prefetch` and to `snapshot`.
     Ok {

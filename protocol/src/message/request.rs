@@ -163,7 +163,7 @@ pub enum Request {
         /// Names of the other sessions of the lost connection, at most 63.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         #[cfg_attr(feature = "schema", schemars(length(max = 63)))]
-        with: Vec<String>,
+        also: Vec<String>,
     },
 }
 

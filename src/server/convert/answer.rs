@@ -138,14 +138,14 @@ pub(crate) fn resumed(
     name: &str,
     last_seq: u64,
     session: Result<&Session, &ClosedSession>,
-    with: &[AlsoResumed<'_>],
+    also_resumed: &[AlsoResumed<'_>],
 ) -> Result<String, Fault> {
     let (step, time_us) = match session {
         Ok(open) => (open.episode().step(), open.episode().time_us()),
         Err(closed) => (closed.steps, closed.time_us),
     };
     let opened = session.ok().map(|session| settings(seq, session, None)).transpose()?;
-    let also = |AlsoResumed { name, session }: &AlsoResumed<'_>| {
+    let one = |AlsoResumed { name, session }: &AlsoResumed<'_>| {
         Ok(message::ResumedSession {
             session: (*name).to_owned(),
             step: session.episode().step(),
@@ -153,7 +153,7 @@ pub(crate) fn resumed(
             opened: Box::new(settings(seq, session, None)?),
         })
     };
-    let with = with.iter().map(also).collect::<Result<_, Fault>>()?;
+    let also = also_resumed.iter().map(one).collect::<Result<_, Fault>>()?;
     text(&Answer::Resumed {
         seq,
         session: name.to_owned(),
@@ -161,7 +161,7 @@ pub(crate) fn resumed(
         step,
         time_us,
         opened: opened.map(Box::new),
-        with,
+        also,
     })
 }
 

@@ -115,7 +115,7 @@ pub(crate) enum Command {
         /// Number of the last request with an answer that arrived.
         last_seq: u64,
         /// The other sessions of the connection that was lost.
-        with: Vec<String>,
+        also: Vec<String>,
     },
 }
 
@@ -201,8 +201,8 @@ fn convert(request: Request) -> Parsed {
         }
         Request::Branch(branch) => general(branch.seq, branch_command(branch)),
         Request::Close { seq, session } => on(seq, session, Ok(Command::Close)),
-        Request::Resume { seq, session, last_seq, with } => {
-            general(seq, resume_command(session, last_seq, with))
+        Request::Resume { seq, session, last_seq, also } => {
+            general(seq, resume_command(session, last_seq, also))
         }
     }
 }
@@ -245,24 +245,24 @@ fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
     Ok(Command::StepMany { steps })
 }
 
-fn resume_command(session: String, last_seq: u64, with: Vec<String>) -> Result<Command, Fault> {
+fn resume_command(session: String, last_seq: u64, also: Vec<String>) -> Result<Command, Fault> {
     let session = name_of("session", session)?;
     let most = limits::CONNECTION_SESSIONS - 1;
-    if with.len() > most {
-        let must = format!("{} sessions; at most {most} are accepted", with.len());
-        return Err(Fault::OutOfRange { field: "with".to_owned(), must });
+    if also.len() > most {
+        let must = format!("{} sessions; at most {most} are accepted", also.len());
+        return Err(Fault::OutOfRange { field: "also".to_owned(), must });
     }
     let mut names = BTreeSet::from([session.clone()]);
     let other = |(index, name): (usize, String)| {
-        let field = format!("with[{index}]");
+        let field = format!("also[{index}]");
         let name = name_of(&field, name)?;
         match names.insert(name.clone()) {
             true => Ok(name),
             false => Err(Fault::SessionTwice { field, name }),
         }
     };
-    let with = with.into_iter().enumerate().map(other).collect::<Result<_, Fault>>()?;
-    Ok(Command::Resume { session, last_seq, with })
+    let also = also.into_iter().enumerate().map(other).collect::<Result<_, Fault>>()?;
+    Ok(Command::Resume { session, last_seq, also })
 }
 
 fn open_command(open: message::Open) -> Result<Command, Fault> {
