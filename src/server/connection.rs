@@ -541,6 +541,8 @@ impl Connection {
         for mut slot in self.slots.drain(..) {
             tracing::info!(?reason, "the connection of a session ended");
             slot.outcome = outcome;
+            // Parks it.
+            drop(slot);
         }
         match &reason {
             Disconnect::Fault(fault) => {

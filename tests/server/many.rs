@@ -178,7 +178,7 @@ async fn a_wrong_list_steps_nothing() {
     let none = json!({ "session": "b" });
     let both = json!({ "session": "b", "pose": pose(1.0), "action": { "acceleration": 0, "curvature": 0 } });
     let unknown = json!({ "session": "b", "pose": pose(1.0), "speed": 3 });
-    let null = json!({ "session": "b", "pose": { "xyz": [0, null, 0], "q": [1, 0, 0, 0] } });
+    let holed = json!({ "session": "b", "pose": { "xyz": [0, null, 0], "q": [1, 0, 0, 0] } });
     let many: Vec<Value> = (0..65).map(|k| to(&format!("s{k}"), 1.0)).collect();
     let first = to("a", 1.0);
     for (steps, code, field) in [
@@ -190,7 +190,7 @@ async fn a_wrong_list_steps_nothing() {
         (json!([first, none]), "invalid_request", "steps[1].pose"),
         (json!([first, both]), "invalid_request", "steps[1].action"),
         (json!([first, unknown]), "invalid_request", "steps[1].speed"),
-        (json!([first, null]), "pose_not_finite", "steps[1].pose.xyz[1]"),
+        (json!([first, holed]), "pose_not_finite", "steps[1].pose.xyz[1]"),
         (json!({ "a": first }), "invalid_request", "steps"),
     ] {
         let answer = agent.ask(json!({ "type": "step_many", "steps": steps })).await;
