@@ -164,8 +164,8 @@ class Many:
         tensors, text = _read_layout(frame, "many")
         try:
             metadata: ManyMetadata = decode(ManyMetadata, parse_json(text, "many"), "many")
-        except (ProtocolError, ValueError) as error:
-            raise BadFrame(str(error)) from error
+        except (ProtocolError, ValueError) as failure:
+            raise BadFrame(str(failure)) from failure
         self.seq = metadata.seq
         self.results: dict[str, Observation | Refused] = {}
         for answer in metadata.answers:
