@@ -98,7 +98,9 @@ pub(crate) enum Fault {
         name: String,
     },
     /// The sessions to resume together did not have one connection.
-    #[error("{field}: the session {name:?} was not on the connection of the first: its last request was {seq}")]
+    #[error(
+        "{field}: the session {name:?} was not on the connection of the first: its last request was {seq}"
+    )]
     OtherConnection {
         /// The field of the request that names it.
         field: String,

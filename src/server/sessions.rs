@@ -238,8 +238,7 @@ impl SessionRegistry {
         owner: &str,
         max_wait: Duration,
     ) -> Result<SlotGuard, Fault> {
-        let unknown =
-            || Fault::UnknownSession { field: field.to_owned(), name: name.to_owned() };
+        let unknown = || Fault::UnknownSession { field: field.to_owned(), name: name.to_owned() };
         let give_up = Instant::now() + max_wait;
         loop {
             let slot = {

@@ -36,14 +36,8 @@ fn absent_fields_have_defaults() {
     let step = parse(&format!(r#"{{"type":"step","seq":2,{pose}}}"#)).unwrap();
     assert!(matches!(step, Request::Step { terminate: false, .. }));
     let reset = parse(r#"{"type":"reset","seq":3}"#).unwrap();
-    let expected = Request::Reset {
-        seq: 3,
-        session: None,
-        seed: 0,
-        start: None,
-        dynamics: None,
-        speed: None,
-    };
+    let expected =
+        Request::Reset { seq: 3, session: None, seed: 0, start: None, dynamics: None, speed: None };
     assert_eq!(reset, expected);
     // Unknown fields of requests are mistakes, not extensions.
     let unknown = format!(r#"{{"type":"step","seq":2,{pose},"speed":3}}"#);
@@ -265,8 +259,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         dynamics: Some(DynamicsChoice::Full(dynamics)),
         speed: Some(8.5),
     };
-    let resume =
-        |also| Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4, also };
+    let resume = |also| Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4, also };
     let alone = SessionStep {
         session: "run-17".into(),
         pose: Some(there),
@@ -308,19 +301,10 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("reset_pose", reset(6, 8, Some(start))),
         ("reset_station", reset(7, 9, Some(station))),
         ("reset_random", drawn),
-        (
-            "switch_version",
-            Request::SwitchVersion { seq: 8, session: None, version: Some(4) },
-        ),
+        ("switch_version", Request::SwitchVersion { seq: 8, session: None, version: Some(4) }),
         ("switch_latest", Request::SwitchVersion { seq: 8, session: None, version: None }),
-        (
-            "snapshot",
-            Request::Snapshot { seq: 9, session: None, name: "before-junction".into() },
-        ),
-        (
-            "restore",
-            Request::Restore { seq: 10, session: None, name: "before-junction".into() },
-        ),
+        ("snapshot", Request::Snapshot { seq: 9, session: None, name: "before-junction".into() }),
+        ("restore", Request::Restore { seq: 10, session: None, name: "before-junction".into() }),
         ("branch", Request::Branch(Branch { seq: 1, from: taken, session: Some("run-18".into()) })),
         ("branch_recorded", Request::Branch(Branch { seq: 1, from: recorded, session: None })),
         ("close", Request::Close { seq: 8, session: None }),

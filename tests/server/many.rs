@@ -128,7 +128,9 @@ async fn one_refusal_does_not_stop_the_others() {
     let mut agent = server.agent().await;
     open_three(&mut agent, ["a", "b", "c"]).await;
     agent.open(json!({ "session": "d" })).await;
-    agent.look(json!({ "type": "step", "session": "d", "pose": pose(1.0), "terminate": true })).await;
+    agent
+        .look(json!({ "type": "step", "session": "d", "pose": pose(1.0), "terminate": true }))
+        .await;
     let tilted = json!({ "xyz": [0, 0, 0], "q": [1, 1, 0, 0] });
     let action = |curvature| json!({ "acceleration": 0, "curvature": curvature });
     let bad = [
@@ -163,7 +165,8 @@ async fn one_refusal_does_not_stop_the_others() {
     // The refused steps have changed nothing.
     let all = agent.step_many(json!(three(["a", "b", "c"], 1))).await;
     assert_eq!(all.seen[2].1.meta["step"], 2, "the first steps of the car");
-    let drawn: u64 = all.seen[..2].iter().map(|(_, seen)| seen.meta["step"].as_u64().unwrap()).sum();
+    let drawn: u64 =
+        all.seen[..2].iter().map(|(_, seen)| seen.meta["step"].as_u64().unwrap()).sum();
     assert_eq!(drawn, 1 + 7 + 2, "{drawn}");
 }
 
@@ -172,7 +175,10 @@ async fn one_refusal_does_not_stop_the_others() {
 async fn a_wrong_list_steps_nothing() {
     let server = TestServer::start().await;
     let mut agent = server.agent().await;
-    refused(&agent.ask(json!({ "type": "step_many", "steps": [to("a", 1.0)] })).await, "session_state");
+    refused(
+        &agent.ask(json!({ "type": "step_many", "steps": [to("a", 1.0)] })).await,
+        "session_state",
+    );
     agent.open(json!({ "session": "a" })).await;
     agent.open(json!({ "session": "b" })).await;
     let none = json!({ "session": "b" });
@@ -219,7 +225,11 @@ async fn the_answer_is_repeated_and_survives_the_connection() {
     let mut agent = server.agent().await;
     let resume = json!({ "type": "resume", "session": "b", "last_seq": seq - 1, "also": ["a"] });
     let resumed = agent.ask(resume).await;
-    assert_eq!((&resumed["type"], &resumed["last_seq"]), (&"resumed".into(), &seq.into()), "{resumed}");
+    assert_eq!(
+        (&resumed["type"], &resumed["last_seq"]),
+        (&"resumed".into(), &seq.into()),
+        "{resumed}"
+    );
     let also = &resumed["also"][0];
     assert_eq!((&also["session"], &also["step"]), (&json!("a"), &json!(1)));
     assert_eq!(also["opened"]["session"], "a");

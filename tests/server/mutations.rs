@@ -210,7 +210,10 @@ async fn mutated_requests_lose_no_session() {
     let took = began.elapsed();
     eprintln!("{REQUESTS} requests in {took:.1?}: {counts:?}");
     assert!(took.as_secs() < 60, "{took:?}");
-    assert!(counts["observation"] > 500 && counts["many"] > 100 && counts["invalid_request"] > 5_000, "{counts:?}");
+    assert!(
+        counts["observation"] > 500 && counts["many"] > 100 && counts["invalid_request"] > 5_000,
+        "{counts:?}"
+    );
     assert!(counts.len() > 12, "{counts:?}");
 
     // The session is the same, and takes steps.

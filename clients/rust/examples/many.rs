@@ -26,7 +26,10 @@ async fn main() -> anyhow::Result<()> {
         anyhow::ensure!(one_hash == many_hash, "the images differ");
         let all = sessions as f64 * f64::from(steps);
         let [one, many] = [all / one_s, all / many_s];
-        println!("round {round}: step_many {one:.0} steps/s, {sessions} connections {many:.0}: {:.2}", one / many);
+        println!(
+            "round {round}: step_many {one:.0} steps/s, {sessions} connections {many:.0}: {:.2}",
+            one / many
+        );
         rates[0].push(one);
         rates[1].push(many);
     }
@@ -35,7 +38,10 @@ async fn main() -> anyhow::Result<()> {
         rates[rates.len() / 2]
     };
     let [one, many] = rates.each_mut().map(median);
-    println!("median: step_many {one:.0} steps/s, {sessions} connections {many:.0}: {:.2}", one / many);
+    println!(
+        "median: step_many {one:.0} steps/s, {sessions} connections {many:.0}: {:.2}",
+        one / many
+    );
     Ok(())
 }
 
@@ -56,7 +62,8 @@ async fn one_connection(
     let mut last = String::new();
     for step in 0..steps {
         let each = names.iter().zip(&starts).enumerate();
-        let moves = each.map(|(k, (name, start))| Movement::Pose(ahead(*start, step, k)).of_session(name));
+        let moves =
+            each.map(|(k, (name, start))| Movement::Pose(ahead(*start, step, k)).of_session(name));
         last.clear();
         for stepped in client.step_many(moves.collect()).await? {
             let refused = |refused| anyhow::anyhow!("{}: {refused:?}", stepped.session);

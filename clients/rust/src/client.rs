@@ -405,11 +405,8 @@ impl Client {
     /// # Errors
     /// As [`Client::step`].
     pub async fn observe(&mut self, poses: &[Pose]) -> Result<Observation, ClientError> {
-        let request = Request::Observe {
-            seq: self.next_seq,
-            session: self.named(),
-            poses: poses.to_vec(),
-        };
+        let request =
+            Request::Observe { seq: self.next_seq, session: self.named(), poses: poses.to_vec() };
         self.exchange_for_observation(&request).await
     }
 
@@ -419,11 +416,8 @@ impl Client {
     /// # Errors
     /// As [`Client::step`].
     pub async fn prefetch(&mut self, poses: &[Pose]) -> Result<(), ClientError> {
-        let request = Request::Prefetch {
-            seq: self.next_seq,
-            session: self.named(),
-            poses: poses.to_vec(),
-        };
+        let request =
+            Request::Prefetch { seq: self.next_seq, session: self.named(), poses: poses.to_vec() };
         match self.exchange(&request).await? {
             Incoming::Answer(Answer::Ok { .. }) => Ok(()),
             other => Err(self.unexpected_answer("ok", &other)),

@@ -205,7 +205,9 @@ impl fmt::Display for Incoming {
             Self::Observation(observation) => {
                 write!(f, "observation {}", observation.metadata().seq)
             }
-            Self::Many(many) => write!(f, "observations of {} sessions {}", many.steps.len(), many.seq),
+            Self::Many(many) => {
+                write!(f, "observations of {} sessions {}", many.steps.len(), many.seq)
+            }
             Self::Answer(answer) => write!(f, "{answer:.200?}"),
         }
     }

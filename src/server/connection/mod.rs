@@ -2,24 +2,32 @@
 //!
 //! A connection may have several sessions. They share its numbers, so that they can be resumed together.
 //!
+//! | file | requests |
+//! |---|---|
+//! | `mod.rs` | the loop, the numbers, and what is for one session |
+//! | `opening.rs` | open, branch, resume |
+//! | `steps.rs` | step, step_many |
+//!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
 //! repeats one that was refused since the last one that was carried out. A request that was carried out is
 //! never carried out again: if its number is repeated, the stored answer is sent again.
 
+mod opening;
+mod steps;
+
 use std::future::pending;
 use std::sync::Arc;
 
-use futures_util::future::{join_all, select_all};
+use futures_util::future::select_all;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions, StepOptions};
+use wildcity_session::{Observation, Outcome, Session, SessionError};
 
 use crate::auth::Grant;
-use crate::convert::{self, AlsoResumed, BranchPoint, Command, DriveRequest, Parsed, SessionStep, Stepped};
+use crate::convert::{self, Command, Parsed};
 use crate::fault::Fault;
 use crate::inbox::Inbox;
 use crate::limits;
-use crate::metrics::Metrics;
 use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
 use crate::socket::{Disconnect, Incoming, Socket};
 use crate::state::ServerState;
@@ -63,10 +71,6 @@ struct Refusal {
 }
 
 const NO_SESSION: Fault = Fault::SessionState("no session is open; send open or resume");
-
-fn new_session_name() -> String {
-    format!("s-{}", uuid::Uuid::now_v7().as_simple())
-}
 
 impl Connection {
     /// Answers requests until the connection ends; returns why it did.
@@ -218,7 +222,7 @@ impl Connection {
                 let slot = self.slot(named)?;
                 let metrics = &self.state.metrics;
                 let session = self.slots[slot].session.as_mut().ok_or(NO_SESSION)?;
-                let frame = step(metrics, session, movement, options).await?;
+                let frame = steps::step(metrics, session, movement, options).await?;
                 self.observation(seq, slot, frame)
             }
             Command::Observe { poses } => {
@@ -274,66 +278,6 @@ impl Connection {
         }
     }
 
-    /// Checks that another session of this name can be opened: the second one of a connection needs one, so that a
-    /// client that has forgotten to close the first is told.
-    fn check_room(&self, name: Option<&String>) -> Result<(), Fault> {
-        let limit = limits::CONNECTION_SESSIONS;
-        if !self.slots.is_empty() && name.is_none() {
-            return Err(Fault::SessionState(
-                "a session is open on this connection; close it first, or name the next one",
-            ));
-        }
-        if self.slots.len() >= limit {
-            return Err(Fault::Busy { what: "sessions on this connection", limit });
-        }
-        Ok(())
-    }
-
-    /// Carries out steps of several sessions at once: their frames wait for the renderer together.
-    async fn step_many(&mut self, seq: u64, steps: Vec<SessionStep>) -> Result<Answer, Fault> {
-        if self.slots.is_empty() {
-            return Err(NO_SESSION);
-        }
-        let open = self.names();
-        let named = |slot: &&SlotGuard| steps.iter().any(|step| step.session == slot.name());
-        let sessions = self.slots.iter().filter(named).filter_map(|slot| slot.session.as_ref());
-        let pixels: u64 = sessions.map(Session::step_pixels).sum();
-        let limit = wildcity_session::limits::ANSWER_PIXELS;
-        if pixels > limit {
-            return Err(SessionError::AnswerTooLarge { field: "steps", pixels, limit }.into());
-        }
-
-        let metrics = &self.state.metrics;
-        let mut slots: Vec<_> = self.slots.iter_mut().map(Some).collect();
-        let carried_out = steps.into_iter().map(|SessionStep { session: name, step: asked }| {
-            let slot = open.iter().position(|known| *known == name);
-            let slot = slot.and_then(|slot| slots[slot].take());
-            let open = &open;
-            async move {
-                let result = async {
-                    let (movement, options) = asked?;
-                    let unknown =
-                        || Fault::NotOnConnection { name: name.clone(), open: open.clone() };
-                    let slot = slot.ok_or_else(unknown)?;
-                    let session = slot.session.as_mut().ok_or(NO_SESSION)?;
-                    let frame = self::step(metrics, session, movement, options).await?;
-                    let frame = Arc::new(convert::observation(seq, session, frame)?);
-                    slot.update_view();
-                    slot.show(&frame);
-                    Ok(frame)
-                };
-                let result = result.await;
-                Stepped { session: name, result }
-            }
-        });
-        let stepped = join_all(carried_out).await;
-        for fault in stepped.iter().filter_map(|step| step.result.as_ref().err()) {
-            tracing::debug!(seq, "refused: {fault}");
-            metrics.refused(&convert::code(fault).0);
-        }
-        Ok(Answer::Many(Arc::new(convert::many(seq, stepped)?)))
-    }
-
     async fn hello(&mut self, seq: u64, client: String) -> Result<Answer, Fault> {
         if self.hello_done {
             return Err(Fault::WrongOrder("hello was sent already"));
@@ -344,124 +288,6 @@ impl Connection {
         let text = convert::welcome(seq, &self.state.limits, engine.backend(), &twins)?;
         tracing::debug!(client, "hello");
         self.hello_done = true;
-        Ok(Answer::Text(text.into()))
-    }
-
-    async fn open(
-        &mut self,
-        seq: u64,
-        name: Option<String>,
-        mut opening: SessionOptions,
-        drive: Option<DriveRequest>,
-    ) -> Result<Answer, Fault> {
-        opening.profile = opening.profile.or(&self.state.profile);
-        self.grant.require_twin(&opening.twin)?;
-        let name = name.unwrap_or_else(new_session_name);
-        let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-        let opened = Session::open(self.state.engine.clone(), name, opening);
-        self.fill(seq, slot, drive, opened).await
-    }
-
-    /// Opens a session in a state of another episode.
-    async fn branch(
-        &mut self,
-        seq: u64,
-        name: Option<String>,
-        from: BranchPoint,
-    ) -> Result<Answer, Fault> {
-        let name = name.unwrap_or_else(new_session_name);
-        let engine = self.state.engine.clone();
-        match from {
-            BranchPoint::Snapshot { session, snapshot } => {
-                let snapshots = self.state.sessions.snapshots(&session, &self.grant.name)?;
-                let from = snapshots.find("from.snapshot", &snapshot)?;
-                self.grant.require_twin(from.twin())?;
-                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-                self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
-            }
-            BranchPoint::Recorded { episode, step } => {
-                let from = Session::recorded(&engine, &episode, step).await?;
-                self.grant.require_twin(from.twin())?;
-                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-                self.fill(seq, slot, None, Session::continued(engine, name, from)).await
-            }
-        }
-    }
-
-    /// Opens a session into a new slot.
-    async fn fill(
-        &mut self,
-        seq: u64,
-        mut slot: SlotGuard,
-        drive: Option<DriveRequest>,
-        opening: impl Future<Output = Result<Session, SessionError>>,
-    ) -> Result<Answer, Fault> {
-        let opened = timeout(self.state.limits.step, opening).await;
-        let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
-        let text = convert::opened(seq, &session, drive.as_ref())?;
-        tracing::info!(session = session.name(), "opened");
-        slot.share_snapshots(&session);
-        slot.session = Some(session);
-        slot.update_view();
-        self.slots.push(slot);
-        Ok(Answer::Text(text.into()))
-    }
-
-    /// Continues sessions of a connection that was lost, or the numbers of one whose `close` was carried out: its answer
-    /// may have been lost.
-    async fn resume(
-        &mut self,
-        seq: u64,
-        name: &str,
-        last_seq: u64,
-        also: &[String],
-    ) -> Result<Answer, Fault> {
-        let max_wait = self.state.limits.step;
-        let owner = &self.grant.name;
-        let check = |answered_seq: u64| {
-            if last_seq > answered_seq {
-                let expected = format!("{answered_seq} is the session's last answer");
-                return Err(Fault::SeqOutOfOrder { field: "last_seq", seq: last_seq, expected });
-            }
-            Ok(())
-        };
-        if also.is_empty()
-            && let Some(closed) = self.state.sessions.closed(name, owner)
-        {
-            check(closed.last.seq)?;
-            let text = convert::resumed(seq, name, closed.last.seq, Err(&closed), &[])?;
-            self.answered_seq = Some(closed.last.seq);
-            self.last = Some(closed.last);
-            return Ok(Answer::Text(text.into()));
-        }
-        let first = self.state.sessions.resume("session", name, owner, max_wait).await?;
-        check(first.answered_seq)?;
-        let mut slots = vec![first];
-        for (index, name) in also.iter().enumerate() {
-            let field = format!("also[{index}]");
-            let slot = self.state.sessions.resume(&field, name, owner, max_wait).await?;
-            // The sessions of a connection share its numbers.
-            if slot.answered_seq != slots[0].answered_seq {
-                let seq = slot.answered_seq;
-                return Err(Fault::OtherConnection { field, name: name.clone(), seq });
-            }
-            slots.push(slot);
-        }
-        let opened: Vec<&Session> =
-            slots.iter().map(|slot| slot.session.as_ref().ok_or(NO_SESSION)).collect::<Result<_, _>>()?;
-        let one = |(name, session)| AlsoResumed { name, session };
-        let resumed_also: Vec<_> =
-            also.iter().map(String::as_str).zip(opened[1..].iter().copied()).map(one).collect();
-        let first = &slots[0];
-        let carried_out = first.last.as_ref().map_or(first.answered_seq, |last| last.seq);
-        let text = convert::resumed(seq, name, carried_out, Ok(opened[0]), &resumed_also)?;
-        for slot in &slots {
-            tracing::info!(session = slot.name(), "resumed");
-            slot.update_view();
-        }
-        self.last = first.last.clone();
-        self.answered_seq = Some(first.answered_seq);
-        self.slots = slots;
         Ok(Answer::Text(text.into()))
     }
 
@@ -555,20 +381,4 @@ impl Connection {
             Disconnect::SendTimedOut => {}
         }
     }
-}
-
-/// Carries out a step of a session, and counts it.
-async fn step(
-    metrics: &Metrics,
-    session: &mut Session,
-    movement: wildcity_sim::Command,
-    options: StepOptions,
-) -> Result<Observation, Fault> {
-    let begun = Instant::now();
-    let done = session.episode().step();
-    let frame = session.follow(movement, options).await?;
-    metrics.steps.inc_by(session.episode().step() - done);
-    metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
-    metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
-    Ok(frame)
 }
