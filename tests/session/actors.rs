@@ -470,17 +470,18 @@ async fn a_recorded_episode_is_rendered_again_with_its_actors() {
             let report = replay(&path, catalog);
             assert_eq!((report.diverged, &report.wrong_value), (None, &None), "{name}-{number}");
             assert_eq!(report.difference, None, "{name}-{number}");
-            assert!(report.images > 6, "{}", report.images);
+            // The second file has the restored state and a step.
+            let images = if number == 1 { 7 } else { 4 };
+            assert!(report.images >= images, "{name}-{number}: {}", report.images);
 
-            // An actor that was recorded elsewhere is seen.
+            // Actors that were recorded elsewhere are seen.
             let text = std::fs::read_to_string(&path).unwrap();
             let mut lines: Vec<Value> =
                 text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-            let has_actors = |line: &&mut Value| {
-                line["kind"] == "actors" && line["actors"].as_array().is_some_and(|a| !a.is_empty())
-            };
-            let last = lines.iter_mut().filter(has_actors).last().unwrap();
-            last["actors"][0][1][1] = json!(last["actors"][0][1][1].as_f64().unwrap() + 0.5);
+            let placed = lines.iter_mut().filter(|line| line["kind"] == "actors");
+            for actor in placed.flat_map(|line| line["actors"].as_array_mut().unwrap()) {
+                actor[1][1] = json!(actor[1][1].as_f64().unwrap() + 0.5);
+            }
             let moved: Vec<String> = lines.iter().map(Value::to_string).collect();
             std::fs::write(&path, moved.join("\n") + "\n").unwrap();
             assert!(replay(&path, catalog).difference.is_some(), "{name}-{number}");
