@@ -101,7 +101,8 @@ async fn steps_of_several_sessions_are_those_of_single_steps() {
             let alone = single.look(request).await;
             assert_eq!(facts(&alone), facts(seen));
             assert_eq!(seen.meta["seq"], agent.seq - 1);
-            let (one, other) = (alone.tensors(), seen.tensors());
+            let one = alone.tensors();
+            let other = seen.tensors();
             assert_eq!(one.len(), other.len());
             for (name, tensor) in one.tensors() {
                 assert_eq!(other.tensor(&name).unwrap(), tensor, "{name}");
@@ -111,7 +112,8 @@ async fn steps_of_several_sessions_are_those_of_single_steps() {
     // The records are the same, and are rendered again.
     for (name, alone) in names.into_iter().zip(singles) {
         let path = |name: &str| server.episodes.path().join(format!("{name}-1.jsonl"));
-        let (many, single) = (lines(&path(name)), lines(&path(alone)));
+        let many = lines(&path(name));
+        let single = lines(&path(alone));
         assert_eq!(many[1..], single[1..], "{name}");
         let steps = many.iter().filter(|line| line["kind"] == "frame").count();
         assert_eq!(steps, 4);

@@ -377,7 +377,8 @@ impl Client {
     ) -> Result<Observation, ClientError> {
         let StepOptions { until_us, notes, terminate } = options;
         let (pose, trajectory, action) = movement.fields();
-        let (seq, session) = (self.next_seq, self.named());
+        let seq = self.next_seq;
+        let session = self.named();
         let request =
             Request::Step { seq, session, pose, trajectory, action, until_us, notes, terminate };
         self.exchange_for_observation(&request).await
@@ -442,7 +443,8 @@ impl Client {
     /// As [`Client::step`].
     pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, ClientError> {
         let ResetOptions { seed, start, dynamics, speed } = options;
-        let (seq, session) = (self.next_seq, self.named());
+        let seq = self.next_seq;
+        let session = self.named();
         let request = Request::Reset { seq, session, seed, start, dynamics, speed };
         self.exchange_for_observation(&request).await
     }
@@ -453,7 +455,8 @@ impl Client {
     /// # Errors
     /// [`Code::UnknownVersion`] if the twin has no such version; otherwise as [`Client::step`].
     pub async fn switch_version(&mut self, version: Option<u64>) -> Result<Switched, ClientError> {
-        let (seq, session) = (self.next_seq, self.named());
+        let seq = self.next_seq;
+        let session = self.named();
         match self.exchange(&Request::SwitchVersion { seq, session, version }).await? {
             Incoming::Answer(Answer::Switched { version, version_hash, profile_hash, .. }) => {
                 Ok(Switched { version, version_hash, profile_hash })
@@ -468,7 +471,8 @@ impl Client {
     /// # Errors
     /// As [`Client::step`].
     pub async fn close(&mut self) -> Result<Summary, ClientError> {
-        let (seq, session) = (self.next_seq, self.named());
+        let seq = self.next_seq;
+        let session = self.named();
         match self.exchange(&Request::Close { seq, session }).await? {
             Incoming::Answer(Answer::Closed { summary, .. }) => {
                 self.remove_selected();
