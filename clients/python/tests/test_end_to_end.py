@@ -62,6 +62,9 @@ RAW = Outputs(encoding="raw", depth=True, opacity=True, normals=True)
 ORIGIN = (52.5162, 13.3777, 34.0)
 """Latitude, longitude and altitude of the twin's origin."""
 
+ZONE_ORIGIN = ("EPSG:32756", 334_900.0, 6_252_300.25, 5.0)
+"""The same of the twin `zone`, in a UTM zone of the southern hemisphere."""
+
 
 @dataclass(frozen=True)
 class Server:
@@ -85,6 +88,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     files = ["--trajectory", str(folder / "log.json"), "--geo", ",".join(map(str, ORIGIN))]
     importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
     subprocess.run([*importing, *twins, *files], check=True, timeout=60)
+    zone = ["--twin", "zone", "--geo", ",".join(map(str, ZONE_ORIGIN))]
+    subprocess.run([*importing[:3], *zone, *twins], check=True, timeout=60)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
     serving += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
@@ -97,7 +102,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
     with connect(server.url) as client:
-        assert [twin.name for twin in client.welcome.twins] == ["corridor"]
+        assert [twin.name for twin in client.welcome.twins] == ["corridor", "zone"]
         start = Station("log", 2.0)
         with client.open("corridor", rig=PAIR, outputs=RAW, start=start, seed=3) as session:
             opened = session.opened
@@ -158,6 +163,22 @@ def test_knows_where_it_is_on_the_earth(connect: Connect, server: Server) -> Non
             ahead = to_earth.transform(x + math.cos(yaw), y + math.sin(yaw), 1.0)
             azimuth = geod.inv(east, north, ahead[0], ahead[1])[0]
             assert (geo.heading - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-3)
+
+
+def test_knows_where_it_is_in_a_utm_zone(connect: Connect, server: Server) -> None:
+    zone, easting, northing, altitude = ZONE_ORIGIN
+    projection = pyproj.Proj(zone)
+    with connect(server.url) as client, client.open("zone", rig=PAIR, outputs=RAW) as session:
+        for x, y, yaw in ((0.0, 0.0, 0.0), (1500.0, -800.0, 2.0), (-20_000.0, 9000.0, -0.5)):
+            pose = Pose((x, y, 1.0), (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)))
+            geo = session.step(pose).metadata.geo
+            assert geo is not None
+            east, north = projection(easting + x, northing + y, inverse=True)
+            assert (geo.longitude, geo.latitude) == pytest.approx((east, north), abs=1e-11)
+            assert geo.altitude == pytest.approx(altitude + 1.0, abs=1e-9)
+            convergence = projection.get_factors(east, north).meridian_convergence
+            heading = 90.0 - math.degrees(yaw) + convergence
+            assert (geo.heading - heading + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-6)
 
 
 def test_steps_several_sessions_at_once(connect: Connect, server: Server) -> None:
@@ -446,7 +467,7 @@ def test_http_routes(server: Server) -> None:
     assert server.get("/readyz")[0] == 200
     status, body = server.get("/v1/twins")
     assert status == 200
-    (twin,) = json.loads(body)["twins"]
+    twin, _ = json.loads(body)["twins"]
     assert (twin["name"], twin["gaussians"]) == ("corridor", 40_000)
 
 
