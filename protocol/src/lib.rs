@@ -11,6 +11,7 @@
 //! let pose = Pose { xyz: [13.0, -3.25, 0.0], q: [1.0, 0.0, 0.0, 0.0] };
 //! let step = Request::Step {
 //!     seq: 3,
+//!     session: None,
 //!     pose: Some(pose),
 //!     trajectory: None,
 //!     action: None,

@@ -13,12 +13,16 @@
 //! 4. For each image `camera/<name>/rgb`, u8.
 //! 5. If requested, earlier frames: `camera/<name>/history/<back>/rgb`, u8.
 //!
+//! The answer to `step_many` has the same layout: its header has `{"many": "<JSON of ManyMetadata>"}`, and its tensors are
+//! u8 `[n]`, each a whole observation.
+//!
 //! Image names start with `pose/<k>/` if there are several poses (`observe`). The length of the header is a
 //! multiple of 8 and floats come first, so floats are aligned to 4 bytes, and instances to 2, and can be read in place.
 
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Lens, Windshield};
+use crate::error::Code;
 use crate::message::{Encoding, Pose};
 
 /// Everything that an observation holds beside its tensors.
@@ -52,6 +56,9 @@ pub struct ObservationMetadata {
     pub frame_hash: String,
     /// State of the ego at this time.
     pub ego: Ego,
+    /// Place and heading of the ego on the earth. Only if the twin says where it lies.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub geo: Option<Geo>,
     /// The images, in order. Empty between two decisions.
     pub images: Vec<Image>,
     /// Earlier frames of the same cameras, camera by camera, newest first. Absent if there are none.
@@ -70,6 +77,44 @@ pub struct ObservationMetadata {
     pub timings: Timings,
     /// Memory of the server, and how long the observation waited for loading.
     pub residency: Residency,
+}
+
+/// What the answer to `step_many` holds beside the observations.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(rename = "Many"))]
+pub struct ManyMetadata {
+    /// Number of the request.
+    pub seq: u64,
+    /// What each step gave, in the order of the request.
+    pub answers: Vec<SessionAnswer>,
+}
+
+/// What one step of a `step_many` gave: an observation or a refusal.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct SessionAnswer {
+    /// Name of the session.
+    pub session: String,
+    /// Name of the tensor that is the observation. Absent if the step was refused.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tensor: Option<String>,
+    /// Why the step was refused. The session is as it was before.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<SessionRefusal>,
+}
+
+/// Why a step of a `step_many` was refused.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct SessionRefusal {
+    /// Error code.
+    pub code: Code,
+    /// What went wrong and how to fix it, for people.
+    pub message: String,
+    /// The field at fault, for example `steps[3].pose.q`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
 }
 
 /// State of the ego vehicle at one time.
@@ -186,6 +231,20 @@ pub struct Actor {
     pub velocity: [f64; 3],
     /// Yaw rate, positive to the left, in rad/s.
     pub yaw_rate: f64,
+}
+
+/// Place and heading of the ego on the earth (WGS84).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Geo {
+    /// Latitude, in degrees, positive to the north.
+    pub latitude: f64,
+    /// Longitude, in degrees, positive to the east.
+    pub longitude: f64,
+    /// Height of the rig's origin above the ellipsoid, in metres.
+    pub altitude: f64,
+    /// Direction of the rig's x axis, in degrees from true north to the east, 0 to 360.
+    pub heading: f64,
 }
 
 /// One image.

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 
 use wildcity_push::{SourceAxes, SourceScene, provenance, read_scene};
+use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{RecordFormat, RenderProfile};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
@@ -60,6 +61,12 @@ pub(super) struct Import {
     /// has only the drives that its own import names.
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
+
+    /// Where the origin of the twin lies on the earth, so that observations have latitude, longitude and heading:
+    /// LATITUDE,LONGITUDE[,ALTITUDE] in degrees (x is east there, y north), or EPSG:CODE,EASTING,NORTHING[,ALTITUDE]
+    /// for a twin in a UTM zone. Altitudes are above the WGS84 ellipsoid.
+    #[arg(long, value_name = "ANCHOR", allow_hyphen_values = true)]
+    geo: Option<GeoAnchor>,
 
     #[command(flatten)]
     sky: SkySource,
@@ -150,6 +157,7 @@ impl Import {
             rig,
             trajectories,
             sky: sky.map(NewSky::Put),
+            geo: self.geo.clone(),
             provenance: provenance(&[hash], axes.options().to_vec(), levels),
             storage: StorageOptions { record: self.record, levels },
         };

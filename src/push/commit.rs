@@ -21,7 +21,7 @@ pub(crate) struct NewContent<'a> {
 }
 
 /// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push
-/// of all cells replaces the twin, but keeps the rig, the trajectories and the sky of the base.
+/// of all cells replaces the twin, but keeps rig, trajectories, sky and place on the earth of the base.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,
@@ -47,8 +47,14 @@ pub(crate) fn commit(
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
             let profile = (!request.profile.is_empty()).then_some(profile);
-            let change =
-                VersionChange { profile, rig: None, trajectories: None, sky: None, provenance };
+            let change = VersionChange {
+                profile,
+                rig: None,
+                trajectories: None,
+                sky: None,
+                geo: None,
+                provenance,
+            };
             commit.change(base.number, change)?
         }
         _ => {
@@ -57,6 +63,7 @@ pub(crate) fn commit(
                 rig: old.and_then(|old| old.rig.clone()),
                 trajectories: old.map(|old| old.trajectories.clone()).unwrap_or_default(),
                 sky: old.and_then(|old| old.sky.clone()).map(NewSky::Kept),
+                geo: old.and_then(|old| old.geo.clone()),
                 provenance,
             };
             commit.replace(request.base, settings)?

@@ -151,6 +151,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::OutcomeUnknown { .. }
         | StoreError::Url { .. }
         | StoreError::Rig(_)
+        | StoreError::Geo(_)
         | StoreError::Trajectory(_)
         | StoreError::DuplicateTrajectory { .. } => false,
     }

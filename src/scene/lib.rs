@@ -14,6 +14,7 @@ pub mod actor;
 pub mod appearance;
 pub mod chunk;
 pub mod gaussian;
+pub mod geo;
 pub mod geometry;
 pub mod lod;
 pub mod manifest;

@@ -7,6 +7,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::geo::GeoAnchor;
 use crate::geometry::Bounds;
 
 use super::{RecordFormat, RenderProfile, Rig, Trajectory};
@@ -38,6 +39,9 @@ pub struct Manifest {
     /// The twin's sky, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sky: Option<SkyRef>,
+    /// Where the world lies on the earth, if that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub geo: Option<GeoAnchor>,
     /// Where the version comes from.
     pub provenance: Provenance,
 }

@@ -68,6 +68,8 @@ pub(crate) enum Fault {
     /// There is no session to resume.
     #[error("there is no session {name:?} to resume; it ended, or was never opened")]
     UnknownSession {
+        /// The field of the request that names it.
+        field: String,
         /// The name asked for.
         name: String,
     },
@@ -78,6 +80,34 @@ pub(crate) enum Fault {
         field: &'static str,
         /// The name asked for.
         name: String,
+    },
+    /// The connection does not have that session.
+    #[error("this connection has no session {name:?}; it has {}", list(open))]
+    NotOnConnection {
+        /// The name asked for.
+        name: String,
+        /// The names of its sessions.
+        open: Vec<String>,
+    },
+    /// A list names a session twice.
+    #[error("{field}: the session {name:?} is in the list already")]
+    SessionTwice {
+        /// The second entry.
+        field: String,
+        /// Its name.
+        name: String,
+    },
+    /// The sessions to resume together did not have one connection.
+    #[error(
+        "{field}: the session {name:?} was not on the connection of the first: its last request was {seq}"
+    )]
+    OtherConnection {
+        /// The field of the request that names it.
+        field: String,
+        /// The name asked for.
+        name: String,
+        /// Number of its last request.
+        seq: u64,
     },
     /// The twin has no trajectory of this name.
     #[error("the twin has no trajectory {name:?}; it has {}", known.join(", "))]
@@ -318,6 +348,13 @@ impl Fault {
                 | Self::Replaced
                 | Self::ShuttingDown
         )
+    }
+}
+
+fn list(names: &[String]) -> String {
+    match names {
+        [] => "none".to_owned(),
+        names => names.join(", "),
     }
 }
 

@@ -8,6 +8,9 @@ pub const LISTEN: &str = "127.0.0.1:8080";
 /// WebSocket connections at once.
 pub const CONNECTIONS: usize = 1024;
 
+/// Sessions of one connection.
+pub const CONNECTION_SESSIONS: usize = 64;
+
 /// How long a connection may be silent between requests before it is closed.
 pub const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
 

@@ -109,6 +109,17 @@ pub(crate) enum Answer {
     Text(Arc<str>),
     /// An observation.
     Observation(Arc<Observation>),
+    /// Observations of several sessions.
+    Many(Arc<ManyAnswer>),
+}
+
+/// The answer to steps of several sessions.
+#[derive(Debug)]
+pub(crate) struct ManyAnswer {
+    /// What is sent before the observations.
+    pub(crate) header: Vec<u8>,
+    /// The observations, in order.
+    pub(crate) frames: Vec<Arc<Observation>>,
 }
 
 /// A connection's exclusive access to a slot. Dropping it parks the session, or removes a closed one.
@@ -215,18 +226,19 @@ impl SessionRegistry {
         self.closed.lock().get(name).filter(|session| session.owner == owner).cloned()
     }
 
-    /// Takes over the slot of a session, even if its old connection still holds it: after a network
+    /// Takes over the slot of a session, which `field` of a request names, even if its old connection still holds it: after a network
     /// failure, the client notices long before the server that the old connection is dead.
     ///
     /// # Errors
     /// There is no such session of this owner, or its last step runs for longer than `max_wait`.
     pub(crate) async fn resume(
         self: &Arc<Self>,
+        field: &str,
         name: &str,
         owner: &str,
         max_wait: Duration,
     ) -> Result<SlotGuard, Fault> {
-        let unknown = || Fault::UnknownSession { name: name.to_owned() };
+        let unknown = || Fault::UnknownSession { field: field.to_owned(), name: name.to_owned() };
         let give_up = Instant::now() + max_wait;
         loop {
             let slot = {
@@ -350,6 +362,11 @@ impl SessionRegistry {
 }
 
 impl SlotGuard {
+    /// Name of the session.
+    pub(crate) fn name(&self) -> &str {
+        &self.name
+    }
+
     /// Lets other sessions be opened from the snapshots of this slot's new session.
     pub(crate) fn share_snapshots(&self, session: &Session) {
         if let Some(entry) = self.registry.entries.lock().get_mut(&self.name) {
@@ -357,11 +374,9 @@ impl SlotGuard {
         }
     }
 
-    /// Shows an answer to the watchers of the session, if it is an observation and there are any.
-    pub(crate) fn show(&self, answer: &Answer) {
-        if let Answer::Observation(observation) = answer {
-            self.newest.show(observation);
-        }
+    /// Shows an observation to the watchers of the session, if there are any.
+    pub(crate) fn show(&self, observation: &Arc<Observation>) {
+        self.newest.show(observation);
     }
 
     /// Updates the part of the session's state that is visible to the rest of the server.

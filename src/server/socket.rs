@@ -110,31 +110,36 @@ impl Socket {
 
     /// Sends a text message.
     pub(crate) async fn send_text(&mut self, text: &str) -> Result<(), Disconnect> {
-        self.send(FINAL_TEXT, text.as_bytes()).await
+        self.send(FINAL_TEXT, &[text.as_bytes()]).await
     }
 
-    /// Sends a binary message.
-    pub(crate) async fn send_binary(&mut self, payload: &[u8]) -> Result<(), Disconnect> {
-        self.send(FINAL_BINARY, payload).await
+    /// Sends a binary message of these parts.
+    pub(crate) async fn send_binary(&mut self, parts: &[&[u8]]) -> Result<(), Disconnect> {
+        self.send(FINAL_BINARY, parts).await
     }
 
     /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes into
     /// its own buffer first. After an error the connection cannot be used.
-    async fn send(&mut self, first_byte: u8, payload: &[u8]) -> Result<(), Disconnect> {
+    async fn send(&mut self, first_byte: u8, payload: &[&[u8]]) -> Result<(), Disconnect> {
         if self.peer_closed {
             return Err(Disconnect::PeerLeft);
         }
         let send = async {
             // A pong may still be in the library's buffer; it must be sent whole before this frame begins.
             self.stream.flush().await.map_err(io::Error::other)?;
-            let header = frame_header(first_byte, payload.len());
+            let header = frame_header(first_byte, payload.iter().map(|part| part.len()).sum());
             let stream = self.stream.get_mut();
-            let parts = [IoSlice::new(&header), IoSlice::new(payload)];
-            let written = stream.write_vectored(&parts).await?;
-            if let Some(rest) = header.get(written..) {
-                stream.write_all(rest).await?;
+            let all = std::iter::once(&*header).chain(payload.iter().copied());
+            let mut all: Vec<IoSlice<'_>> = all.map(IoSlice::new).collect();
+            let mut rest = &mut all[..];
+            while !rest.is_empty() {
+                let written = stream.write_vectored(rest).await?;
+                if written == 0 {
+                    return Err(io::ErrorKind::WriteZero.into());
+                }
+                IoSlice::advance_slices(&mut rest, written);
             }
-            stream.write_all(&payload[written.saturating_sub(header.len())..]).await
+            io::Result::Ok(())
         };
         match timeout(self.send_timeout, send).await {
             Ok(Ok(())) => Ok(()),
@@ -152,7 +157,7 @@ impl Socket {
             if let Some(CloseStatus { code, reason }) = status {
                 let payload = [&code.to_be_bytes(), reason.as_bytes()].concat();
                 // Sending fails if the client has left, or has sent its own Close frame.
-                let _ = self.send(FINAL_CLOSE, &payload).await;
+                let _ = self.send(FINAL_CLOSE, &[&payload]).await;
             }
             let mut stream = self.stream.into_inner();
             stream.shutdown().await?;

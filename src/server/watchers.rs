@@ -86,7 +86,7 @@ async fn send_all(socket: &mut Socket, watch: &mut Watch) -> Disconnect {
                 }
                 let newest = watch.receiver.borrow_and_update().clone();
                 let Some(observation) = newest else { continue };
-                if let Err(reason) = socket.send_binary(observation.buffer.bytes()).await {
+                if let Err(reason) = socket.send_binary(&[observation.buffer.bytes()]).await {
                     return reason;
                 }
                 next = Instant::now() + limits::WATCH_PERIOD;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio::time::timeout;
-use wildcity_client::{Client, ClientError};
+use wildcity_client::{Action, Client, ClientError, Movement};
 use wildcity_protocol::error::Code;
 use wildcity_protocol::message::{Open, Outcome, Pose, Request};
 
@@ -63,6 +63,80 @@ async fn a_whole_session() {
     assert!(matches!(requests[4], Request::Step { terminate: true, .. }));
 }
 
+/// With two sessions, requests name theirs, and both are resumed together.
+#[tokio::test]
+async fn several_sessions_of_one_connection() {
+    let other = Reply::Text(
+        String::from_utf8(read("vectors/answers/opened.json"))
+            .unwrap()
+            .replace("\"seq\": 1,", "\"seq\": 2,")
+            .replace("run-17", "run-18"),
+    );
+    let many = Reply::Binary(read("vectors/many/two.bin"));
+    let first = vec![HELLO, OPEN, other, many, OBSERVATION, Reply::HangUp];
+    let second = vec![HELLO, Reply::Golden("resumed_also"), OBSERVATION, Reply::Golden("closed")];
+    let (server, mut client) = opened(vec![first, second]).await;
+    client.open(Open { session: Some("run-18".into()), ..Open::twin("street") }).await.unwrap();
+    assert_eq!(client.sessions(), ["run-17", "run-18"]);
+
+    let action = Action { acceleration: -1.5, curvature: 0.025 };
+    let steps = vec![
+        Movement::Pose(HERE).of_session("run-17"),
+        Movement::Action(action).of_session("run-18"),
+    ];
+    let stepped = client.step_many(steps).await.unwrap();
+    let names: Vec<_> = stepped.iter().map(|step| &*step.session).collect();
+    assert_eq!(names, ["run-17", "run-18"]);
+    let observation = stepped[0].result.as_ref().unwrap();
+    observation.verify().unwrap();
+    assert_eq!(observation.frame()[..], super::observations::raw_frame().bytes());
+    let refused = stepped[1].result.as_ref().unwrap_err();
+    assert_eq!(refused.code, Code::SessionState);
+    assert_eq!(refused.field.as_deref(), Some("steps[1].action"));
+
+    client.select("run-17");
+    client.step(HERE).await.unwrap();
+    client.step(HERE).await.unwrap_err();
+    let resumed = client.reconnect().await.unwrap().unwrap();
+    assert_eq!(resumed.also[0].step, 3);
+    client.step(HERE).await.unwrap();
+    client.close().await.unwrap();
+    assert_eq!(client.sessions(), ["run-18"]);
+    drop(client);
+
+    let requests = server.requests().await;
+    assert_eq!(seqs(&requests[0]), [0, 1, 2, 3, 4, 5]);
+    assert_eq!(seqs(&requests[1]), [0, 1, 5, 6]);
+    assert!(matches!(&requests[0][3], Request::StepMany { steps, .. } if steps.len() == 2));
+    let named = |request: &Request| match request {
+        Request::Step { session, .. } | Request::Close { session, .. } => session.clone(),
+        _ => None,
+    };
+    for request in [&requests[0][4], &requests[1][2], &requests[1][3]] {
+        assert_eq!(named(request).as_deref(), Some("run-17"));
+    }
+    let also = vec!["run-18".to_owned()];
+    let resume = Request::Resume { seq: 1, session: "run-17".to_owned(), last_seq: 4, also };
+    assert_eq!(requests[1][1], resume);
+}
+
+/// A message that is not what its header says is refused.
+#[tokio::test]
+async fn damaged_answers_to_step_many() {
+    let whole = read("vectors/many/two.bin");
+    let swapped = String::from_utf8_lossy(&whole[8..]).find("run-17").unwrap() + 8;
+    let mut other_session = whole.clone();
+    other_session[swapped + 5] = b'9';
+    for bytes in [whole[..whole.len() - 1].to_vec(), other_session] {
+        let script = vec![HELLO, OPEN, OBSERVATION, Reply::Binary(bytes)];
+        let (_server, mut client) = opened(vec![script]).await;
+        client.step(HERE).await.unwrap();
+        let steps = vec![Movement::Pose(HERE).of_session("run-17")];
+        let refused = client.step_many(steps).await.unwrap_err();
+        assert!(matches!(refused, ClientError::Frame(_)), "{refused}");
+    }
+}
+
 #[tokio::test]
 async fn a_refused_request_keeps_its_number() {
     let (server, mut client) =
@@ -107,7 +181,7 @@ async fn a_lost_answer_is_fetched_after_reconnecting() {
     assert_eq!(seqs(&requests[0]), [0, 1, 2, 3, 4]);
     assert_eq!(seqs(&requests[1]), [0, 1, 4, 5]);
     let session = "run-17".to_owned();
-    assert_eq!(requests[1][1], Request::Resume { seq: 1, session, last_seq: 3 });
+    assert_eq!(requests[1][1], Request::Resume { seq: 1, session, last_seq: 3, also: Vec::new() });
 }
 
 #[tokio::test]

@@ -138,7 +138,8 @@ pub(crate) fn seq_of(request: &Request) -> u64 {
         | Request::Prefetch { seq, .. }
         | Request::Reset { seq, .. }
         | Request::SwitchVersion { seq, .. }
-        | Request::Close { seq }
+        | Request::Close { seq, .. }
+        | Request::StepMany { seq, .. }
         | Request::Snapshot { seq, .. }
         | Request::Restore { seq, .. }
         | Request::Resume { seq, .. } => *seq,

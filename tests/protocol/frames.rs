@@ -4,7 +4,7 @@ use serde_json::{Map, Value, json};
 use wildcity_protocol::camera::{Windshield, WindshieldReference};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
 use wildcity_protocol::observation::{
-    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+    Ego, Geo, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
 };
 
 use super::messages::{front, rear};
@@ -36,7 +36,8 @@ pub(crate) struct Recipe {
     pub(crate) history: u64,
     pub(crate) normals: bool,
     pub(crate) instances: bool,
-    /// Whether the images come with their trust, and the first camera is behind a windshield.
+    /// Whether the images come with their trust, the first camera is behind a windshield, and the place on the earth is
+    /// known.
     pub(crate) trust_and_windshield: bool,
 }
 
@@ -164,8 +165,14 @@ impl Frame {
                 });
             }
         }
+        let geo = recipe.trust_and_windshield.then_some(Geo {
+            latitude: 52.5,
+            longitude: 13.375,
+            altitude: 34.125,
+            heading: 16.25,
+        });
         Self {
-            metadata: ObservationMetadata { history, ..observation(seq, images, frame_hash) },
+            metadata: ObservationMetadata { history, geo, ..observation(seq, images, frame_hash) },
             tensors,
         }
     }
@@ -322,6 +329,7 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationM
             steering: Some(-0.0625),
             history_count: 3,
         },
+        geo: None,
         images,
         history: Vec::new(),
         timings: Timings {

@@ -36,7 +36,9 @@ fn absent_fields_have_defaults() {
     let step = parse(&format!(r#"{{"type":"step","seq":2,{pose}}}"#)).unwrap();
     assert!(matches!(step, Request::Step { terminate: false, .. }));
     let reset = parse(r#"{"type":"reset","seq":3}"#).unwrap();
-    assert_eq!(reset, Request::Reset { seq: 3, seed: 0, start: None, dynamics: None, speed: None });
+    let expected =
+        Request::Reset { seq: 3, session: None, seed: 0, start: None, dynamics: None, speed: None };
+    assert_eq!(reset, expected);
     // Unknown fields of requests are mistakes, not extensions.
     let unknown = format!(r#"{{"type":"step","seq":2,{pose},"speed":3}}"#);
     assert!(parse(&unknown).unwrap_err().to_string().contains("speed"));
@@ -206,6 +208,7 @@ fn requests() -> Vec<(&'static str, Request)> {
     let model = Open { seq: 1, dynamics: model, ..Open::twin("street") };
     let step = |seq, pose, trajectory, action, terminate| Request::Step {
         seq,
+        session: None,
         pose,
         trajectory,
         action,
@@ -217,6 +220,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         |time_us, x_m| TimedPose { time_us, pose: pose([x_m, 0.5, 0.0], [1.0, 0.0, 0.0, 0.0]) };
     let until = Request::Step {
         seq: 3,
+        session: None,
         pose: None,
         trajectory: Some(vec![ahead(500_000, 1.5), ahead(1_000_000, 3.25)]),
         action: None,
@@ -231,7 +235,14 @@ fn requests() -> Vec<(&'static str, Request)> {
     let start = Start::Pose { pose: there };
     let client = ClientInfo { name: "golden".into(), version: "0.1.0".into() };
     let protocols = vec![PROTOCOL.to_owned()];
-    let reset = |seq, seed, start| Request::Reset { seq, seed, start, dynamics: None, speed: None };
+    let reset = |seq, seed, start| Request::Reset {
+        seq,
+        session: None,
+        seed,
+        start,
+        dynamics: None,
+        speed: None,
+    };
     let random = RandomStart {
         trajectory: Some("log".into()),
         from_m: Some(20.0),
@@ -242,11 +253,34 @@ fn requests() -> Vec<(&'static str, Request)> {
     let dynamics = Dynamics { model: DynamicsModel::Kinematic, speed: 3.0, reverse: false };
     let drawn = Request::Reset {
         seq: 8,
+        session: None,
         seed: 10,
         start: Some(Start::Random { random }),
         dynamics: Some(DynamicsChoice::Full(dynamics)),
         speed: Some(8.5),
     };
+    let resume = |also| Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4, also };
+    let alone = SessionStep {
+        session: "run-17".into(),
+        pose: Some(there),
+        trajectory: None,
+        action: None,
+        until_us: None,
+        notes: None,
+        terminate: false,
+    };
+    let many = vec![
+        alone.clone(),
+        SessionStep {
+            session: "run-18".into(),
+            pose: None,
+            action: Some(action),
+            until_us: Some(200_000),
+            notes: Some(json!({ "confidence": 0.75 })),
+            terminate: true,
+            ..alone
+        },
+    ];
     let taken =
         BranchPoint::Snapshot { session: "run-17".into(), snapshot: "before-junction".into() };
     let recorded = BranchPoint::Recorded { episode: "run-17-1".into(), step: 40 };
@@ -261,20 +295,23 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("step_trajectory", step(3, None, Some(planned), None, false)),
         ("step_action", step(3, None, None, Some(action), false)),
         ("step_until", until),
-        ("observe", Request::Observe { seq: 5, poses: vec![there, above] }),
-        ("prefetch", Request::Prefetch { seq: 6, poses: vec![there, above] }),
+        ("observe", Request::Observe { seq: 5, session: None, poses: vec![there, above] }),
+        ("prefetch", Request::Prefetch { seq: 6, session: None, poses: vec![there, above] }),
         ("reset", reset(2, 7, None)),
         ("reset_pose", reset(6, 8, Some(start))),
         ("reset_station", reset(7, 9, Some(station))),
         ("reset_random", drawn),
-        ("switch_version", Request::SwitchVersion { seq: 8, version: Some(4) }),
-        ("switch_latest", Request::SwitchVersion { seq: 8, version: None }),
-        ("snapshot", Request::Snapshot { seq: 9, name: "before-junction".into() }),
-        ("restore", Request::Restore { seq: 10, name: "before-junction".into() }),
+        ("switch_version", Request::SwitchVersion { seq: 8, session: None, version: Some(4) }),
+        ("switch_latest", Request::SwitchVersion { seq: 8, session: None, version: None }),
+        ("snapshot", Request::Snapshot { seq: 9, session: None, name: "before-junction".into() }),
+        ("restore", Request::Restore { seq: 10, session: None, name: "before-junction".into() }),
         ("branch", Request::Branch(Branch { seq: 1, from: taken, session: Some("run-18".into()) })),
         ("branch_recorded", Request::Branch(Branch { seq: 1, from: recorded, session: None })),
-        ("close", Request::Close { seq: 8 }),
-        ("resume", Request::Resume { seq: 1, session: "run-17".into(), last_seq: 4 }),
+        ("close", Request::Close { seq: 8, session: None }),
+        ("close_named", Request::Close { seq: 8, session: Some("run-17".into()) }),
+        ("resume", resume(Vec::new())),
+        ("resume_also", resume(vec!["run-18".into()])),
+        ("step_many", Request::StepMany { seq: 3, steps: many }),
     ]
 }
 
@@ -369,6 +406,26 @@ fn answers() -> Vec<(&'static str, Answer)> {
         step: 2,
         time_us: 200_000,
         opened: Some(Box::new(Opened { trajectory: None, ..opened.clone() })),
+        also: Vec::new(),
+    };
+    let other = ResumedSession {
+        session: "run-18".to_owned(),
+        step: 3,
+        time_us: 300_000,
+        opened: Box::new(Opened {
+            session: "run-18".to_owned(),
+            trajectory: None,
+            ..opened.clone()
+        }),
+    };
+    let resumed_also = Answer::Resumed {
+        seq: 1,
+        session: "run-17".to_owned(),
+        last_seq: 4,
+        step: 2,
+        time_us: 200_000,
+        opened: Some(Box::new(Opened { trajectory: None, ..opened.clone() })),
+        also: vec![other],
     };
     let summary = Summary {
         outcome: Outcome::OffModel,
@@ -398,6 +455,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("welcome", welcome),
         ("opened", Answer::Opened(Box::new(opened))),
         ("resumed", resumed),
+        ("resumed_also", resumed_also),
         ("ok", Answer::Ok { seq: 6 }),
         ("switched", switched),
         ("closed", Answer::Closed { seq: 8, summary }),

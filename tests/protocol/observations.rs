@@ -2,7 +2,9 @@
 
 use serde_json::{Value, json};
 use wildcity_client::{FrameError, ImageView, Observation};
+use wildcity_protocol::error::Code;
 use wildcity_protocol::message::Encoding;
+use wildcity_protocol::observation::{ManyMetadata, SessionAnswer, SessionRefusal};
 
 use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
@@ -82,6 +84,37 @@ fn the_last_frames_of_a_camera_are_in_the_order_they_were_taken() {
     wrong.tensors.pop();
     let found = Observation::decode(wrong.bytes());
     assert!(matches!(found, Err(FrameError::Missing { name }) if name.contains("history/2")));
+}
+
+/// The golden answer to the golden `step_many`: one observation and one refusal.
+#[test]
+fn observations_of_several_sessions() {
+    let frame = raw_frame().bytes();
+    let metadata = ManyMetadata {
+        seq: 3,
+        answers: vec![
+            SessionAnswer {
+                session: "run-17".into(),
+                tensor: Some("session/run-17".into()),
+                error: None,
+            },
+            SessionAnswer {
+                session: "run-18".into(),
+                tensor: None,
+                error: Some(SessionRefusal {
+                    code: Code::SessionState,
+                    message: "action moves a car; the dynamics are teleport".into(),
+                    field: Some("steps[1].action".into()),
+                }),
+            },
+        ],
+    };
+    let header = json!({
+        "__metadata__": { "many": serde_json::to_string(&metadata).unwrap() },
+        "session/run-17": { "dtype": "U8", "shape": [frame.len()], "data_offsets": [0, frame.len()] },
+    });
+    check_file("vectors/many/two.bin", &frames::assemble(&header.to_string(), &frame));
+    check_json("vectors/many/two.expected.json", &metadata);
 }
 
 #[test]

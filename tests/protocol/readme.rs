@@ -18,8 +18,9 @@ fn every_json_example_is_a_message() {
         ("answer", parses::<Answer>),
         ("observation", parses::<ObservationMetadata>),
     ];
-    // Every request has one example `open` three, `reset` and `branch` two; `step` has four. Every answer has one.
-    assert_eq!(counted(page, kinds), [19, 7, 1]);
+    // Every request has one example `open` three, `reset`, `branch`, `close` and `resume` two; `step` has four. Every
+    // answer has one.
+    assert_eq!(counted(page, kinds), [22, 7, 1]);
     let kinds: [Kind; 7] = [
         ("new upload", parses::<http::NewUpload>),
         ("upload", parses::<http::Upload>),

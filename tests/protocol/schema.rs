@@ -17,6 +17,7 @@ fn schemas_are_up_to_date() {
     check::<message::Answer>("answer");
     check::<message::Drive>("drive");
     check::<observation::ObservationMetadata>("observation");
+    check::<observation::ManyMetadata>("many");
     check::<http::Upload>("upload");
     check::<http::Push>("push");
     check::<http::VersionInfo>("version");

@@ -16,6 +16,7 @@ mod drives;
 mod ego;
 mod http;
 mod leases;
+mod many;
 mod mutations;
 mod observation;
 mod page;

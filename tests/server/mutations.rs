@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use serde_json::{Value, json};
 
-use crate::support::{Agent, Reply, Seen, TestServer, pose};
+use crate::support::{Agent, Reply, TestServer, pose};
 
 const REQUESTS: usize = 20_000;
 
@@ -43,6 +43,11 @@ fn valid(seq: u64) -> Vec<Value> {
         json!({ "type": "step", "seq": seq, "pose": pose(1.0), "terminate": false }),
         json!({ "type": "step", "seq": seq, "trajectory": planned }),
         json!({ "type": "step", "seq": seq, "action": { "acceleration": 1.0, "curvature": 0.01 } }),
+        json!({ "type": "step_many", "seq": seq, "steps": [
+            { "session": "mutated", "pose": pose(1.0), "notes": { "a": 1 } },
+            { "session": "gone", "trajectory": planned, "until_us": 100_000, "terminate": false },
+        ] }),
+        json!({ "type": "step", "seq": seq, "session": "mutated", "pose": pose(1.0) }),
         json!({ "type": "observe", "seq": seq, "poses": [pose(1.0), pose(2.0)] }),
         json!({ "type": "prefetch", "seq": seq, "poses": [pose(1.0), pose(2.0)] }),
         json!({ "type": "reset", "seq": seq, "seed": 3, "start": { "trajectory": "log", "station_m": 2.5 } }),
@@ -149,6 +154,16 @@ fn mutated(random: &mut Random, seq: u64) -> String {
     text
 }
 
+/// The kind of a binary answer, and its number.
+fn observed(bytes: &[u8]) -> (&'static str, u64) {
+    let (_, header) = safetensors::SafeTensors::read_metadata(bytes).expect("a header");
+    let texts = header.metadata().as_ref().expect("metadata");
+    let kinds = ["observation", "many"];
+    let kind = kinds.into_iter().find(|kind| texts.contains_key(*kind)).expect("a kind");
+    let metadata: Value = serde_json::from_str(&texts[kind]).expect("JSON");
+    (kind, metadata["seq"].as_u64().expect("a number"))
+}
+
 async fn driver(server: &TestServer) -> Agent {
     let mut agent = server.agent().await;
     let open =
@@ -170,8 +185,9 @@ async fn mutated_requests_lose_no_session() {
         let outcome = match agent.receive().await {
             Reply::Binary(bytes) => {
                 // A change of the number may ask for the last answer again.
-                agent.seq = Seen::decode(bytes).meta["seq"].as_u64().expect("a number") + 1;
-                "observation".to_owned()
+                let (kind, seq) = observed(&bytes);
+                agent.seq = seq + 1;
+                kind.to_owned()
             }
             Reply::Text(answer) if answer["type"] == "error" => {
                 assert_ne!(answer["code"], "internal", "{number}: {text}\n{answer}");
@@ -180,6 +196,11 @@ async fn mutated_requests_lose_no_session() {
             }
             Reply::Text(answer) => {
                 agent.seq = answer["seq"].as_u64().expect("a number") + 1;
+                if answer["type"] == "opened" && answer["session"] != "mutated" {
+                    // With two sessions, requests without a name are refused.
+                    let close = json!({ "type": "close", "session": answer["session"] });
+                    assert_eq!(agent.ask(close).await["type"], "closed");
+                }
                 answer["type"].as_str().expect("a type").to_owned()
             }
             Reply::Closed => panic!("{number}: {text} ended the connection"),
@@ -189,7 +210,10 @@ async fn mutated_requests_lose_no_session() {
     let took = began.elapsed();
     eprintln!("{REQUESTS} requests in {took:.1?}: {counts:?}");
     assert!(took.as_secs() < 60, "{took:?}");
-    assert!(counts["observation"] > 500 && counts["invalid_request"] > 5_000, "{counts:?}");
+    assert!(
+        counts["observation"] > 500 && counts["many"] > 100 && counts["invalid_request"] > 5_000,
+        "{counts:?}"
+    );
     assert!(counts.len() > 12, "{counts:?}");
 
     // The session is the same, and takes steps.

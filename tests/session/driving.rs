@@ -19,7 +19,7 @@ use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 /// An engine with its own directory of episodes.
 pub(crate) struct Bench {
     pub(crate) engine: Arc<Engine>,
-    _episodes: tempfile::TempDir,
+    pub(crate) episodes: tempfile::TempDir,
 }
 
 pub(crate) fn bench(cache: Cache) -> Bench {
@@ -35,7 +35,7 @@ pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend
         backend,
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
     });
-    Bench { engine: engine.unwrap(), _episodes: episodes }
+    Bench { engine: engine.unwrap(), episodes }
 }
 
 /// The two cameras of the other tests, as a rig.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use wildcity_scene::geo::{GeoAnchor, ProjectedOrigin};
 use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Trajectory};
 use wildcity_twin::store::{
     Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
@@ -15,8 +16,8 @@ const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels
 
 /// The settings of `street`.
 fn settings() -> VersionSettings {
-    let NewVersion { profile, rig, trajectories, sky, provenance, .. } = street(&EMPTY);
-    VersionSettings { profile, rig, trajectories, sky, provenance }
+    let NewVersion { profile, rig, trajectories, sky, geo, provenance, .. } = street(&EMPTY);
+    VersionSettings { profile, rig, trajectories, sky, geo, provenance }
 }
 
 static EMPTY: Gaussians = Gaussians {
@@ -32,7 +33,7 @@ static EMPTY: Gaussians = Gaussians {
 fn change(source: &str) -> VersionChange {
     let mut provenance = settings().provenance;
     provenance.source = source.to_owned();
-    VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance }
+    VersionChange { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance }
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.
@@ -153,6 +154,33 @@ fn a_change_keeps_every_other_cell() {
     let third = changed(&catalog, &[], 0).change(2, change).unwrap();
     assert_eq!(third.manifest.profile, profile);
     assert_eq!(third.manifest.chunks, second.manifest.chunks);
+}
+
+/// The place on the earth is set, kept and removed; without one the manifest is as it was.
+#[test]
+fn a_version_may_say_where_it_lies() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, first) = three(&dir);
+    assert!(!serde_json::to_string(&first.manifest).unwrap().contains("geo"));
+    let anchor: GeoAnchor = "52.5162,13.3777,34".parse().unwrap();
+    let place = |geo| VersionChange { geo: Some(geo), ..change("geo") };
+    let placed = changed(&catalog, &[], 0).change(1, place(Some(anchor.clone()))).unwrap();
+    assert_eq!(placed.manifest.geo.as_ref(), Some(&anchor));
+    assert_eq!(placed.manifest.chunks, first.manifest.chunks);
+    assert_eq!(catalog.version("street", None).unwrap(), placed);
+    let pushed = changed(&catalog, &[[1, 0]], 2).change(2, change("push")).unwrap();
+    assert_eq!(pushed.manifest.geo, Some(anchor));
+    let removed = changed(&catalog, &[], 0).change(3, place(None)).unwrap();
+    assert_eq!(removed.manifest.geo, None);
+    let zone = GeoAnchor::Projected(ProjectedOrigin {
+        projection: "EPSG:3857".to_owned(),
+        easting_m: 5e5,
+        northing_m: 0.0,
+        altitude_m: 0.0,
+    });
+    let refused = changed(&catalog, &[], 0).change(4, place(Some(zone))).unwrap_err();
+    assert!(refused.to_string().contains("geo.projection"), "{refused}");
+    assert_eq!(catalog.version("street", None).unwrap().number, 4);
 }
 
 #[test]

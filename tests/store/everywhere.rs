@@ -147,12 +147,12 @@ fn what_cannot_be_used_leaves_nothing() {
 fn settings_are_replaced_whole() {
     everywhere(|place| {
         let catalog = place.catalog();
-        let NewVersion { profile, rig, trajectories, sky, provenance, .. } =
+        let NewVersion { profile, rig, trajectories, sky, geo, provenance, .. } =
             street(&gaussians(0, 0, 1.0, 0));
         let commit = change(&catalog, [0, 0], 1);
         let id = commit.id().to_owned();
         let version = commit
-            .replace(None, VersionSettings { profile, rig, trajectories, sky, provenance })
+            .replace(None, VersionSettings { profile, rig, trajectories, sky, geo, provenance })
             .unwrap();
         assert_eq!(version.manifest.gaussians(), 300);
         assert_eq!(catalog.versions("street").unwrap()[0].commit, Some(id));

@@ -33,6 +33,7 @@ pub(crate) fn city() -> &'static City {
             rig: Rig::preset("vehicle6"),
             trajectories: vec![drive.clone()],
             sky: None,
+            geo: None,
             provenance: Provenance::of("test".into()),
         };
         commit.replace(None, settings).unwrap();

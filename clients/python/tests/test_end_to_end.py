@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import os
 import queue
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
 import pytest
 import wildcity
 from PIL import Image
@@ -24,14 +26,19 @@ from wildcity import (
     Action,
     Camera,
     Disconnected,
+    DriveSection,
     Dynamics,
     Exposure,
     Observation,
     Outputs,
     Pose,
+    RandomStart,
+    RecordedPoint,
     Refused,
     Rig,
+    SnapshotPoint,
     Station,
+    Step,
     TimedPose,
     Trajectory,
     png_data_uri,
@@ -50,6 +57,13 @@ PAIR = Rig(
     ),
 )
 RAW = Outputs(encoding="raw", depth=True, opacity=True, normals=True)
+
+
+ORIGIN = (52.5162, 13.3777, 34.0)
+"""Latitude, longitude and altitude of the twin's origin."""
+
+ZONE_ORIGIN = ("EPSG:32756", 334_900.0, 6_252_300.25, 5.0)
+"""The same of the twin `zone`, in a UTM zone of the southern hemisphere."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +85,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     write_corridor(folder / "corridor.ply")
     write_log(folder / "log.json")
     twins = ["--twins", str(folder / "twins")]
-    files = ["--trajectory", str(folder / "log.json")]
+    files = ["--trajectory", str(folder / "log.json"), "--geo", ",".join(map(str, ORIGIN))]
     importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
     subprocess.run([*importing, *twins, *files], check=True, timeout=60)
+    zone = ["--twin", "zone", "--geo", ",".join(map(str, ZONE_ORIGIN))]
+    subprocess.run([*importing[:3], *zone, *twins], check=True, timeout=60)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
     serving += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
@@ -86,7 +102,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 def test_drives_through_the_twin(connect: Connect, server: Server) -> None:
     with connect(server.url) as client:
-        assert [twin.name for twin in client.welcome.twins] == ["corridor"]
+        assert [twin.name for twin in client.welcome.twins] == ["corridor", "zone"]
         start = Station("log", 2.0)
         with client.open("corridor", rig=PAIR, outputs=RAW, start=start, seed=3) as session:
             opened = session.opened
@@ -127,6 +143,118 @@ def test_frames_of_the_recorded_and_the_driven_part(connect: Connect, server: Se
     assert on_route is not None and beside is not None
     assert on_route.distance_m == pytest.approx(0.0, abs=1e-9) and beside.distance_m == pytest.approx(1.0)
     assert beside.value < on_route.value <= 1.0
+
+
+def test_knows_where_it_is_on_the_earth(connect: Connect, server: Server) -> None:
+    latitude, longitude, altitude = ORIGIN
+    plane = f"+proj=topocentric +ellps=WGS84 +lat_0={latitude} +lon_0={longitude} +h_0={altitude}"
+    steps = f"+step +inv {plane} +step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    to_earth = pyproj.Transformer.from_pipeline(f"+proj=pipeline {steps}")
+    geod = pyproj.Geod(ellps="WGS84")
+    with connect(server.url) as client, client.open("corridor", rig=PAIR, outputs=RAW) as session:
+        for x, y, yaw in ((0.0, 0.0, 0.0), (1500.0, -800.0, 2.0), (-20_000.0, 9000.0, -0.5)):
+            pose = Pose((x, y, 1.0), (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)))
+            geo = session.step(pose).metadata.geo
+            assert geo is not None
+            east, north, up = to_earth.transform(x, y, 1.0)
+            assert (geo.longitude, geo.latitude) == pytest.approx((east, north), abs=1e-11)
+            assert geo.altitude == pytest.approx(up, abs=1e-6)
+            # The heading is the azimuth of a point a metre ahead.
+            ahead = to_earth.transform(x + math.cos(yaw), y + math.sin(yaw), 1.0)
+            azimuth = geod.inv(east, north, ahead[0], ahead[1])[0]
+            assert (geo.heading - azimuth + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-3)
+
+
+def test_knows_where_it_is_in_a_utm_zone(connect: Connect, server: Server) -> None:
+    zone, easting, northing, altitude = ZONE_ORIGIN
+    projection = pyproj.Proj(zone)
+    with connect(server.url) as client, client.open("zone", rig=PAIR, outputs=RAW) as session:
+        for x, y, yaw in ((0.0, 0.0, 0.0), (1500.0, -800.0, 2.0), (-20_000.0, 9000.0, -0.5)):
+            pose = Pose((x, y, 1.0), (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)))
+            geo = session.step(pose).metadata.geo
+            assert geo is not None
+            east, north = projection(easting + x, northing + y, inverse=True)
+            assert (geo.longitude, geo.latitude) == pytest.approx((east, north), abs=1e-11)
+            assert geo.altitude == pytest.approx(altitude + 1.0, abs=1e-9)
+            convergence = projection.get_factors(east, north).meridian_convergence
+            heading = 90.0 - math.degrees(yaw) + convergence
+            assert (geo.heading - heading + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-6)
+
+
+def test_steps_several_sessions_at_once(connect: Connect, server: Server) -> None:
+    with connect(server.url) as client, connect(server.url) as other:
+        car = Dynamics("kinematic", 5.0)
+        left = client.open("corridor", rig=PAIR, outputs=RAW, session="left")
+        right = client.open("corridor", rig=PAIR, outputs=RAW, session="right", dynamics=car)
+        alone = other.open("corridor", rig=PAIR, outputs=RAW)
+        here = Pose((1.0, 0.5, 0.0))
+        seen = client.step_many({"left": here, "right": Step(Action(1.0, 0.0), 300_000, {"why": "test"})})
+        same = alone.step(here)
+        assert seen["left"].metadata.frame_hash == same.metadata.frame_hash
+        for name in ("front", "rear"):
+            assert np.array_equal(seen["left"].images[name], same.images[name])
+        assert seen["right"].metadata.step == 3
+        seen = client.step_many({"left": Action(0.0, 0.0), "right": Action(0.0, 0.0), "gone": here})
+        assert seen["right"].metadata.step == 4
+        assert (seen["left"].code, seen["left"].field) == ("session_state", "steps[0].action")
+        assert (seen["gone"].code, seen["gone"].field) == ("unknown_session", "steps[2].session")
+        with pytest.raises(Refused, match="session_state"):
+            client.open("corridor")
+        assert left.reset().metadata.session == "left"
+        # After a lost connection both are resumed.
+        client.close()
+        assert right.resume().also[0].session == "right"
+        assert left.step(here).metadata.session == "left"
+        assert left.close().steps == 1
+        assert right.step(Action(0.0, 0.0)).metadata.step == 5
+        right.close()
+        alone.close()
+
+
+def test_returns_to_a_snapshot_and_branches(connect: Connect, server: Server) -> None:
+    log = Station("log", 2.0)
+    name = f"tree-{time.time_ns()}"
+    with connect(server.url) as client:
+        dynamics = Dynamics("dynamic", 5.0)
+        with client.open(
+            "corridor", rig=PAIR, outputs=RAW, start=log, dynamics=dynamics, session=name
+        ) as session:
+            session.reset(seed=1)
+            before = session.step(Action(1.0, 0.05), until_us=300_000, notes={"why": "to the fork"})
+            assert (before.metadata.step, before.metadata.time_us) == (3, 300_000)
+            session.snapshot("fork")
+            left = session.step(Action(0.0, 0.1))
+            again = session.restore("fork")
+            assert again.metadata.ego == before.metadata.ego
+            assert np.array_equal(again.images["front"], before.images["front"])
+            with connect(server.url) as other:
+                with other.branch(SnapshotPoint(name, "fork")) as branch:
+                    assert branch.opened.dynamics == dynamics
+                    same = branch.step(Action(0.0, 0.1))
+            assert same.frame[-1000:] == left.frame[-1000:]
+            assert same.metadata.ego == left.metadata.ego
+        with client.branch(RecordedPoint(f"{name}-1", 3)) as branch:
+            same = branch.step(Action(0.0, 0.1))
+            assert same.metadata.ego == left.metadata.ego
+            assert same.metadata.frame_hash == left.metadata.frame_hash
+        with pytest.raises(Refused, match="no recorded episode"):
+            client.branch(RecordedPoint("nothing-1", 0))
+
+
+def test_reads_the_recorded_drive_and_starts_along_it(connect: Connect, server: Server) -> None:
+    http = server.url.replace("ws://", "http://").removesuffix("/v1/session")
+    drive = wildcity.recorded_drive("corridor", "log", from_m=1.0, to_m=2.0, every_m=0.5, server=http)
+    assert [pose.station_m for pose in drive.poses] == [1.0, 1.5, 2.0]
+    assert drive.poses[1].pose.xyz == pytest.approx((1.5, 0.0, 0.0))
+    with connect(server.url) as client:
+        start = RandomStart("log", 1.0, 2.0, lateral_m=0.25)
+        section = DriveSection("log", 1.0, 2.0, 0.5)
+        with client.open("corridor", rig=PAIR, start=start, trajectory=section) as session:
+            assert session.opened.trajectory == drive
+            places = {session.reset(seed).ego.pose.xyz for seed in range(5)}
+            assert len(places) == 5
+            assert all(1.0 <= x <= 2.0 and abs(y) <= 0.25 for x, y, _ in places)
+            assert session.reset(3, dynamics="kinematic", speed=4.0).ego.velocity[0] == pytest.approx(4.0)
 
 
 def test_drives_a_car(connect: Connect, server: Server) -> None:
@@ -339,7 +467,7 @@ def test_http_routes(server: Server) -> None:
     assert server.get("/readyz")[0] == 200
     status, body = server.get("/v1/twins")
     assert status == 200
-    (twin,) = json.loads(body)["twins"]
+    twin, _ = json.loads(body)["twins"]
     assert (twin["name"], twin["gaussians"]) == ("corridor", 40_000)
 
 

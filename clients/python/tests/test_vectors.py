@@ -27,14 +27,17 @@ from wildcity import (
     ProtocolError,
     RandomStart,
     RecordedPoint,
+    Refused,
     Rig,
     Shutter,
     SnapshotPoint,
     Station,
+    Step,
     TimedPose,
     Trajectory,
     png_data_uri,
 )
+from wildcity.observation import Many
 from wildcity.protocol import ANSWERS, decode_answer, encode
 from wildcity.session_protocol import SessionProtocol
 
@@ -115,8 +118,21 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "branch": lambda c: c.branch(SnapshotPoint("run-17", "before-junction"), "run-18"),
     "branch_recorded": lambda c: c.branch(RecordedPoint("run-17-1", 40), None),
     "close": lambda c: c.close(),
+    "close_named": lambda c: with_sessions(c, "run-17", "run-18").close(on="run-17"),
     "resume": lambda c: c.resume("run-17", 4),
+    "resume_also": lambda c: c.resume("run-17", 4, ["run-18"]),
+    "step_many": lambda c: c.step_many(
+        {
+            "run-17": HERE,
+            "run-18": Step(Action(-1.5, 0.025), 200_000, {"confidence": 0.75}, terminate=True),
+        }
+    ),
 }
+
+
+def with_sessions(protocol: SessionProtocol, *names: str) -> SessionProtocol:
+    protocol.sessions = list(names)
+    return protocol
 
 
 def names(folder: str) -> list[str]:
@@ -156,6 +172,26 @@ def test_unknown_fields_of_the_metadata_are_ignored() -> None:
     text = json.dumps(header).encode()
     more = len(text).to_bytes(8, "little") + text + data[8 + length :]
     assert Observation(more).metadata == Observation(data).metadata
+
+
+def test_observations_of_several_sessions() -> None:
+    data = frame("many/two.bin")
+    many = Many(data)
+    assert many.seq == 3
+    assert list(many.results) == ["run-17", "run-18"]
+    seen, refused = many.results.values()
+    assert isinstance(seen, Observation)
+    alone = Observation(frame("observations/raw.bin"))
+    assert bytes(seen.frame) == alone.frame
+    assert np.array_equal(seen.images["front"], alone.images["front"])
+    assert isinstance(refused, Refused)
+    expected = vector("many/two.expected.json")["answers"][1]["error"]
+    assert (refused.code, refused.message, refused.field) == tuple(expected.values())
+    for wrong in (data[:-1], data.replace(b"run-17", b"run-19", 1), frame("observations/raw.bin")):
+        with pytest.raises(BadFrame):
+            Many(wrong)
+    with pytest.raises(BadFrame):
+        Observation(data)
 
 
 def with_unknown_fields(value: Any) -> Any:

@@ -8,16 +8,20 @@ use wildcity_protocol::error::Code;
 use wildcity_protocol::limits::HELLO_TIMEOUT;
 use wildcity_protocol::message::{
     Action, Answer, Branch, BranchPoint, ClientInfo, DynamicsChoice, Limits, Open, Opened, Pose,
-    Request, ServerInfo, Start, Summary, TimedPose, TwinInfo,
+    Request, ResumedSession, ServerInfo, SessionStep, Start, Summary, TimedPose, TwinInfo,
 };
 
 use crate::connection::{Connection, Endpoint, Incoming};
 use crate::error::ClientError;
 use crate::limits;
+use crate::many::Stepped;
 use crate::observation::Observation;
 use crate::options::ConnectOptions;
 
-/// A connection to a server, and the session on it.
+/// A connection to a server, and the sessions on it.
+///
+/// Most clients have one session. With several, each call is for the one that was opened last or
+/// [selected](Client::select), and [`Client::step_many`] steps several at once.
 ///
 /// A request keeps its number if it was refused or its answer did not arrive. Make the same call again
 /// (after [`Client::reconnect`] if the connection was lost): the server carries it out only once. Dropping
@@ -51,8 +55,10 @@ pub struct Client {
     /// Why the connection was lost; empty if it was not, or if a call was dropped.
     disconnect_reason: String,
     welcome: Welcome,
-    /// Name of the open session.
-    session: Option<String>,
+    /// Names of the open sessions.
+    sessions: Vec<String>,
+    /// The one that calls are for.
+    selected: Option<String>,
     next_seq: u64,
     answer_timeout: Duration,
 }
@@ -66,6 +72,30 @@ pub enum Movement {
     Trajectory(Vec<TimedPose>),
     /// With this acceleration and curvature. Only with the dynamics `kinematic` and `dynamic`.
     Action(Action),
+}
+
+impl Movement {
+    /// The step of a session, for [`Client::step_many`].
+    pub fn of_session(self, session: &str) -> SessionStep {
+        let (pose, trajectory, action) = self.fields();
+        SessionStep {
+            session: session.to_owned(),
+            pose,
+            trajectory,
+            action,
+            until_us: None,
+            notes: None,
+            terminate: false,
+        }
+    }
+
+    fn fields(self) -> (Option<Pose>, Option<Vec<TimedPose>>, Option<Action>) {
+        match self {
+            Self::Pose(pose) => (Some(pose), None, None),
+            Self::Trajectory(poses) => (None, Some(poses), None),
+            Self::Action(action) => (None, None, Some(action)),
+        }
+    }
 }
 
 /// How a step is made, beside its movement.
@@ -119,6 +149,8 @@ pub struct Resumed {
     pub time_us: i64,
     /// The settings of the session, as [`Client::open`] returned them; `None` if it is closed.
     pub opened: Option<Box<Opened>>,
+    /// The other sessions of the connection.
+    pub also: Vec<ResumedSession>,
 }
 
 /// The server's answer to `switch_version`: the version that the session shows from the next step on.
@@ -162,7 +194,8 @@ impl Client {
             connection: Some(connection),
             disconnect_reason: String::new(),
             welcome,
-            session: None,
+            sessions: Vec::new(),
+            selected: None,
             next_seq: 1,
             answer_timeout: limits::ANSWER_TIMEOUT,
         })
@@ -176,12 +209,26 @@ impl Client {
     /// [`Code::UnknownSession`] if the session ended or its time to resume is over. After any error but that
     /// one the connection is lost.
     pub async fn resume(&mut self, session: &str, last_seq: u64) -> Result<Resumed, ClientError> {
-        self.session = Some(session.to_owned());
-        self.next_seq = last_seq.saturating_add(1);
-        self.resume_session(session, last_seq).await
+        self.resume_with(session, &[], last_seq).await
     }
 
-    /// Connects again after the connection was lost, and continues the session if one was open.
+    /// As [`Client::resume`], with the other sessions that were on the same connection.
+    ///
+    /// # Errors
+    /// As [`Client::resume`], and if another session was not on that connection.
+    pub async fn resume_with(
+        &mut self,
+        session: &str,
+        also: &[String],
+        last_seq: u64,
+    ) -> Result<Resumed, ClientError> {
+        self.sessions = std::iter::once(session.to_owned()).chain(also.iter().cloned()).collect();
+        self.selected = Some(session.to_owned());
+        self.next_seq = last_seq.saturating_add(1);
+        self.resume_sessions(last_seq).await
+    }
+
+    /// Connects again after the connection was lost, and continues the sessions that were open.
     ///
     /// Then repeat the call that failed. It keeps its number, so the server carries it out only once: if it
     /// already did, it sends the same answer again, byte for byte.
@@ -194,11 +241,21 @@ impl Client {
         let mut connection = self.endpoint.connect().await?;
         self.welcome = hello(&mut connection, &self.name).await?;
         self.connection = Some(connection);
-        let Some(session) = self.session.clone() else {
+        if self.sessions.is_empty() {
             self.next_seq = 1;
             return Ok(None);
-        };
-        self.resume_session(&session, self.next_seq - 1).await.map(Some)
+        }
+        self.resume_sessions(self.next_seq - 1).await.map(Some)
+    }
+
+    /// Names of the open sessions, in the order in which they were opened.
+    pub fn sessions(&self) -> &[String] {
+        &self.sessions
+    }
+
+    /// Chooses the session that calls are for. Nothing is sent: a name that is not open is refused by the server.
+    pub fn select(&mut self, session: &str) {
+        self.selected = Some(session.to_owned());
     }
 
     /// The server's answer to `hello`: its limits and its twins.
@@ -217,7 +274,8 @@ impl Client {
         self.answer_timeout = timeout;
     }
 
-    /// Opens a session on a twin. `open.seq` is ignored: the client sets it.
+    /// Opens a session on a twin. `open.seq` is ignored: the client sets it. While another session is open, the new one
+    /// needs a name.
     ///
     /// # Errors
     /// [`ClientError::Refused`] if the server refuses; see [`ClientError`] for lost connections.
@@ -225,7 +283,7 @@ impl Client {
         let request = Request::Open(Box::new(Open { seq: self.next_seq, ..open }));
         match self.exchange(&request).await? {
             Incoming::Answer(Answer::Opened(opened)) => {
-                self.session = Some(opened.session.clone());
+                self.add(&opened);
                 Ok(*opened)
             }
             other => Err(self.unexpected_answer("opened", &other)),
@@ -246,7 +304,7 @@ impl Client {
         let request = Request::Branch(Branch { seq: self.next_seq, from, session });
         match self.exchange(&request).await? {
             Incoming::Answer(Answer::Opened(opened)) => {
-                self.session = Some(opened.session.clone());
+                self.add(&opened);
                 Ok(*opened)
             }
             other => Err(self.unexpected_answer("opened", &other)),
@@ -258,7 +316,8 @@ impl Client {
     /// # Errors
     /// As [`Client::step`].
     pub async fn snapshot(&mut self, name: &str) -> Result<(), ClientError> {
-        let request = Request::Snapshot { seq: self.next_seq, name: name.to_owned() };
+        let request =
+            Request::Snapshot { seq: self.next_seq, session: self.named(), name: name.to_owned() };
         match self.exchange(&request).await? {
             Incoming::Answer(Answer::Ok { .. }) => Ok(()),
             other => Err(self.unexpected_answer("ok", &other)),
@@ -270,7 +329,8 @@ impl Client {
     /// # Errors
     /// [`Code::UnknownState`] if there is no such snapshot; otherwise as [`Client::step`].
     pub async fn restore(&mut self, name: &str) -> Result<Observation, ClientError> {
-        let request = Request::Restore { seq: self.next_seq, name: name.to_owned() };
+        let request =
+            Request::Restore { seq: self.next_seq, session: self.named(), name: name.to_owned() };
         self.exchange_for_observation(&request).await
     }
 
@@ -316,14 +376,28 @@ impl Client {
         options: StepOptions,
     ) -> Result<Observation, ClientError> {
         let StepOptions { until_us, notes, terminate } = options;
-        let (pose, trajectory, action) = match movement {
-            Movement::Pose(pose) => (Some(pose), None, None),
-            Movement::Trajectory(poses) => (None, Some(poses), None),
-            Movement::Action(action) => (None, None, Some(action)),
-        };
+        let (pose, trajectory, action) = movement.fields();
         let seq = self.next_seq;
-        let request = Request::Step { seq, pose, trajectory, action, until_us, notes, terminate };
+        let session = self.named();
+        let request =
+            Request::Step { seq, session, pose, trajectory, action, until_us, notes, terminate };
         self.exchange_for_observation(&request).await
+    }
+
+    /// Steps several sessions of this connection, 1 to 64, in one message. A session whose step is refused does not stop
+    /// the others. What they gave comes in the order of `steps`.
+    ///
+    /// # Errors
+    /// [`ClientError::Refused`] if the list itself is refused: then no session was stepped. Otherwise as
+    /// [`Client::step`].
+    pub async fn step_many(
+        &mut self,
+        steps: Vec<SessionStep>,
+    ) -> Result<Vec<Stepped>, ClientError> {
+        match self.exchange(&Request::StepMany { seq: self.next_seq, steps }).await? {
+            Incoming::Many(many) => Ok(many.steps),
+            other => Err(self.unexpected_answer("observations of several sessions", &other)),
+        }
     }
 
     /// Renders the cameras from `poses` (`world_from_rig`) without moving the ego or the time. The
@@ -332,7 +406,8 @@ impl Client {
     /// # Errors
     /// As [`Client::step`].
     pub async fn observe(&mut self, poses: &[Pose]) -> Result<Observation, ClientError> {
-        let request = Request::Observe { seq: self.next_seq, poses: poses.to_vec() };
+        let request =
+            Request::Observe { seq: self.next_seq, session: self.named(), poses: poses.to_vec() };
         self.exchange_for_observation(&request).await
     }
 
@@ -342,7 +417,8 @@ impl Client {
     /// # Errors
     /// As [`Client::step`].
     pub async fn prefetch(&mut self, poses: &[Pose]) -> Result<(), ClientError> {
-        let request = Request::Prefetch { seq: self.next_seq, poses: poses.to_vec() };
+        let request =
+            Request::Prefetch { seq: self.next_seq, session: self.named(), poses: poses.to_vec() };
         match self.exchange(&request).await? {
             Incoming::Answer(Answer::Ok { .. }) => Ok(()),
             other => Err(self.unexpected_answer("ok", &other)),
@@ -367,7 +443,9 @@ impl Client {
     /// As [`Client::step`].
     pub async fn reset_with(&mut self, options: ResetOptions) -> Result<Observation, ClientError> {
         let ResetOptions { seed, start, dynamics, speed } = options;
-        let request = Request::Reset { seq: self.next_seq, seed, start, dynamics, speed };
+        let seq = self.next_seq;
+        let session = self.named();
+        let request = Request::Reset { seq, session, seed, start, dynamics, speed };
         self.exchange_for_observation(&request).await
     }
 
@@ -377,7 +455,9 @@ impl Client {
     /// # Errors
     /// [`Code::UnknownVersion`] if the twin has no such version; otherwise as [`Client::step`].
     pub async fn switch_version(&mut self, version: Option<u64>) -> Result<Switched, ClientError> {
-        match self.exchange(&Request::SwitchVersion { seq: self.next_seq, version }).await? {
+        let seq = self.next_seq;
+        let session = self.named();
+        match self.exchange(&Request::SwitchVersion { seq, session, version }).await? {
             Incoming::Answer(Answer::Switched { version, version_hash, profile_hash, .. }) => {
                 Ok(Switched { version, version_hash, profile_hash })
             }
@@ -385,14 +465,17 @@ impl Client {
         }
     }
 
-    /// Ends the session. Another one can be opened on the same connection.
+    /// Ends the session. Another one can be opened on the same connection. If others are open, the last of them is
+    /// selected.
     ///
     /// # Errors
     /// As [`Client::step`].
     pub async fn close(&mut self) -> Result<Summary, ClientError> {
-        match self.exchange(&Request::Close { seq: self.next_seq }).await? {
+        let seq = self.next_seq;
+        let session = self.named();
+        match self.exchange(&Request::Close { seq, session }).await? {
             Incoming::Answer(Answer::Closed { summary, .. }) => {
-                self.session = None;
+                self.remove_selected();
                 Ok(summary)
             }
             other => Err(self.unexpected_answer("closed", &other)),
@@ -425,21 +508,20 @@ impl Client {
         result
     }
 
-    /// Continues a session on a new connection, on which `hello` had number 0 and this request has 1.
-    async fn resume_session(
-        &mut self,
-        session: &str,
-        last_seq: u64,
-    ) -> Result<Resumed, ClientError> {
+    /// Continues the sessions on a new connection, on which `hello` had number 0 and this request has 1.
+    async fn resume_sessions(&mut self, last_seq: u64) -> Result<Resumed, ClientError> {
         let mut connection = self.take_connection()?;
-        let request = Request::Resume { seq: 1, session: session.to_owned(), last_seq };
+        let mut names = self.sessions.iter().cloned();
+        let session = names.next().unwrap_or_default();
+        let request = Request::Resume { seq: 1, session, last_seq, also: names.collect() };
         let incoming = match connection.exchange(&request, 1, self.answer_timeout).await {
             Ok(incoming) => incoming,
             Err(error) => {
                 if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
-                    // The session is over. A new one can be opened on this connection, and its request
+                    // A session is over. A new one can be opened on this connection, and its request
                     // takes the number of this refused one.
-                    self.session = None;
+                    self.sessions.clear();
+                    self.selected = None;
                     self.next_seq = 1;
                     self.connection = Some(connection);
                 } else {
@@ -456,13 +538,36 @@ impl Client {
                 step,
                 time_us,
                 opened,
+                also,
                 ..
             }) if session_seq == last_seq || Some(session_seq) == last_seq.checked_add(1) => {
                 self.connection = Some(connection);
-                Ok(Resumed { last_seq: session_seq, step, time_us, opened })
+                Ok(Resumed { last_seq: session_seq, step, time_us, opened, also })
             }
             other => Err(self.unexpected_answer("resumed, at most one request ahead", &other)),
         }
+    }
+
+    /// The name of the selected session for a request, which needs one only if there are several.
+    fn named(&self) -> Option<String> {
+        self.selected.clone().filter(|_| self.sessions.len() > 1)
+    }
+
+    /// Adds an opened session, and selects it. An answer that is repeated opens nothing new.
+    fn add(&mut self, opened: &Opened) {
+        if !self.sessions.contains(&opened.session) {
+            self.sessions.push(opened.session.clone());
+        }
+        self.selected = Some(opened.session.clone());
+    }
+
+    /// Removes the session that was closed, and selects the last of the others.
+    fn remove_selected(&mut self) {
+        match self.sessions.len() {
+            0 | 1 => self.sessions.clear(),
+            _ => self.sessions.retain(|name| Some(name) != self.selected.as_ref()),
+        }
+        self.selected = self.sessions.last().cloned();
     }
 
     /// Takes the connection for the time of a call. A dropped future does not give it back, which closes the

@@ -20,7 +20,8 @@ use wildcity_protocol::PROTOCOL;
 use wildcity_protocol::limits::{HELLO_TIMEOUT, OBSERVATION_BYTES};
 use wildcity_protocol::message::{Answer, Request};
 
-use crate::error::ClientError;
+use crate::error::{ClientError, FrameError};
+use crate::many::Many;
 use crate::observation::Observation;
 use crate::options::ConnectOptions;
 use crate::tls;
@@ -43,6 +44,7 @@ pub(crate) struct Connection {
 pub(crate) enum Incoming {
     Answer(Answer),
     Observation(Box<Observation>),
+    Many(Box<Many>),
 }
 
 impl Endpoint {
@@ -166,8 +168,15 @@ impl Connection {
 }
 
 fn decode(frame: Bytes) -> Result<Incoming, ClientError> {
-    let observation = Observation::decode(frame).map_err(ClientError::Frame)?;
-    Ok(Incoming::Observation(Box::new(observation)))
+    match Observation::decode(frame.clone()) {
+        Ok(observation) => Ok(Incoming::Observation(Box::new(observation))),
+        // The answer to `step_many` has another metadata.
+        Err(FrameError::NoObservation) => {
+            let many = Many::decode(&frame).map_err(ClientError::Frame)?;
+            Ok(Incoming::Many(Box::new(many)))
+        }
+        Err(error) => Err(ClientError::Frame(error)),
+    }
 }
 
 impl Incoming {
@@ -175,6 +184,7 @@ impl Incoming {
     fn seq(&self) -> Option<u64> {
         match self {
             Self::Observation(observation) => Some(observation.metadata().seq),
+            Self::Many(many) => Some(many.seq),
             Self::Answer(Answer::Error { seq, .. }) => *seq,
             Self::Answer(Answer::Opened(opened)) => Some(opened.seq),
             Self::Answer(
@@ -194,6 +204,9 @@ impl fmt::Display for Incoming {
         match self {
             Self::Observation(observation) => {
                 write!(f, "observation {}", observation.metadata().seq)
+            }
+            Self::Many(many) => {
+                write!(f, "observations of {} sessions {}", many.steps.len(), many.seq)
             }
             Self::Answer(answer) => write!(f, "{answer:.200?}"),
         }

@@ -34,6 +34,7 @@ mod decode;
 mod error;
 mod http;
 pub mod limits;
+mod many;
 mod observation;
 mod options;
 mod tls;
@@ -42,6 +43,7 @@ mod upload;
 pub use client::{Client, Movement, ResetOptions, Resumed, StepOptions, Switched, Welcome};
 pub use error::{ClientError, FrameError};
 pub use http::{HttpClient, HttpError};
+pub use many::Stepped;
 pub use observation::{ImageView, Observation};
 pub use options::ConnectOptions;
 pub use wildcity_protocol as protocol;
@@ -51,5 +53,6 @@ pub use wildcity_protocol::http::{
 };
 pub use wildcity_protocol::message::{
     Action, BranchPoint, Drive, DrivePose, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,
-    Open, Pose, RandomStart, Start, TimedPose,
+    Open, Pose, RandomStart, ResumedSession, SessionStep, Start, TimedPose,
 };
+pub use wildcity_protocol::observation::SessionRefusal;

@@ -301,7 +301,7 @@ impl<'a> ImageView<'a> {
 
 /// Refuses a long header before anything is allocated for it. A frame that is too short to have a length is
 /// refused later, with the rest of the layout.
-fn check_header_length(frame: &[u8]) -> Result<(), FrameError> {
+pub(crate) fn check_header_length(frame: &[u8]) -> Result<(), FrameError> {
     let limit = OBSERVATION_HEADER_BYTES;
     match frame.first_chunk().map(|length| u64::from_le_bytes(*length)) {
         Some(bytes) if bytes > limit => Err(FrameError::HeaderTooLong { bytes, limit }),

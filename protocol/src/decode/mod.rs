@@ -97,7 +97,7 @@ pub enum MistakeKind {
 /// use wildcity_protocol::message::Request;
 ///
 /// let closing = decode::<Request>(r#"{"type": "close", "seq": 2e0}"#).unwrap();
-/// assert_eq!(closing, Request::Close { seq: 2 });
+/// assert_eq!(closing, Request::Close { seq: 2, session: None });
 ///
 /// let refused = decode::<Request>(r#"{"type": "observe", "seq": 3, "poses": [{"xyz": [0, 0, 0]}]}"#).unwrap_err();
 /// assert_eq!(refused.seq, Some(3));

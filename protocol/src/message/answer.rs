@@ -45,6 +45,9 @@ pub enum Answer {
         /// The settings of the session, as in the answer to `open`; the version is the present one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         opened: Option<Box<Opened>>,
+        /// The other sessions that the request named, in its order.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        also: Vec<ResumedSession>,
     },
     /// Answer to `prefetch` and to `snapshot`.
     Ok {
@@ -208,6 +211,20 @@ pub struct OpenedScenario {
     pub hash: String,
     /// Number of actors.
     pub actors: u64,
+}
+
+/// A session that is resumed together with another.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ResumedSession {
+    /// Name of the session.
+    pub session: String,
+    /// Steps done in its episode.
+    pub step: u64,
+    /// Simulated time, in microseconds.
+    pub time_us: i64,
+    /// Its settings, as in the answer to `open`; the version is the present one.
+    pub opened: Box<Opened>,
 }
 
 /// Summary of an episode.

@@ -12,7 +12,8 @@ mod pose;
 mod request;
 
 pub use answer::{
-    Answer, Limits, Opened, OpenedScenario, Outcome, ServerInfo, Summary, TrajectoryInfo, TwinInfo,
+    Answer, Limits, Opened, OpenedScenario, Outcome, ResumedSession, ServerInfo, Summary,
+    TrajectoryInfo, TwinInfo,
 };
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose, DriveSection};
@@ -21,7 +22,7 @@ pub use open::{
     RigCamera, RigChoice, ScenarioChoice, Start,
 };
 pub use pose::Pose;
-pub use request::{Action, ClientInfo, Request, TimedPose};
+pub use request::{Action, ClientInfo, Request, SessionStep, TimedPose};
 
 /// What names are, as a regular expression.
 #[cfg(feature = "schema")]

@@ -32,6 +32,9 @@ pub enum Request {
     Step {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// `world_from_rig` at the end of the step. Only with teleport dynamics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pose: Option<Pose>,
@@ -53,11 +56,23 @@ pub enum Request {
         #[serde(default)]
         terminate: bool,
     },
+    /// Steps several sessions of the connection. A session whose step is refused does not stop the others. Answer: one
+    /// binary message with the observation or the refusal of each.
+    StepMany {
+        /// Number of this request.
+        seq: u64,
+        /// The steps, each of another session: 1 to 64.
+        #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 64)))]
+        steps: Vec<SessionStep>,
+    },
     /// Renders images from poses without moving the ego. Answer: one observation with the images of all
     /// poses.
     Observe {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// Poses of the rig, `world_from_rig`: 1 to `limits.observe_poses`.
         #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
         poses: Vec<Pose>,
@@ -67,6 +82,9 @@ pub enum Request {
     Prefetch {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// Poses of the rig, `world_from_rig`, in driving order. The straight lines between them count too.
         /// They replace the poses of the previous `prefetch`.
         #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
@@ -76,6 +94,9 @@ pub enum Request {
     Reset {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// Seed of the episode.
         #[serde(default)]
         seed: u64,
@@ -93,6 +114,9 @@ pub enum Request {
     SwitchVersion {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// Number of the version. If absent, the latest.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         version: Option<u64>,
@@ -101,6 +125,9 @@ pub enum Request {
     Snapshot {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// Name of the snapshot.
         name: String,
     },
@@ -108,6 +135,9 @@ pub enum Request {
     Restore {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
         /// Name of the snapshot.
         name: String,
     },
@@ -117,6 +147,9 @@ pub enum Request {
     Close {
         /// Number of this request.
         seq: u64,
+        /// Which session of the connection. If absent, its only one.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        session: Option<String>,
     },
     /// Continues a session after a lost connection, in place of `open`. Answer: `resumed`.
     Resume {
@@ -127,7 +160,41 @@ pub enum Request {
         session: String,
         /// Number of the last answer that the client received.
         last_seq: u64,
+        /// Names of the other sessions of the lost connection, at most 63.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        #[cfg_attr(feature = "schema", schemars(length(max = 63)))]
+        also: Vec<String>,
     },
+}
+
+/// The step of one session in a `step_many`, with the fields of `step`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(transform = super::one_movement))]
+#[serde(deny_unknown_fields)]
+pub struct SessionStep {
+    /// Name of the session.
+    pub session: String,
+    /// `world_from_rig` at the end of the step. Only with teleport dynamics.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pose: Option<Pose>,
+    /// Planned poses of the ego, 1 to 64 in order of time, up to the end of the step or later.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 64)))]
+    pub trajectory: Option<Vec<TimedPose>>,
+    /// Acceleration and curvature of the ego. Only with kinematic or dynamic dynamics.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub action: Option<Action>,
+    /// For how long the trajectory or the action is followed, in microseconds since the start of the step: a
+    /// whole number of `dt_us`. The answer is the observation at its end. If absent, `dt_us`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until_us: Option<i64>,
+    /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub notes: Option<serde_json::Value>,
+    /// Whether the episode ends with this step.
+    #[serde(default)]
+    pub terminate: bool,
 }
 
 /// A pose of a planned trajectory.

@@ -98,6 +98,7 @@ impl Generate {
             rig: Rig::preset("vehicle6"),
             trajectories: vec![wildcity_generate::city_drive(&settings)?],
             sky: None,
+            geo: None,
             provenance: Provenance::of(format!(
                 "city {}: {}",
                 wildcity_generate::REVISION,

@@ -4,6 +4,7 @@ mod diff;
 mod fsck;
 mod gc;
 mod generate;
+mod geo;
 mod list;
 mod log;
 mod rollback;
@@ -31,6 +32,7 @@ enum Subcommand {
     Gc(gc::Gc),
     Fsck(fsck::Fsck),
     Sky(sky::Sky),
+    Geo(geo::Geo),
 }
 
 impl Twin {
@@ -44,6 +46,7 @@ impl Twin {
             Subcommand::Gc(gc) => gc.run(),
             Subcommand::Fsck(fsck) => fsck.run(),
             Subcommand::Sky(sky) => sky.run(),
+            Subcommand::Geo(geo) => geo.run(),
         }
     }
 }

@@ -48,6 +48,7 @@ impl Sky {
             rig: None,
             trajectories: None,
             sky: Some(sky),
+            geo: None,
             provenance,
         };
         let version = commit.change(base.number, change)?;

@@ -126,18 +126,34 @@ fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {
     }
 }
 
+/// A session that is resumed together with another.
+pub(crate) struct AlsoResumed<'a> {
+    pub(crate) name: &'a str,
+    pub(crate) session: &'a Session,
+}
+
 /// The answer to `resume`.
 pub(crate) fn resumed(
     seq: u64,
     name: &str,
     last_seq: u64,
     session: Result<&Session, &ClosedSession>,
+    also_resumed: &[AlsoResumed<'_>],
 ) -> Result<String, Fault> {
     let (step, time_us) = match session {
         Ok(open) => (open.episode().step(), open.episode().time_us()),
         Err(closed) => (closed.steps, closed.time_us),
     };
     let opened = session.ok().map(|session| settings(seq, session, None)).transpose()?;
+    let one = |AlsoResumed { name, session }: &AlsoResumed<'_>| {
+        Ok(message::ResumedSession {
+            session: (*name).to_owned(),
+            step: session.episode().step(),
+            time_us: session.episode().time_us(),
+            opened: Box::new(settings(seq, session, None)?),
+        })
+    };
+    let also = also_resumed.iter().map(one).collect::<Result<_, Fault>>()?;
     text(&Answer::Resumed {
         seq,
         session: name.to_owned(),
@@ -145,6 +161,7 @@ pub(crate) fn resumed(
         step,
         time_us,
         opened: opened.map(Box::new),
+        also,
     })
 }
 

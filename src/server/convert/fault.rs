@@ -177,10 +177,13 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UnsupportedProtocol { .. } => at(Code::UnsupportedProtocol, "protocols"),
         Fault::SessionState(_) => at(Code::SessionState, "type"),
         Fault::Replaced => plain(Code::SessionState),
-        Fault::UnknownSession { .. } => at(Code::UnknownSession, "session"),
+        Fault::UnknownSession { field, .. } => at(Code::UnknownSession, field),
         Fault::NoSuchSession { field, .. } => at(Code::UnknownSession, field),
         Fault::UnknownTrajectory { field, .. } => at(Code::UnknownTrajectory, field),
         Fault::SessionExists { .. } => at(Code::SessionExists, "session"),
+        Fault::NotOnConnection { .. } => at(Code::UnknownSession, "session"),
+        Fault::SessionTwice { field, .. } => at(Code::InvalidName, field),
+        Fault::OtherConnection { field, .. } => at(Code::SeqOutOfOrder, field),
         Fault::InvalidName { field, .. } => at(Code::InvalidName, field),
         Fault::Pose { field, cause } => {
             let code = match cause {
@@ -326,6 +329,7 @@ fn of_store(error: &StoreError) -> WireFault {
         | StoreError::DuplicateCell { .. }
         | StoreError::SideFileSize { .. }
         | StoreError::Rig(_)
+        | StoreError::Geo(_)
         | StoreError::Trajectory(_)
         | StoreError::DuplicateTrajectory { .. } => at(Code::TwinDamaged, "twin"),
     }

@@ -6,6 +6,7 @@
 //! rig          rigs of requests
 //! answer       answers other than observations
 //! observation  observations
+//! many         observations of several sessions
 //! camera       lenses, windshields, shutters and exposures, to and from the wire
 //! drive        recorded drives
 //! http         bodies of HTTP requests and answers
@@ -18,20 +19,22 @@ mod drive;
 mod fault;
 mod field;
 mod http;
+mod many;
 mod mistake;
 mod observation;
 mod request;
 mod rig;
 
-pub(crate) use answer::{closed, ok, opened, resumed, switched, twin, twins, welcome};
+pub(crate) use answer::{AlsoResumed, closed, ok, opened, resumed, switched, twin, twins, welcome};
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
     ListedEpisode, episodes, new_push, new_upload, push, rollback, sessions, ticket, upload,
     version, versions,
 };
+pub(crate) use many::{Stepped, many};
 pub(crate) use observation::observation;
-pub(crate) use request::{BranchPoint, Command, Parsed, parse};
+pub(crate) use request::{BranchPoint, Command, Parsed, SessionStep, parse};
 
 /// The WebSocket subprotocol.
 pub(crate) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;

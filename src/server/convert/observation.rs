@@ -7,11 +7,12 @@ use serde::Serialize;
 use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
 use wildcity_protocol::observation::{
-    self as wire, Actor, Ego, Event, Image, NavigationCommand, ObservationMetadata, Residency,
+    self as wire, Actor, Ego, Event, Geo, Image, NavigationCommand, ObservationMetadata, Residency,
     Route, Stage, Timings, Trust,
 };
 use wildcity_render::FIRST_ACTOR_INSTANCE;
 use wildcity_scene::ActorBox;
+use wildcity_scene::geo::{GeoPoint, GeoPose};
 use wildcity_scene::geometry::camera::Pinhole;
 use wildcity_session::{
     DType, Episode, EpisodeTraffic, EventKind, HEADER_PREFIX_BYTES, PastImageInfo, Session,
@@ -49,7 +50,7 @@ pub(crate) fn observation(
         let data_offsets = [tensor.bytes.start, tensor.bytes.end];
         header.tensors.insert(name, TensorInfo { dtype, shape: &tensor.shape, data_offsets });
     }
-    let observation = text(&metadata(seq, session, &frame, &image_names))?;
+    let observation = text(&metadata(seq, session, &frame, &image_names)?)?;
     header.metadata.insert("observation", observation);
     let header = text(&header)?;
 
@@ -105,7 +106,7 @@ fn metadata(
     session: &Session,
     frame: &wildcity_session::Observation,
     image_names: &[String],
-) -> ObservationMetadata {
+) -> Result<ObservationMetadata, Fault> {
     let episode = session.episode();
     let version = &session.resident().version;
     let time_us = episode.time_us();
@@ -153,7 +154,10 @@ fn metadata(
     let timings = &frame.timings;
     let ms = |duration: std::time::Duration| duration.as_secs_f64() * 1e3;
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
-    ObservationMetadata {
+    let anchor = version.manifest.geo.as_ref();
+    let located = anchor.map(|anchor| anchor.locate(&episode.world_from_rig())).transpose();
+    let located = located.map_err(|error| Fault::Internal(error.to_string()))?;
+    Ok(ObservationMetadata {
         seq,
         step: episode.step(),
         time_us,
@@ -174,6 +178,7 @@ fn metadata(
             steering: episode.ego().steering_rad(),
             history_count: frame.history_count as u64,
         },
+        geo: located.map(geo),
         images: frame.images.iter().zip(image_names).map(drawn).collect(),
         history: frame.history.iter().map(past).collect(),
         events: session.traffic().map(events).unwrap_or_default(),
@@ -191,6 +196,16 @@ fn metadata(
             waited_for: frame.residency.waited_for as u64,
             waited_us: frame.residency.waited.as_micros() as u64,
         },
+    })
+}
+
+fn geo(located: GeoPose) -> Geo {
+    let GeoPoint { latitude_deg, longitude_deg, altitude_m } = located.point;
+    Geo {
+        latitude: latitude_deg,
+        longitude: longitude_deg,
+        altitude: altitude_m,
+        heading: located.heading_deg,
     }
 }
 

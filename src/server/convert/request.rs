@@ -1,11 +1,12 @@
 //! Parses text frames as commands.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use serde_json::Value;
 
 use crate::fault::Fault;
+use crate::limits;
 use wildcity_protocol::PROTOCOL;
 use wildcity_protocol::decode::{Refused, decode};
 use wildcity_protocol::message::{self, Request};
@@ -30,6 +31,8 @@ pub(crate) enum Parsed {
     Numbered {
         /// The number.
         seq: u64,
+        /// The session of the connection that it is for, if it names one.
+        session: Option<String>,
         /// The command, or why the request is refused.
         command: Result<Command, Fault>,
     },
@@ -60,6 +63,11 @@ pub(crate) enum Command {
         movement: wildcity_sim::Command,
         /// How long, whether it is the last step, and notes.
         options: StepOptions,
+    },
+    /// Carries out steps of several sessions of the connection.
+    StepMany {
+        /// The steps, each of another session.
+        steps: Vec<SessionStep>,
     },
     /// Renders images of poses.
     Observe {
@@ -106,7 +114,18 @@ pub(crate) enum Command {
         session: String,
         /// Number of the last request with an answer that arrived.
         last_seq: u64,
+        /// The other sessions of the connection that was lost.
+        also: Vec<String>,
     },
+}
+
+/// The step of one session among several.
+#[derive(Debug)]
+pub(crate) struct SessionStep {
+    /// Name of the session.
+    pub(crate) session: String,
+    /// How the ego moves, and for how long; or why this session's step is refused.
+    pub(crate) step: Result<(wildcity_sim::Command, StepOptions), Fault>,
 }
 
 /// A state of an episode, with names that are checked.
@@ -131,19 +150,18 @@ pub(crate) enum BranchPoint {
 /// Reads a text frame.
 pub(crate) fn parse(text: &str) -> Parsed {
     match decode::<Request>(text) {
-        Ok(request) => {
-            let (seq, command) = convert(request);
-            Parsed::Numbered { seq, command }
-        }
+        Ok(request) => convert(request),
         Err(Refused { seq: Some(seq), mistake }) => {
-            Parsed::Numbered { seq, command: Err(mistake.into()) }
+            Parsed::Numbered { seq, session: None, command: Err(mistake.into()) }
         }
         Err(Refused { seq: None, mistake }) => Parsed::Unnumbered(mistake.into()),
     }
 }
 
-/// The number and the command of a request.
-fn convert(request: Request) -> (u64, Result<Command, Fault>) {
+/// The number, the session and the command of a request.
+fn convert(request: Request) -> Parsed {
+    // Requests that are not for one of several sessions.
+    let general = |seq, command| Parsed::Numbered { seq, session: None, command };
     match request {
         Request::Hello { seq, client, protocols } => {
             let command = if protocols.iter().any(|offered| offered == PROTOCOL) {
@@ -151,41 +169,100 @@ fn convert(request: Request) -> (u64, Result<Command, Fault>) {
             } else {
                 Err(Fault::UnsupportedProtocol { server: PROTOCOL, offered: protocols })
             };
-            (seq, command)
+            general(seq, command)
         }
-        Request::Open(open) => (open.seq, open_command(*open)),
-        Request::Step { seq, pose, trajectory, action, until_us, notes, terminate } => {
+        Request::Open(open) => general(open.seq, open_command(*open)),
+        Request::Step { seq, session, pose, trajectory, action, until_us, notes, terminate } => {
             let movement = movement_of(pose, trajectory, action);
             let options = StepOptions { until_us, terminate, notes };
-            (seq, movement.map(|movement| Command::Step { movement, options }))
+            on(seq, session, movement.map(|movement| Command::Step { movement, options }))
         }
-        Request::Observe { seq, poses } => {
+        Request::StepMany { seq, steps } => general(seq, many_command(steps)),
+        Request::Observe { seq, session, poses } => {
             let poses = poses_of("poses", &poses, wildcity_session::limits::OBSERVE_POSES);
-            (seq, poses.map(|poses| Command::Observe { poses }))
+            on(seq, session, poses.map(|poses| Command::Observe { poses }))
         }
-        Request::Prefetch { seq, poses } => {
+        Request::Prefetch { seq, session, poses } => {
             let poses = poses_of("poses", &poses, wildcity_session::limits::PREFETCH_POSES);
-            (seq, poses.map(|poses| Command::Prefetch { poses }))
+            on(seq, session, poses.map(|poses| Command::Prefetch { poses }))
         }
-        Request::Reset { seq, seed, start, dynamics, speed } => {
+        Request::Reset { seq, session, seed, start, dynamics, speed } => {
             let options = reset_options(seed, start, dynamics, speed);
-            (seq, options.map(|options| Command::Reset { options }))
+            on(seq, session, options.map(|options| Command::Reset { options }))
         }
-        Request::SwitchVersion { seq, version } => (seq, Ok(Command::SwitchVersion { version })),
-        Request::Snapshot { seq, name } => {
-            (seq, name_of("name", name).map(|name| Command::Snapshot { name }))
+        Request::SwitchVersion { seq, session, version } => {
+            on(seq, session, Ok(Command::SwitchVersion { version }))
         }
-        Request::Restore { seq, name } => {
-            (seq, name_of("name", name).map(|name| Command::Restore { name }))
+        Request::Snapshot { seq, session, name } => {
+            on(seq, session, name_of("name", name).map(|name| Command::Snapshot { name }))
         }
-        Request::Branch(branch) => (branch.seq, branch_command(branch)),
-        Request::Close { seq } => (seq, Ok(Command::Close)),
-        Request::Resume { seq, session, last_seq } => {
-            let command =
-                name_of("session", session).map(|session| Command::Resume { session, last_seq });
-            (seq, command)
+        Request::Restore { seq, session, name } => {
+            on(seq, session, name_of("name", name).map(|name| Command::Restore { name }))
+        }
+        Request::Branch(branch) => general(branch.seq, branch_command(branch)),
+        Request::Close { seq, session } => on(seq, session, Ok(Command::Close)),
+        Request::Resume { seq, session, last_seq, also } => {
+            general(seq, resume_command(session, last_seq, also))
         }
     }
+}
+
+/// A request for one session of the connection.
+fn on(seq: u64, session: Option<String>, command: Result<Command, Fault>) -> Parsed {
+    match session.map(|name| name_of("session", name)).transpose() {
+        Ok(session) => Parsed::Numbered { seq, session, command },
+        Err(fault) => Parsed::Numbered { seq, session: None, command: Err(fault) },
+    }
+}
+
+/// Steps of several sessions. A list that is not one is refused; a number out of range refuses its own step.
+fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
+    let most = limits::CONNECTION_SESSIONS;
+    if !(1..=most).contains(&steps.len()) {
+        let must = format!("{} steps; 1 to {most} are accepted", steps.len());
+        return Err(Fault::OutOfRange { field: "steps".to_owned(), must });
+    }
+    let mut names = BTreeSet::new();
+    let step = |(index, step): (usize, message::SessionStep)| {
+        let message::SessionStep { session, pose, trajectory, action, until_us, notes, terminate } =
+            step;
+        let field = format!("steps[{index}].session");
+        let session = name_of(&field, session)?;
+        if !names.insert(session.clone()) {
+            return Err(Fault::SessionTwice { field, name: session });
+        }
+        let step = match movement_of(pose, trajectory, action) {
+            Err(Fault::InvalidRequest { field, reason }) => {
+                let field = field.map(|field| format!("steps[{index}].{field}"));
+                return Err(Fault::InvalidRequest { field, reason });
+            }
+            Err(fault) => Err(fault),
+            Ok(movement) => Ok((movement, StepOptions { until_us, terminate, notes })),
+        };
+        Ok(SessionStep { session, step })
+    };
+    let steps = steps.into_iter().enumerate().map(step).collect::<Result<_, Fault>>()?;
+    Ok(Command::StepMany { steps })
+}
+
+fn resume_command(session: String, last_seq: u64, also: Vec<String>) -> Result<Command, Fault> {
+    let session = name_of("session", session)?;
+    let most = limits::CONNECTION_SESSIONS - 1;
+    if also.len() > most {
+        let must = format!("{} sessions; at most {most} are accepted", also.len());
+        return Err(Fault::OutOfRange { field: "also".to_owned(), must });
+    }
+    let mut names = BTreeSet::from([session.clone()]);
+    let other = |(index, name): (usize, String)| {
+        let field = format!("also[{index}]");
+        let name = name_of(&field, name)?;
+        match names.insert(name.clone()) {
+            true => Ok(name),
+            false => Err(Fault::SessionTwice { field, name }),
+        }
+    };
+    let also = also.into_iter().enumerate().map(other).collect::<Result<_, Fault>>()?;
+    Ok(Command::Resume { session, last_seq, also })
 }
 
 fn open_command(open: message::Open) -> Result<Command, Fault> {
@@ -404,7 +481,7 @@ mod tests {
             format!(r#"{{"type":"step","seq":3,"pose":{{"xyz":[0,{x},0],"q":[1,0,0,0]}}}}"#)
         };
         for x in ["NaN", "Infinity", "-Infinity", "1e999", "-1e999", "null"] {
-            let Parsed::Numbered { seq: 3, command } = parse(&step(x)) else { panic!("{x}") };
+            let Parsed::Numbered { seq: 3, command, .. } = parse(&step(x)) else { panic!("{x}") };
             let field = field_of(command);
             assert_eq!(field, "pose.xyz[1]", "{x}");
         }

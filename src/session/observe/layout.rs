@@ -178,20 +178,34 @@ impl ObservationLayout {
 
     /// Checks that the images of so many rigs, which `field` of a request asks for, fit one answer.
     pub(super) fn check_size(&self, field: &'static str, rigs: usize) -> Result<(), SessionError> {
-        let rig_pixels: u64 = self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum();
-        let with_normals = match self.maps.normals {
-            true => limits::ANSWER_PIXELS / 2,
-            false => limits::ANSWER_PIXELS,
-        };
-        let limit = match self.maps.instances {
-            true => with_normals / 4 * 3,
-            false => with_normals,
-        };
-        let pixels = rig_pixels * rigs as u64;
+        let limit = self.pixel_limit();
+        let pixels = self.rig_pixels() * rigs as u64;
         if pixels > limit {
             return Err(SessionError::AnswerTooLarge { field, pixels, limit });
         }
         Ok(())
+    }
+
+    /// Pixels of the largest answer to a step, which take as many bytes without normals and instances.
+    pub(crate) fn step_pixels(&self) -> u64 {
+        let pixels = self.rig_pixels() * self.schedule.frames() as u64;
+        pixels * limits::ANSWER_PIXELS / self.pixel_limit()
+    }
+
+    fn rig_pixels(&self) -> u64 {
+        self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum()
+    }
+
+    /// The most pixels of one answer: with normals or instances each takes more bytes.
+    fn pixel_limit(&self) -> u64 {
+        let with_normals = match self.maps.normals {
+            true => limits::ANSWER_PIXELS / 2,
+            false => limits::ANSWER_PIXELS,
+        };
+        match self.maps.instances {
+            true => with_normals / 4 * 3,
+            false => with_normals,
+        }
     }
 
     /// Reserves room in the headers for what a scenario with so many actors tells.

@@ -76,7 +76,7 @@ impl Session {
 
         let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
         let traffic = state.traffic.as_ref();
-        let mut lines = traffic.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record));
+        let mut lines = traffic.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record, true));
         lines.push(Line::Frame(record));
         let file = self.create_file(version, origin.clone(), traffic, &episode, lines).await?;
         if let Some(bytes) = bytes

@@ -151,6 +151,11 @@ impl Session {
         self.settings.layout.schedule().frames()
     }
 
+    /// Pixels that its answer to a step counts towards [`limits::ANSWER_PIXELS`](crate::limits::ANSWER_PIXELS).
+    pub fn step_pixels(&self) -> u64 {
+        self.settings.layout.step_pixels()
+    }
+
     /// Time between two frames of a camera, by its index, in microseconds.
     pub fn period_us(&self, camera: usize) -> i64 {
         self.settings.layout.schedule().period_us(camera)

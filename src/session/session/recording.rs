@@ -26,7 +26,9 @@ impl Session {
         frame: FrameRecord,
         traffic: Option<&EpisodeTraffic>,
     ) -> Result<(), SessionError> {
-        let mut lines = traffic.map_or(Vec::new(), |traffic| traffic_lines(traffic, &frame));
+        let is_first = self.recorder.is_none();
+        let shown = traffic.or(self.state.traffic.as_ref().filter(|_| is_first));
+        let mut lines = shown.map_or(Vec::new(), |shown| traffic_lines(shown, &frame, is_first));
         lines.push(Line::Frame(frame));
         match self.recorder.clone() {
             Some(recorder) => {
@@ -57,6 +59,9 @@ impl Session {
     ) -> FrameRecord {
         let RenderedObservation { observation, captures, hashes, .. } = rendered;
         let all_cameras = self.settings.layout.cameras().len();
+        // Where the actors are in the warm-up depends on the time.
+        let needs_times = self.settings.scenario.is_some() && captures.len() > 1;
+        let times_us = captures.iter().map(|capture| capture.time_us).collect();
         let mut cameras: Vec<_> = captures.iter().map(|capture| capture.cameras.clone()).collect();
         if cameras.iter().all(|of_pose| of_pose.len() == all_cameras) {
             cameras.clear();
@@ -69,7 +74,7 @@ impl Session {
             cameras,
             command: None,
             steps: 1,
-            times_us: Vec::new(),
+            times_us: if needs_times { times_us } else { Vec::new() },
             notes: None,
             terminated: episode.terminated(),
             frame_hash: observation.frame_hash.to_hex().to_string(),
@@ -168,14 +173,20 @@ impl Session {
 }
 
 /// The lines before the frame of a request: where the actors are at each frame of a warm-up and after each step, and
-/// what happened.
-pub(super) fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord) -> Vec<Line> {
+/// what happened. Before the first frame of a file also where they were in the steps that its frames show: of a
+/// branch, or if the first request is no reset.
+pub(super) fn traffic_lines(
+    traffic: &EpisodeTraffic,
+    frame: &FrameRecord,
+    is_first: bool,
+) -> Vec<Line> {
     let FrameRecord { step, steps, .. } = *frame;
     let warm_up_us = frame.times_us.iter().copied().filter(|time_us| *time_us < 0);
     let warm_up =
         warm_up_us.map(|time_us| ActorsLine::new(step, time_us, &traffic.states_before(time_us)));
-    let before = (step + 1).saturating_sub(steps);
-    let of_steps = (before..).zip(traffic.last_steps(steps as usize));
+    let count = traffic.last_steps(if is_first { usize::MAX } else { steps as usize }).count();
+    let before = (step + 1).saturating_sub(count as u64);
+    let of_steps = (before..).zip(traffic.last_steps(count));
     let of_steps = of_steps.map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
     let actors = warm_up.chain(of_steps).map(Line::Actors);
     let event = |happened: &Event| {

@@ -202,13 +202,9 @@ impl Session {
         let moment = Moment { episode: &next, traffic: traffic.as_ref() };
         let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
-        let mut record = self.frame_record(FrameRequest::Reset, &next, &rendered);
+        let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let before = traffic.as_ref();
-        if before.is_some() && rendered.captures.len() > 1 {
-            // Where the actors are in the warm-up depends on the time.
-            record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
-        }
-        let mut lines = before.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record));
+        let mut lines = before.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record, true));
         lines.push(Line::Frame(record));
         let file = self.create_file(&self.version, None, before, &next, lines).await?;
         self.end_recording(Outcome::Completed).await;

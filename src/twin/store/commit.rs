@@ -205,7 +205,7 @@ impl Commit {
 
     /// A manifest with the cells that were put, and no others. Its table is not written yet.
     fn new_manifest(&mut self, settings: VersionSettings) -> Result<Manifest, StoreError> {
-        let VersionSettings { profile, rig, trajectories, sky, provenance } = settings;
+        let VersionSettings { profile, rig, trajectories, sky, geo, provenance } = settings;
         Ok(Manifest {
             format: Manifest::FORMAT,
             twin: self.name.clone(),
@@ -217,6 +217,7 @@ impl Commit {
             rig,
             trajectories,
             sky: sky.map(|sky| sky.put(&mut *self.staging)).transpose()?,
+            geo,
             provenance,
         })
     }
@@ -230,13 +231,14 @@ impl Commit {
     ) -> Result<Manifest, StoreError> {
         self.check_field("sh_degree", self.sh_degree, manifest.sh_degree)?;
         self.check_field("record", Some(self.storage.record), manifest.record)?;
-        let VersionChange { profile, rig, trajectories, sky, provenance } = change.clone();
+        let VersionChange { profile, rig, trajectories, sky, geo, provenance } = change.clone();
         if let Some(sky) = sky {
             manifest.sky = sky.map(|sky| sky.put(&mut *self.staging)).transpose()?;
         }
         manifest.profile = profile.unwrap_or(manifest.profile);
         manifest.rig = rig.or(manifest.rig);
         manifest.trajectories = trajectories.unwrap_or(manifest.trajectories);
+        manifest.geo = geo.unwrap_or(manifest.geo);
         manifest.provenance = provenance;
         let own = manifest.chunks.into_iter().map(|chunk| ([chunk.cell[1], chunk.cell[0]], chunk));
         let mut chunks: BTreeMap<_, _> = own.collect();

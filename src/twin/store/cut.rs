@@ -106,8 +106,14 @@ impl Catalog {
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
         let mut provenance = manifest.provenance.clone();
         provenance.options.push(option);
-        let change =
-            VersionChange { profile: None, rig: None, trajectories: None, sky: None, provenance };
+        let change = VersionChange {
+            profile: None,
+            rig: None,
+            trajectories: None,
+            sky: None,
+            geo: None,
+            provenance,
+        };
         let version = commit.change(base.number, change)?;
         Ok(Cut { version, gaussians: cut })
     }

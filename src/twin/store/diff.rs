@@ -15,7 +15,7 @@ pub struct Diff {
     /// Number of cells that are the same in both.
     pub kept: u64,
     /// Fields of the manifest that differ, among `profile`, `sh_degree`, `record`, `rig`,
-    /// `trajectories`, `sky`.
+    /// `trajectories`, `sky`, `geo`.
     pub settings: Vec<&'static str>,
 }
 
@@ -78,6 +78,7 @@ impl Diff {
             ("rig", before.rig != after.rig),
             ("trajectories", before.trajectories != after.trajectories),
             ("sky", before.sky != after.sky),
+            ("geo", before.geo != after.geo),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
         Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }

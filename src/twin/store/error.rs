@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::ingest::IngestError;
 use crate::limits;
 use wildcity_scene::RecordFormat;
+use wildcity_scene::geo::GeoError;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::RigError;
 use wildcity_scene::trajectory::TrajectoryError;
@@ -246,6 +247,9 @@ pub enum StoreError {
     /// The rig of a commit cannot be used.
     #[error(transparent)]
     Rig(#[from] RigError),
+    /// The place of the world on the earth is invalid.
+    #[error(transparent)]
+    Geo(#[from] GeoError),
     /// A trajectory of a commit cannot be used.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),

@@ -1,6 +1,7 @@
 //! Commits a whole version in one call, for scenes that are in memory.
 
 use crate::ingest::IngestError;
+use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Gaussians, RenderProfile, Rig, Trajectory};
@@ -24,6 +25,8 @@ pub struct NewVersion<'a> {
     pub trajectories: Vec<Trajectory>,
     /// The sky behind them.
     pub sky: Option<NewSky>,
+    /// Where the world lies on the earth.
+    pub geo: Option<GeoAnchor>,
     /// Where they come from.
     pub provenance: Provenance,
     /// How they are stored.
@@ -40,6 +43,7 @@ impl<'a> NewVersion<'a> {
             rig: None,
             trajectories: Vec::new(),
             sky: None,
+            geo: None,
             provenance,
             storage: StorageOptions::default(),
         }
@@ -58,11 +62,20 @@ impl Catalog {
         new: NewVersion<'_>,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
-        let NewVersion { name, gaussians, profile, rig, trajectories, sky, provenance, storage } =
-            new;
+        let NewVersion {
+            name,
+            gaussians,
+            profile,
+            rig,
+            trajectories,
+            sky,
+            geo,
+            provenance,
+            storage,
+        } = new;
         check_name(name)?;
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
-        let settings = VersionSettings { profile, rig, trajectories, sky, provenance };
+        let settings = VersionSettings { profile, rig, trajectories, sky, geo, provenance };
         settings.check()?;
         let mut commit = self.begin(name, CommitKind::Import, storage)?;
         commit.put(gaussians, None, progress)?;

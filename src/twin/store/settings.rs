@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig, Trajectory};
 
@@ -19,6 +20,8 @@ pub struct VersionSettings {
     pub trajectories: Vec<Trajectory>,
     /// The sky behind the Gaussians.
     pub sky: Option<NewSky>,
+    /// Where the world lies on the earth.
+    pub geo: Option<GeoAnchor>,
     /// Where it comes from.
     pub provenance: Provenance,
 }
@@ -35,6 +38,8 @@ pub struct VersionChange {
     pub trajectories: Option<Vec<Trajectory>>,
     /// The sky behind the Gaussians; `Some(None)` removes it.
     pub sky: Option<Option<NewSky>>,
+    /// Where the world lies on the earth; `Some(None)` removes it.
+    pub geo: Option<Option<GeoAnchor>>,
     /// Where the new version comes from.
     pub provenance: Provenance,
 }
@@ -44,6 +49,7 @@ impl VersionSettings {
     /// Names what cannot be used.
     pub(super) fn check(&self) -> Result<(), StoreError> {
         check(Some(&self.profile), self.rig.as_ref(), &self.trajectories)?;
+        self.geo.as_ref().map_or(Ok(()), GeoAnchor::check)?;
         self.sky.as_ref().map_or(Ok(()), |sky| sky.check(&self.profile))
     }
 }
@@ -55,6 +61,7 @@ impl VersionChange {
     /// Names what cannot be used.
     pub(super) fn check(&self) -> Result<(), StoreError> {
         let trajectories = self.trajectories.as_deref().unwrap_or_default();
+        self.geo.iter().flatten().try_for_each(GeoAnchor::check)?;
         check(self.profile.as_ref(), self.rig.as_ref(), trajectories)
     }
 }

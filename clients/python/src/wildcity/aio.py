@@ -20,7 +20,7 @@ from .session_protocol import (
     can_reuse_connection,
     translate_error,
 )
-from .errors import ConnectFailed, Disconnected, WildCityError
+from .errors import ConnectFailed, Disconnected, Refused, WildCityError
 from .observation import Observation
 from .protocol import (
     PROTOCOL,
@@ -37,6 +37,7 @@ from .protocol import (
     Rig,
     SnapshotPoint,
     Station,
+    Step,
     Summary,
     Switched,
     Trajectory,
@@ -99,6 +100,8 @@ class Client:
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
 
+        A connection can have 64 sessions; while one is open, the next needs a name, `session`.
+
         `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
 
         Raises `Refused` if the server refuses.
@@ -122,7 +125,7 @@ class Client:
                 trajectory=trajectory,
             )
         )
-        return Session(self, opened)
+        return Session(self, opened.session, opened)
 
     async def branch(self, point: SnapshotPoint | RecordedPoint, *, session: str | None = None) -> Session:
         """Opens a session in a state of another episode, with that episode's settings.
@@ -130,12 +133,23 @@ class Client:
         The new session has that state as its snapshot `start`: `restore("start")` shows it. Raises `Refused` if
         there is no such state.
         """
-        return Session(self, await self._run(self._protocol.branch(point, session)))
+        opened = await self._run(self._protocol.branch(point, session))
+        return Session(self, opened.session, opened)
 
     async def resume(self, session: str, last_seq: int) -> Session:
         """Continues a session that another client opened; see `wildcity.sync`."""
         resumed = await self._run(self._protocol.resume(session, last_seq))
-        return Session(self, resumed.opened)
+        return Session(self, session, resumed.opened)
+
+    async def step_many(
+        self, steps: Mapping[str, Pose | Trajectory | Action | Step]
+    ) -> dict[str, Observation | Refused]:
+        """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
+
+        Returns by name the observation of each, or the `Refused` of one whose step was refused, which stops no other.
+        Raises `Refused` if the list itself is refused; then no session was stepped.
+        """
+        return await self._run(self._protocol.step_many(steps))
 
     async def close(self) -> None:
         """Closes the connection. An open session can be resumed within `welcome.limits.resume_ms`."""
@@ -202,9 +216,10 @@ async def _answer(connection: ClientConnection, request: str) -> Message:
 
 
 class Session:
-    """An open session. An `async with` block closes it at its end, if the connection is still open."""
+    """An open session, one of those of its client. An `async with` block closes it at its end, if the connection is still open."""
 
-    def __init__(self, client: Client, opened: Opened | None) -> None:
+    def __init__(self, client: Client, name: str, opened: Opened | None) -> None:
+        self.name = name
         self._client = client
         self._protocol = client._protocol
         self._opened = opened
@@ -231,15 +246,15 @@ class Session:
         is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into the
         record. `terminate` ends the episode with this step.
         """
-        return await self._client._run(self._protocol.step(movement, terminate, until_us, notes))
+        return await self._client._run(self._protocol.step(movement, terminate, until_us, notes, on=self.name))
 
     async def observe(self, poses: Sequence[Pose]) -> Observation:
         """Renders images from poses without moving the ego: `views[k]` of the observation shows `poses[k]`."""
-        return await self._client._run(self._protocol.observe(poses))
+        return await self._client._run(self._protocol.observe(poses, on=self.name))
 
     async def prefetch(self, poses: Sequence[Pose]) -> None:
         """Asks the server to load what is visible from poses, in driving order. Does not wait for it."""
-        return await self._client._run(self._protocol.prefetch(poses))
+        return await self._client._run(self._protocol.prefetch(poses, on=self.name))
 
     async def reset(
         self,
@@ -253,23 +268,23 @@ class Session:
 
         `dynamics`, and `speed` (m/s) in place of theirs, hold for this episode alone.
         """
-        return await self._client._run(self._protocol.reset(seed, start, dynamics, speed))
+        return await self._client._run(self._protocol.reset(seed, start, dynamics, speed, on=self.name))
 
     async def snapshot(self, name: str) -> None:
         """Stores the state of the episode under a name, in place of an earlier snapshot of that name."""
-        return await self._client._run(self._protocol.snapshot(name))
+        return await self._client._run(self._protocol.snapshot(name, on=self.name))
 
     async def restore(self, name: str) -> Observation:
         """Returns to a snapshot of this session, and returns the observation of that state."""
-        return await self._client._run(self._protocol.restore(name))
+        return await self._client._run(self._protocol.restore(name, on=self.name))
 
     async def switch_version(self, version: int | None = None) -> Switched:
         """Shows another version of the twin from the next step on, or the latest. The episode continues."""
-        return await self._client._run(self._protocol.switch_version(version))
+        return await self._client._run(self._protocol.switch_version(version, on=self.name))
 
     async def close(self) -> Summary:
         """Ends the session. Another one can be opened on the same client."""
-        return await self._client._run(self._protocol.close())
+        return await self._client._run(self._protocol.close(on=self.name))
 
     async def resume(self) -> Resumed:
         """Connects again after `Disconnected` or `TimedOut`, and continues the session.
@@ -288,7 +303,7 @@ class Session:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._client._connection is None or self._protocol.session is None:
+        if self._client._connection is None or self.name not in self._protocol.sessions:
             return
         try:
             await self.close()

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from .errors import BadFrame, ProtocolError
-from .protocol import Ego, ImageInfo, Metadata, decode, parse_json
+from .errors import BadFrame, ProtocolError, Refused
+from .protocol import Ego, ImageInfo, ManyMetadata, Metadata, decode, parse_json
 
 HEADER_BYTES = 1 << 20
 """Largest header that is accepted: 256 images take a quarter of it."""
@@ -39,9 +39,9 @@ class Observation:
     Raises `BadFrame` if the frame is not a valid observation.
     """
 
-    def __init__(self, frame: bytes) -> None:
+    def __init__(self, frame: bytes | memoryview) -> None:
         self.frame = frame
-        self._tensors, text = _read_layout(frame)
+        self._tensors, text = _read_layout(frame, "observation")
         try:
             self.metadata: Metadata = decode(Metadata, parse_json(text, "metadata"), "metadata")
         except BadFrame:
@@ -154,6 +154,34 @@ class Observation:
             )
 
 
+class Many:
+    """The answer to `step_many`: by session its observation, or the refusal of its step.
+
+    The observations are views of the message, without a copy. Raises `BadFrame` if it is not such a message.
+    """
+
+    def __init__(self, frame: bytes) -> None:
+        tensors, text = _read_layout(frame, "many")
+        try:
+            metadata: ManyMetadata = decode(ManyMetadata, parse_json(text, "many"), "many")
+        except (ProtocolError, ValueError) as failure:
+            raise BadFrame(str(failure)) from failure
+        self.seq = metadata.seq
+        self.results: dict[str, Observation | Refused] = {}
+        for answer in metadata.answers:
+            name, error = answer.session, answer.error
+            if error is not None and answer.tensor is None:
+                self.results[name] = Refused(error.code, error.message, error.field, False)
+                continue
+            tensor = None if answer.tensor is None or error is not None else tensors.get(answer.tensor)
+            if tensor is None or tensor.dtype != np.uint8 or len(tensor.shape) != 1:
+                raise BadFrame(f"session {name!r} has neither an observation nor an error")
+            observation = Observation(memoryview(frame)[tensor.start : tensor.start + tensor.shape[0]])
+            if observation.metadata.session != name:
+                raise BadFrame(f"the observation of {name!r} is of {observation.metadata.session!r}")
+            self.results[name] = observation
+
+
 class View:
     """The images of one pose."""
 
@@ -251,8 +279,8 @@ def _decode_image(observation: Observation, image: ImageInfo) -> NDArray[np.uint
     return pixels
 
 
-def _read_layout(frame: bytes) -> tuple[dict[str, _Tensor], str]:
-    """The tensors, checked to fill the frame without overlap, and the observation's JSON."""
+def _read_layout(frame: bytes | memoryview, key: str) -> tuple[dict[str, _Tensor], str]:
+    """The tensors, checked to fill the frame without overlap, and the JSON of that key in `__metadata__`."""
     if len(frame) < 8:
         raise BadFrame(f"the frame ends within its header length, at {len(frame)} bytes")
     (header_bytes,) = struct.unpack_from("<Q", frame)
@@ -263,15 +291,15 @@ def _read_layout(frame: bytes) -> tuple[dict[str, _Tensor], str]:
         )
     try:
         # Decoded here, because `json` would accept other encodings than UTF-8.
-        header = parse_json(frame[8 : 8 + header_bytes].decode(), "the header")
+        header = parse_json(bytes(frame[8 : 8 + header_bytes]).decode(), "the header")
     except (ProtocolError, UnicodeDecodeError) as error:
         raise BadFrame(f"the header cannot be read: {error}") from error
     if not isinstance(header, dict):
         raise BadFrame(f"the header is a {type(header).__name__}; expected a JSON object")
     metadata = header.pop("__metadata__", None)
-    text = metadata.get("observation") if isinstance(metadata, dict) else None
+    text = metadata.get(key) if isinstance(metadata, dict) else None
     if not isinstance(text, str):
-        raise BadFrame("the header's __metadata__ has no observation")
+        raise BadFrame(f"the header's __metadata__ has no {key}")
     return _read_table(header, 8 + header_bytes, len(frame)), text
 
 

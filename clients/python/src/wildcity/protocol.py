@@ -72,6 +72,16 @@ class Action:
     curvature: float
 
 
+@dataclass(frozen=True)
+class Step:
+    """A step of one of several sessions: see `Session.step` for the fields."""
+
+    movement: Pose | Trajectory | Action
+    until_us: int | None = None
+    notes: Any = None
+    terminate: bool = False
+
+
 Model = Literal["teleport", "kinematic", "dynamic"]
 
 
@@ -363,6 +373,16 @@ class Opened:
 
 
 @dataclass(frozen=True)
+class ResumedSession:
+    """A session that was resumed together with another."""
+
+    session: str
+    step: int
+    time_us: int
+    opened: Opened
+
+
+@dataclass(frozen=True)
 class Resumed:
     """Answer to `resume`: the state of the session."""
 
@@ -372,6 +392,7 @@ class Resumed:
     step: int
     time_us: int
     opened: Opened | None = None
+    also: tuple[ResumedSession, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -446,6 +467,16 @@ class Ego:
     yaw_rate: float
     history_count: int
     steering: float | None = None
+
+
+@dataclass(frozen=True)
+class Geo:
+    """Place of the ego on the earth (WGS84): degrees, metres above the ellipsoid, and degrees from north to the east."""
+
+    latitude: float
+    longitude: float
+    altitude: float
+    heading: float
 
 
 @dataclass(frozen=True)
@@ -587,6 +618,33 @@ class Metadata:
     events: tuple[Event, ...] = ()
     route: Route | None = None
     actors: tuple[Actor, ...] | None = None
+    geo: Geo | None = None
+
+
+@dataclass(frozen=True)
+class SessionRefusal:
+    """Why a step of `step_many` was refused."""
+
+    code: Code
+    message: str
+    field: str | None = None
+
+
+@dataclass(frozen=True)
+class SessionAnswer:
+    """What one step of `step_many` gave: the tensor that is its observation, or an error."""
+
+    session: str
+    tensor: str | None = None
+    error: SessionRefusal | None = None
+
+
+@dataclass(frozen=True)
+class ManyMetadata:
+    """What the answer to `step_many` has beside the observations."""
+
+    seq: int
+    answers: tuple[SessionAnswer, ...]
 
 
 ANSWERS: dict[str, type[Any]] = {

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
 from .errors import Disconnected, ProtocolError, Refused, TimedOut, WildCityError
-from .observation import Observation
+from .observation import Many, Observation
 from .protocol import (
     OBSERVATION_BYTES,
     PROTOCOL,
@@ -36,6 +36,7 @@ from .protocol import (
     Rig,
     SnapshotPoint,
     Station,
+    Step,
     Summary,
     Switched,
     Trajectory,
@@ -55,8 +56,8 @@ class SessionProtocol:
     def __init__(self, name: str) -> None:
         self.name = name
         self.next_seq = 1
-        self.session: str | None = None
-        """Name of the open session."""
+        self.sessions: list[str] = []
+        """Names of the open sessions."""
 
     def hello(self) -> Exchange[Welcome]:
         """Starts a connection."""
@@ -65,7 +66,7 @@ class SessionProtocol:
         welcome = yield from self._ask("hello", 0, Welcome, fields)
         if welcome.protocol != PROTOCOL:
             raise ProtocolError(f"the server chose protocol {welcome.protocol!r}")
-        if self.session is None:
+        if not self.sessions:
             self.next_seq = 1
         return welcome
 
@@ -106,7 +107,7 @@ class SessionProtocol:
         fields = {name: value for name, value in optional.items() if value is not None}
         fields |= {"twin": twin, "seed": seed, "outputs": encode(outputs or Outputs())}
         opened = yield from self._next("open", Opened, fields)
-        self.session = opened.session
+        self._add(opened.session)
         return opened
 
     def step(
@@ -115,20 +116,35 @@ class SessionProtocol:
         terminate: bool,
         until_us: int | None = None,
         notes: Any = None,
+        *,
+        on: str | None = None,
     ) -> Exchange[Observation]:
-        """Moves the ego and advances the time by one step, or by several along a plan."""
-        optional = {"until_us": until_us, "notes": notes}
-        fields = {**_movement(movement), "terminate": terminate}
-        fields |= {name: value for name, value in optional.items() if value is not None}
+        """Moves the ego and advances the time by one step, or by several along a plan.
+
+        Here and below, `on` is the session, which the request names if there are several.
+        """
+        fields = {**self._named(on), **_step(Step(movement, until_us, notes, terminate))}
         return (yield from self._next("step", Observation, fields))
 
-    def observe(self, poses: Sequence[Pose]) -> Exchange[Observation]:
-        """Renders images from poses without moving."""
-        return (yield from self._next("observe", Observation, {"poses": encode(poses)}))
+    def step_many(
+        self, steps: Mapping[str, Pose | Trajectory | Action | Step]
+    ) -> Exchange[dict[str, Observation | Refused]]:
+        """Steps several sessions."""
+        entries = [
+            {"session": name, **_step(step if isinstance(step, Step) else Step(step))}
+            for name, step in steps.items()
+        ]
+        many = yield from self._next("step_many", Many, {"steps": entries})
+        return many.results
 
-    def prefetch(self, poses: Sequence[Pose]) -> Exchange[None]:
+    def observe(self, poses: Sequence[Pose], *, on: str | None = None) -> Exchange[Observation]:
+        """Renders images from poses without moving."""
+        fields = {**self._named(on), "poses": encode(poses)}
+        return (yield from self._next("observe", Observation, fields))
+
+    def prefetch(self, poses: Sequence[Pose], *, on: str | None = None) -> Exchange[None]:
         """Announces where the ego may go next."""
-        yield from self._next("prefetch", Ok, {"poses": encode(poses)})
+        yield from self._next("prefetch", Ok, {**self._named(on), "poses": encode(poses)})
 
     def reset(
         self,
@@ -136,10 +152,12 @@ class SessionProtocol:
         start: Pose | Station | RandomStart | None,
         dynamics: Model | Dynamics | None = None,
         speed: float | None = None,
+        *,
+        on: str | None = None,
     ) -> Exchange[Observation]:
         """Starts a new episode."""
         optional = {"start": _start(start), "dynamics": encode(dynamics), "speed": speed}
-        fields: dict[str, Any] = {"seed": seed}
+        fields: dict[str, Any] = {**self._named(on), "seed": seed}
         fields |= {name: value for name, value in optional.items() if value is not None}
         return (yield from self._next("reset", Observation, fields))
 
@@ -149,53 +167,63 @@ class SessionProtocol:
         if session is not None:
             fields["session"] = session
         opened = yield from self._next("branch", Opened, fields)
-        self.session = opened.session
+        self._add(opened.session)
         return opened
 
-    def snapshot(self, name: str) -> Exchange[None]:
+    def snapshot(self, name: str, *, on: str | None = None) -> Exchange[None]:
         """Stores the state of the episode under a name."""
-        yield from self._next("snapshot", Ok, {"name": name})
+        yield from self._next("snapshot", Ok, {**self._named(on), "name": name})
 
-    def restore(self, name: str) -> Exchange[Observation]:
+    def restore(self, name: str, *, on: str | None = None) -> Exchange[Observation]:
         """Returns to a snapshot."""
-        return (yield from self._next("restore", Observation, {"name": name}))
+        return (yield from self._next("restore", Observation, {**self._named(on), "name": name}))
 
-    def switch_version(self, version: int | None) -> Exchange[Switched]:
+    def switch_version(self, version: int | None, *, on: str | None = None) -> Exchange[Switched]:
         """Shows another version of the twin."""
-        fields = {} if version is None else {"version": version}
-        return (yield from self._next("switch_version", Switched, fields))
+        fields: dict[str, Any] = {} if version is None else {"version": version}
+        return (yield from self._next("switch_version", Switched, {**self._named(on), **fields}))
 
-    def close(self) -> Exchange[Summary]:
+    def close(self, *, on: str | None = None) -> Exchange[Summary]:
         """Ends the session."""
-        closed = yield from self._next("close", Closed, {})
-        self.session = None
+        closed = yield from self._next("close", Closed, self._named(on))
+        self.sessions = [name for name in self.sessions if len(self.sessions) > 1 and name != on]
         return closed.summary
 
-    def resume(self, session: str, last_seq: int) -> Exchange[Resumed]:
-        """Continues a session on a new connection, on which `hello` had number 0 and this request has 1."""
-        fields = {"session": session, "last_seq": last_seq}
+    def resume(self, session: str, last_seq: int, also: Sequence[str] = ()) -> Exchange[Resumed]:
+        """Continues sessions on a new connection, on which `hello` had number 0 and this request has 1."""
+        fields: dict[str, Any] = {"session": session, "last_seq": last_seq}
+        if also:
+            fields["also"] = list(also)
         try:
             resumed = yield from self._ask("resume", 1, Resumed, fields)
         except Refused as refused:
             if refused.code == "unknown_session":
-                # The session is over. A new one can be opened on this connection, and its request takes
+                # A session is over. A new one can be opened on this connection, and its request takes
                 # the number of this refused one.
-                self.session = None
+                self.sessions = []
                 self.next_seq = 1
             raise
         # One request is under way at a time, so the session has carried out either request `last_seq` or
         # the one after it.
         if resumed.last_seq not in (last_seq, last_seq + 1):
             raise ProtocolError(f"the session is at {resumed.last_seq}, not at {last_seq}")
-        self.session = session
+        self.sessions = [session, *also]
         self.next_seq = last_seq + 1
         return resumed
 
     def resume_own(self) -> Exchange[Resumed]:
-        """As `resume`, for the session that this client opened."""
-        if self.session is None:
+        """As `resume`, for the sessions that this client opened."""
+        if not self.sessions:
             raise ProtocolError("this client has no open session to resume")
-        return (yield from self.resume(self.session, self.next_seq - 1))
+        first, *also = self.sessions
+        return (yield from self.resume(first, self.next_seq - 1, also))
+
+    def _add(self, session: str) -> None:
+        if session not in self.sessions:
+            self.sessions.append(session)
+
+    def _named(self, on: str | None) -> dict[str, Any]:
+        return {"session": on} if on is not None and len(self.sessions) > 1 else {}
 
     def _next(self, kind: str, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
         result = yield from self._ask(kind, self.next_seq, answer, fields)
@@ -206,7 +234,11 @@ class SessionProtocol:
         # Raises ValueError for NaN and infinity, which JSON cannot represent.
         request = json.dumps({"type": kind, "seq": seq, **fields}, allow_nan=False)
         message = yield request
-        got = Observation(message) if isinstance(message, bytes) else decode_answer(message)
+        got: Any
+        if isinstance(message, bytes):
+            got = Many(message) if answer is Many else Observation(message)
+        else:
+            got = decode_answer(message)
         got_seq = got.metadata.seq if isinstance(got, Observation) else got.seq
         # An error has no number if the server could not read the request.
         if got_seq != seq and not (isinstance(got, Refusal) and got_seq is None):
@@ -255,6 +287,12 @@ def _movement(movement: Pose | Trajectory | Action) -> dict[str, Any]:
     if isinstance(movement, Trajectory):
         return {"trajectory": encode(movement.poses)}
     return {"action" if isinstance(movement, Action) else "pose": encode(movement)}
+
+
+def _step(step: Step) -> dict[str, Any]:
+    optional = {"until_us": step.until_us, "notes": step.notes}
+    fields = {**_movement(step.movement), "terminate": step.terminate}
+    return fields | {name: value for name, value in optional.items() if value is not None}
 
 
 def _start(start: Pose | Station | RandomStart | None) -> Any:

@@ -22,7 +22,7 @@ from .session_protocol import (
     can_reuse_connection,
     translate_error,
 )
-from .errors import ConnectFailed, Disconnected, WildCityError
+from .errors import ConnectFailed, Disconnected, Refused, WildCityError
 from .observation import Observation
 from .protocol import (
     PROTOCOL,
@@ -39,6 +39,7 @@ from .protocol import (
     Rig,
     SnapshotPoint,
     Station,
+    Step,
     Summary,
     Switched,
     Trajectory,
@@ -98,6 +99,8 @@ class Client:
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
 
+        A connection can have 64 sessions; while one is open, the next needs a name, `session`.
+
         `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
 
         Raises `Refused` if the server refuses.
@@ -121,7 +124,7 @@ class Client:
                 trajectory=trajectory,
             )
         )
-        return Session(self, opened)
+        return Session(self, opened.session, opened)
 
     def branch(self, point: SnapshotPoint | RecordedPoint, *, session: str | None = None) -> Session:
         """Opens a session in a state of another episode, with that episode's settings.
@@ -129,7 +132,8 @@ class Client:
         The new session has that state as its snapshot `start`: `restore("start")` shows it. Raises `Refused` if
         there is no such state.
         """
-        return Session(self, self._run(self._protocol.branch(point, session)))
+        opened = self._run(self._protocol.branch(point, session))
+        return Session(self, opened.session, opened)
 
     def resume(self, session: str, last_seq: int) -> Session:
         """Continues a session that another client opened, for example one in a process that ended.
@@ -138,7 +142,17 @@ class Client:
         directly after connecting.
         """
         resumed = self._run(self._protocol.resume(session, last_seq))
-        return Session(self, resumed.opened)
+        return Session(self, session, resumed.opened)
+
+    def step_many(
+        self, steps: Mapping[str, Pose | Trajectory | Action | Step]
+    ) -> dict[str, Observation | Refused]:
+        """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
+
+        Returns by name the observation of each, or the `Refused` of one whose step was refused, which stops no other.
+        Raises `Refused` if the list itself is refused; then no session was stepped.
+        """
+        return self._run(self._protocol.step_many(steps))
 
     def close(self) -> None:
         """Closes the connection. An open session can be resumed within `welcome.limits.resume_ms`."""
@@ -215,9 +229,10 @@ class Client:
 
 
 class Session:
-    """An open session. A `with` block closes it at its end, if the connection is still open."""
+    """An open session, one of those of its client. A `with` block closes it at its end, if the connection is still open."""
 
-    def __init__(self, client: Client, opened: Opened | None) -> None:
+    def __init__(self, client: Client, name: str, opened: Opened | None) -> None:
+        self.name = name
         self._client = client
         self._protocol = client._protocol
         self._opened = opened
@@ -244,15 +259,15 @@ class Session:
         is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into the
         record. `terminate` ends the episode with this step.
         """
-        return self._client._run(self._protocol.step(movement, terminate, until_us, notes))
+        return self._client._run(self._protocol.step(movement, terminate, until_us, notes, on=self.name))
 
     def observe(self, poses: Sequence[Pose]) -> Observation:
         """Renders images from poses without moving the ego: `views[k]` of the observation shows `poses[k]`."""
-        return self._client._run(self._protocol.observe(poses))
+        return self._client._run(self._protocol.observe(poses, on=self.name))
 
     def prefetch(self, poses: Sequence[Pose]) -> None:
         """Asks the server to load what is visible from poses, in driving order. Does not wait for it."""
-        return self._client._run(self._protocol.prefetch(poses))
+        return self._client._run(self._protocol.prefetch(poses, on=self.name))
 
     def reset(
         self,
@@ -266,23 +281,23 @@ class Session:
 
         `dynamics`, and `speed` (m/s) in place of theirs, hold for this episode alone.
         """
-        return self._client._run(self._protocol.reset(seed, start, dynamics, speed))
+        return self._client._run(self._protocol.reset(seed, start, dynamics, speed, on=self.name))
 
     def snapshot(self, name: str) -> None:
         """Stores the state of the episode under a name, in place of an earlier snapshot of that name."""
-        return self._client._run(self._protocol.snapshot(name))
+        return self._client._run(self._protocol.snapshot(name, on=self.name))
 
     def restore(self, name: str) -> Observation:
         """Returns to a snapshot of this session, and returns the observation of that state."""
-        return self._client._run(self._protocol.restore(name))
+        return self._client._run(self._protocol.restore(name, on=self.name))
 
     def switch_version(self, version: int | None = None) -> Switched:
         """Shows another version of the twin from the next step on, or the latest. The episode continues."""
-        return self._client._run(self._protocol.switch_version(version))
+        return self._client._run(self._protocol.switch_version(version, on=self.name))
 
     def close(self) -> Summary:
         """Ends the session. Another one can be opened on the same client."""
-        return self._client._run(self._protocol.close())
+        return self._client._run(self._protocol.close(on=self.name))
 
     def resume(self) -> Resumed:
         """Connects again after `Disconnected` or `TimedOut`, and continues the session.
@@ -301,7 +316,7 @@ class Session:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        if self._client._connection is None or self._protocol.session is None:
+        if self._client._connection is None or self.name not in self._protocol.sessions:
             return
         try:
             self.close()

@@ -1,18 +1,30 @@
 //! One agent, in lock step: read a request, answer it.
 //!
+//! A connection may have several sessions. They share its numbers, so that they can be resumed together.
+//!
+//! | file | requests |
+//! |---|---|
+//! | `mod.rs` | the loop, the numbers, and what is for one session |
+//! | `opening.rs` | open, branch, resume |
+//! | `steps.rs` | step, step_many |
+//!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
 //! repeats one that was refused since the last one that was carried out. A request that was carried out is
 //! never carried out again: if its number is repeated, the stored answer is sent again.
 
+mod opening;
+mod steps;
+
 use std::future::pending;
 use std::sync::Arc;
 
+use futures_util::future::select_all;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use wildcity_session::{Observation, Outcome, Session, SessionError, SessionOptions};
+use wildcity_session::{Observation, Outcome, Session, SessionError};
 
 use crate::auth::Grant;
-use crate::convert::{self, BranchPoint, Command, DriveRequest, Parsed};
+use crate::convert::{self, Command, Parsed};
 use crate::fault::Fault;
 use crate::inbox::Inbox;
 use crate::limits;
@@ -31,7 +43,7 @@ pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Gr
         hello_done: false,
         answered_seq: None,
         last: None,
-        slot: None,
+        slots: Vec::new(),
     };
     let reason = connection.run(&mut inbox).await;
     connection.end(inbox.socket, reason).await;
@@ -47,7 +59,8 @@ struct Connection {
     answered_seq: Option<u64>,
     /// The last request carried out, and its answer.
     last: Option<AnsweredRequest>,
-    slot: Option<SlotGuard>,
+    /// The sessions, in the order in which they were opened.
+    slots: Vec<SlotGuard>,
 }
 
 /// A request that was refused.
@@ -58,10 +71,6 @@ struct Refusal {
 }
 
 const NO_SESSION: Fault = Fault::SessionState("no session is open; send open or resume");
-
-fn new_session_name() -> String {
-    format!("s-{}", uuid::Uuid::now_v7().as_simple())
-}
 
 impl Connection {
     /// Answers requests until the connection ends; returns why it did.
@@ -92,10 +101,11 @@ impl Connection {
             if self.hello_done { Instant::now() + idle } else { self.hello_deadline };
         loop {
             let released = async {
-                match &self.slot {
-                    Some(slot) => slot.release.notified().await,
-                    None => pending().await,
+                if self.slots.is_empty() {
+                    return pending().await;
                 }
+                let each = self.slots.iter().map(|slot| Box::pin(slot.release.notified()));
+                select_all(each).await;
             };
             let fault = tokio::select! {
                 incoming = inbox.next() => match incoming? {
@@ -124,8 +134,8 @@ impl Connection {
             let parsed = tokio::task::spawn_blocking(move || convert::parse(&text)).await;
             parsed.unwrap_or_else(|error| Parsed::Unnumbered(Fault::Internal(error.to_string())))
         };
-        let (seq, command) = match parsed {
-            Parsed::Numbered { seq, command } => (seq, command),
+        let (seq, session, command) = match parsed {
+            Parsed::Numbered { seq, session, command } => (seq, session, command),
             Parsed::Unnumbered(fault) => return Err(Refusal { seq: None, fault }),
         };
 
@@ -140,22 +150,18 @@ impl Connection {
 
         // Carries the request out.
         self.answered_seq = Some(seq);
-        if let Some(slot) = &mut self.slot {
+        for slot in &mut self.slots {
             slot.answered_seq = seq;
         }
         let command = command.map_err(refusal)?;
         // `resume` itself sets the numbers: they continue those of the session.
         let is_resume = matches!(command, Command::Resume { .. });
-        let answer = self.carry_out(seq, command).await.map_err(refusal)?;
+        let answer = self.carry_out(seq, session.as_deref(), command).await.map_err(refusal)?;
 
-        // Stores the answer in the slot too, where it survives the connection.
-        if let Some(slot) = &self.slot {
-            slot.update_view();
-            slot.show(&answer);
-        }
+        // Stores the answer in the slots too, where it survives the connection.
         if !is_resume {
             self.last = Some(AnsweredRequest { seq, answer: answer.clone() });
-            if let Some(slot) = &mut self.slot {
+            for slot in &mut self.slots {
                 slot.last = self.last.clone();
                 slot.answered_seq = seq;
             }
@@ -187,62 +193,78 @@ impl Connection {
         Err(Fault::SeqOutOfOrder { field: "seq", seq, expected })
     }
 
-    async fn carry_out(&mut self, seq: u64, command: Command) -> Result<Answer, Fault> {
+    /// Carries out a request. `named` is the session that it is for, if it names one.
+    async fn carry_out(
+        &mut self,
+        seq: u64,
+        named: Option<&str>,
+        command: Command,
+    ) -> Result<Answer, Fault> {
         match command {
             Command::Hello { client } => self.hello(seq, client).await,
             _ if !self.hello_done => Err(Fault::WrongOrder("the first request is hello")),
-            Command::Open { .. } | Command::Branch { .. } | Command::Resume { .. }
-                if self.slot.is_some() =>
-            {
+            Command::Open { name, opening, drive } => {
+                self.check_room(name.as_ref())?;
+                self.open(seq, name, *opening, drive).await
+            }
+            Command::Branch { name, from } => {
+                self.check_room(name.as_ref())?;
+                self.branch(seq, name, from).await
+            }
+            Command::Resume { .. } if !self.slots.is_empty() => {
                 Err(Fault::SessionState("a session is open on this connection; close it first"))
             }
-            Command::Open { name, opening, drive } => self.open(seq, name, *opening, drive).await,
-            Command::Branch { name, from } => self.branch(seq, name, from).await,
-            Command::Resume { session, last_seq } => self.resume(seq, &session, last_seq).await,
+            Command::Resume { session, last_seq, also } => {
+                self.resume(seq, &session, last_seq, &also).await
+            }
+            Command::StepMany { steps } => self.step_many(seq, steps).await,
             Command::Step { movement, options } => {
-                let begun = Instant::now();
-                let session = self.session()?;
-                let done = session.episode().step();
-                let frame = session.follow(movement, options).await?;
-                let steps = session.episode().step() - done;
+                let slot = self.slot(named)?;
                 let metrics = &self.state.metrics;
-                metrics.steps.inc_by(steps);
-                metrics.step_seconds.observe(begun.elapsed().as_secs_f64());
-                metrics.queue_seconds.observe(frame.timings.queue.as_secs_f64());
-                self.observation(seq, frame)
+                let session = self.slots[slot].session.as_mut().ok_or(NO_SESSION)?;
+                let frame = steps::step(metrics, session, movement, options).await?;
+                self.observation(seq, slot, frame)
             }
             Command::Observe { poses } => {
-                let frame = self.session()?.observe(poses).await?;
-                self.observation(seq, frame)
+                let slot = self.slot(named)?;
+                let frame = self.session(slot)?.observe(poses).await?;
+                self.observation(seq, slot, frame)
             }
             Command::Prefetch { poses } => {
-                self.session()?.prefetch(poses)?;
+                let slot = self.slot(named)?;
+                self.session(slot)?.prefetch(poses)?;
                 Ok(Answer::Text(convert::ok(seq)?.into()))
             }
             Command::Snapshot { name } => {
-                self.session()?.take_snapshot(name)?;
+                let slot = self.slot(named)?;
+                self.session(slot)?.take_snapshot(name)?;
                 Ok(Answer::Text(convert::ok(seq)?.into()))
             }
             Command::Restore { name } => {
-                let frame = self.session()?.restore(&name).await?;
-                self.observation(seq, frame)
+                let slot = self.slot(named)?;
+                let frame = self.session(slot)?.restore(&name).await?;
+                self.observation(seq, slot, frame)
             }
             Command::Reset { options } => {
-                let frame = self.session()?.reset_with(options).await?;
-                self.observation(seq, frame)
+                let slot = self.slot(named)?;
+                let frame = self.session(slot)?.reset_with(options).await?;
+                self.observation(seq, slot, frame)
             }
             Command::SwitchVersion { version } => {
+                let slot = self.slot(named)?;
                 let max_wait = self.state.limits.step;
-                let switched = timeout(max_wait, self.session()?.switch_version(version)).await;
+                let switched = timeout(max_wait, self.session(slot)?.switch_version(version)).await;
                 switched.map_err(|_| SessionError::DeadlineExceeded)??;
                 self.state.metrics.versions_switched.inc();
-                let text = convert::switched(seq, self.session()?)?;
+                self.slots[slot].update_view();
+                let text = convert::switched(seq, self.session(slot)?)?;
                 Ok(Answer::Text(text.into()))
             }
             Command::Close => {
-                let session = self.slot.as_mut().and_then(|slot| slot.session.take());
-                let session = session.ok_or(NO_SESSION)?;
-                self.slot = None;
+                let slot = self.slot(named)?;
+                let session = self.slots[slot].session.take().ok_or(NO_SESSION)?;
+                // Dropping the slot frees the name.
+                drop(self.slots.remove(slot));
                 let name = session.name().to_owned();
                 tracing::info!(session = name, "closed");
                 let episode = session.episode_name();
@@ -269,101 +291,37 @@ impl Connection {
         Ok(Answer::Text(text.into()))
     }
 
-    async fn open(
-        &mut self,
-        seq: u64,
-        name: Option<String>,
-        mut opening: SessionOptions,
-        drive: Option<DriveRequest>,
-    ) -> Result<Answer, Fault> {
-        opening.profile = opening.profile.or(&self.state.profile);
-        self.grant.require_twin(&opening.twin)?;
-        let name = name.unwrap_or_else(new_session_name);
-        let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-        let opened = Session::open(self.state.engine.clone(), name, opening);
-        self.fill(seq, slot, drive, opened).await
-    }
-
-    /// Opens a session in a state of another episode.
-    async fn branch(
-        &mut self,
-        seq: u64,
-        name: Option<String>,
-        from: BranchPoint,
-    ) -> Result<Answer, Fault> {
-        let name = name.unwrap_or_else(new_session_name);
-        let engine = self.state.engine.clone();
-        match from {
-            BranchPoint::Snapshot { session, snapshot } => {
-                let snapshots = self.state.sessions.snapshots(&session, &self.grant.name)?;
-                let from = snapshots.find("from.snapshot", &snapshot)?;
-                self.grant.require_twin(from.twin())?;
-                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-                self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
-            }
-            BranchPoint::Recorded { episode, step } => {
-                let from = Session::recorded(&engine, &episode, step).await?;
-                self.grant.require_twin(from.twin())?;
-                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
-                self.fill(seq, slot, None, Session::continued(engine, name, from)).await
+    /// Index of the session that a request names, or of the only one.
+    fn slot(&self, named: Option<&str>) -> Result<usize, Fault> {
+        match (named, &self.slots[..]) {
+            (_, []) => Err(NO_SESSION),
+            (None, [_]) => Ok(0),
+            (None, _) => Err(Fault::InvalidRequest {
+                field: Some("session".to_owned()),
+                reason: format!("session: name one of {}", self.names().join(", ")),
+            }),
+            (Some(name), slots) => {
+                let unknown =
+                    || Fault::NotOnConnection { name: name.to_owned(), open: self.names() };
+                slots.iter().position(|slot| slot.name() == name).ok_or_else(unknown)
             }
         }
     }
 
-    /// Opens a session into a new slot.
-    async fn fill(
-        &mut self,
-        seq: u64,
-        mut slot: SlotGuard,
-        drive: Option<DriveRequest>,
-        opening: impl Future<Output = Result<Session, SessionError>>,
-    ) -> Result<Answer, Fault> {
-        let opened = timeout(self.state.limits.step, opening).await;
-        let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
-        let text = convert::opened(seq, &session, drive.as_ref())?;
-        tracing::info!(session = session.name(), "opened");
-        slot.share_snapshots(&session);
-        slot.session = Some(session);
-        self.slot = Some(slot);
-        Ok(Answer::Text(text.into()))
+    /// Names of the open sessions.
+    fn names(&self) -> Vec<String> {
+        self.slots.iter().map(|slot| slot.name().to_owned()).collect()
     }
 
-    /// Continues a session, or the numbers of one whose `close` was carried out: its answer may have been lost.
-    async fn resume(&mut self, seq: u64, name: &str, last_seq: u64) -> Result<Answer, Fault> {
-        let max_wait = self.state.limits.step;
-        let check = |answered_seq: u64| {
-            if last_seq > answered_seq {
-                let expected = format!("{answered_seq} is the session's last answer");
-                return Err(Fault::SeqOutOfOrder { field: "last_seq", seq: last_seq, expected });
-            }
-            Ok(())
-        };
-        if let Some(closed) = self.state.sessions.closed(name, &self.grant.name) {
-            check(closed.last.seq)?;
-            let text = convert::resumed(seq, name, closed.last.seq, Err(&closed))?;
-            self.answered_seq = Some(closed.last.seq);
-            self.last = Some(closed.last);
-            return Ok(Answer::Text(text.into()));
-        }
-        let slot = self.state.sessions.resume(name, &self.grant.name, max_wait).await?;
-        check(slot.answered_seq)?;
-        let carried_out = slot.last.as_ref().map_or(slot.answered_seq, |last| last.seq);
-        let session = slot.session.as_ref().ok_or(NO_SESSION)?;
-        let text = convert::resumed(seq, name, carried_out, Ok(session))?;
-        tracing::info!(session = session.name(), "resumed");
-        self.last = slot.last.clone();
-        self.answered_seq = Some(slot.answered_seq);
-        self.slot = Some(slot);
-        Ok(Answer::Text(text.into()))
+    fn session(&mut self, slot: usize) -> Result<&mut Session, Fault> {
+        self.slots[slot].session.as_mut().ok_or(NO_SESSION)
     }
 
-    fn session(&mut self) -> Result<&mut Session, Fault> {
-        self.slot.as_mut().and_then(|slot| slot.session.as_mut()).ok_or(NO_SESSION)
-    }
-
-    fn observation(&mut self, seq: u64, frame: Observation) -> Result<Answer, Fault> {
-        let frame = convert::observation(seq, self.session()?, frame)?;
-        Ok(Answer::Observation(Arc::new(frame)))
+    fn observation(&mut self, seq: u64, slot: usize, frame: Observation) -> Result<Answer, Fault> {
+        let frame = Arc::new(convert::observation(seq, self.session(slot)?, frame)?);
+        self.slots[slot].update_view();
+        self.slots[slot].show(&frame);
+        Ok(Answer::Observation(frame))
     }
 
     async fn send(&self, socket: &mut Socket, answer: &Answer) -> Result<(), Disconnect> {
@@ -372,7 +330,14 @@ impl Connection {
             Answer::Observation(frame) => {
                 let bytes = frame.buffer.bytes();
                 self.state.metrics.observation_bytes.inc_by(bytes.len() as u64);
-                socket.send_binary(bytes).await
+                socket.send_binary(&[bytes]).await
+            }
+            Answer::Many(many) => {
+                let frames = many.frames.iter().map(|frame| frame.buffer.bytes());
+                let parts: Vec<&[u8]> = std::iter::once(&*many.header).chain(frames).collect();
+                let bytes = parts.iter().map(|part| part.len() as u64).sum();
+                self.state.metrics.observation_bytes.inc_by(bytes);
+                socket.send_binary(&parts).await
             }
         }
     }
@@ -399,9 +364,11 @@ impl Connection {
             Disconnect::Fault(_) => Outcome::AgentError,
         };
         // The session first: a client that resumes it need not wait for this connection to close.
-        if let Some(mut slot) = self.slot.take() {
+        for mut slot in self.slots.drain(..) {
             tracing::info!(?reason, "the connection of a session ended");
             slot.outcome = outcome;
+            // Parks it.
+            drop(slot);
         }
         match &reason {
             Disconnect::Fault(fault) => {

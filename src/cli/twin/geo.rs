@@ -1,0 +1,67 @@
+//! `wildcity twin geo`.
+
+use std::io::{self, Write};
+
+use crate::cli::directories::{TwinVersion, Twins};
+use wildcity_scene::geo::GeoAnchor;
+use wildcity_twin::store::{CommitKind, StorageOptions, VersionChange};
+
+/// Say where a twin lies on the earth, or remove that: makes a new version with the same Gaussians.
+///
+/// Observations of the version then have latitude, longitude and heading. Open sessions keep the version that they
+/// have.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+#[command(group = clap::ArgGroup::new("action").args(["anchor", "remove"]).required(true))]
+pub(in crate::cli) struct Geo {
+    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    /// Place of the twin's origin: LATITUDE,LONGITUDE[,ALTITUDE], or EPSG:CODE,EASTING,NORTHING[,ALTITUDE].
+    #[arg(value_name = "ANCHOR", allow_hyphen_values = true)]
+    anchor: Option<GeoAnchor>,
+
+    /// Remove the place.
+    #[arg(long)]
+    remove: bool,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity twin geo street 52.5162,13.3777,34
+  wildcity twin geo street EPSG:32633,391779,5820076
+  wildcity twin geo street --remove";
+
+impl Geo {
+    pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        // The Gaussians stay, and so does what the version says of their origin.
+        let provenance = base.manifest.provenance.clone();
+        let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
+        let commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
+        let change = VersionChange {
+            profile: None,
+            rig: None,
+            trajectories: None,
+            sky: None,
+            geo: Some(self.anchor),
+            provenance,
+        };
+        let version = commit.change(base.number, change)?;
+        let anchor = version.manifest.geo.as_ref();
+        let what = anchor.map_or(Ok("no place on the earth".to_owned()), serde_json::to_string)?;
+        writeln!(
+            io::stdout().lock(),
+            "twin {} version {}: {what}\nblake3 {}",
+            self.twin.name,
+            version.number,
+            version.hash
+        )?;
+        Ok(())
+    }
+}

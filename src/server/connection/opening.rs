@@ -1,0 +1,152 @@
+//! Requests that give a connection its sessions: open, branch and resume.
+
+use tokio::time::timeout;
+
+use wildcity_session::{Session, SessionError, SessionOptions};
+
+use super::{Connection, NO_SESSION};
+use crate::convert::{self, AlsoResumed, BranchPoint, DriveRequest};
+use crate::fault::Fault;
+use crate::limits;
+use crate::sessions::{Answer, SlotGuard};
+
+fn new_session_name() -> String {
+    format!("s-{}", uuid::Uuid::now_v7().as_simple())
+}
+
+impl Connection {
+    /// Checks that another session of this name can be opened: the second one of a connection needs one, so that a
+    /// client that has forgotten to close the first is told.
+    pub(super) fn check_room(&self, name: Option<&String>) -> Result<(), Fault> {
+        let limit = limits::CONNECTION_SESSIONS;
+        if !self.slots.is_empty() && name.is_none() {
+            return Err(Fault::SessionState(
+                "a session is open on this connection; close it first, or name the next one",
+            ));
+        }
+        if self.slots.len() >= limit {
+            return Err(Fault::Busy { what: "sessions on this connection", limit });
+        }
+        Ok(())
+    }
+
+    pub(super) async fn open(
+        &mut self,
+        seq: u64,
+        name: Option<String>,
+        mut opening: SessionOptions,
+        drive: Option<DriveRequest>,
+    ) -> Result<Answer, Fault> {
+        opening.profile = opening.profile.or(&self.state.profile);
+        self.grant.require_twin(&opening.twin)?;
+        let name = name.unwrap_or_else(new_session_name);
+        let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+        let opened = Session::open(self.state.engine.clone(), name, opening);
+        self.fill(seq, slot, drive, opened).await
+    }
+
+    /// Opens a session in a state of another episode.
+    pub(super) async fn branch(
+        &mut self,
+        seq: u64,
+        name: Option<String>,
+        from: BranchPoint,
+    ) -> Result<Answer, Fault> {
+        let name = name.unwrap_or_else(new_session_name);
+        let engine = self.state.engine.clone();
+        match from {
+            BranchPoint::Snapshot { session, snapshot } => {
+                let snapshots = self.state.sessions.snapshots(&session, &self.grant.name)?;
+                let from = snapshots.find("from.snapshot", &snapshot)?;
+                self.grant.require_twin(from.twin())?;
+                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+                self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
+            }
+            BranchPoint::Recorded { episode, step } => {
+                let from = Session::recorded(&engine, &episode, step).await?;
+                self.grant.require_twin(from.twin())?;
+                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+                self.fill(seq, slot, None, Session::continued(engine, name, from)).await
+            }
+        }
+    }
+
+    /// Opens a session into a new slot.
+    async fn fill(
+        &mut self,
+        seq: u64,
+        mut slot: SlotGuard,
+        drive: Option<DriveRequest>,
+        opening: impl Future<Output = Result<Session, SessionError>>,
+    ) -> Result<Answer, Fault> {
+        let opened = timeout(self.state.limits.step, opening).await;
+        let session = opened.map_err(|_| SessionError::DeadlineExceeded)??;
+        let text = convert::opened(seq, &session, drive.as_ref())?;
+        tracing::info!(session = session.name(), "opened");
+        slot.share_snapshots(&session);
+        slot.session = Some(session);
+        slot.update_view();
+        self.slots.push(slot);
+        Ok(Answer::Text(text.into()))
+    }
+
+    /// Continues sessions of a connection that was lost, or the numbers of one whose `close` was carried out: its answer
+    /// may have been lost.
+    pub(super) async fn resume(
+        &mut self,
+        seq: u64,
+        name: &str,
+        last_seq: u64,
+        also: &[String],
+    ) -> Result<Answer, Fault> {
+        let max_wait = self.state.limits.step;
+        let owner = &self.grant.name;
+        let check = |answered_seq: u64| {
+            if last_seq > answered_seq {
+                let expected = format!("{answered_seq} is the session's last answer");
+                return Err(Fault::SeqOutOfOrder { field: "last_seq", seq: last_seq, expected });
+            }
+            Ok(())
+        };
+        if also.is_empty()
+            && let Some(closed) = self.state.sessions.closed(name, owner)
+        {
+            check(closed.last.seq)?;
+            let text = convert::resumed(seq, name, closed.last.seq, Err(&closed), &[])?;
+            self.answered_seq = Some(closed.last.seq);
+            self.last = Some(closed.last);
+            return Ok(Answer::Text(text.into()));
+        }
+        let first = self.state.sessions.resume("session", name, owner, max_wait).await?;
+        check(first.answered_seq)?;
+        let mut slots = vec![first];
+        for (index, name) in also.iter().enumerate() {
+            let field = format!("also[{index}]");
+            let slot = self.state.sessions.resume(&field, name, owner, max_wait).await?;
+            // The sessions of a connection share its numbers.
+            if slot.answered_seq != slots[0].answered_seq {
+                let seq = slot.answered_seq;
+                return Err(Fault::OtherConnection { field, name: name.clone(), seq });
+            }
+            slots.push(slot);
+        }
+        let opened: Vec<&Session> = slots
+            .iter()
+            .map(|slot| slot.session.as_ref().ok_or(NO_SESSION))
+            .collect::<Result<_, _>>()?;
+        let one = |(name, session)| AlsoResumed { name, session };
+        let resumed_also: Vec<_> =
+            also.iter().map(String::as_str).zip(opened[1..].iter().copied()).map(one).collect();
+        let first = &slots[0];
+        let carried_out = first.last.as_ref().map_or(first.answered_seq, |last| last.seq);
+        let text = convert::resumed(seq, name, carried_out, Ok(opened[0]), &resumed_also)?;
+        for slot in &slots {
+            tracing::info!(session = slot.name(), "resumed");
+            slot.update_view();
+        }
+        self.last = first.last.clone();
+        self.answered_seq = Some(first.answered_seq);
+        self.slots = slots;
+        Ok(Answer::Text(text.into()))
+    }
+}
