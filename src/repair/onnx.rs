@@ -185,6 +185,11 @@ impl Worker {
         Ok((Worker { jobs, timeouts: 0, withdrawn: None }, graph))
     }
 
+    /// Whether no run will succeed any more.
+    pub(crate) fn is_withdrawn(&self) -> bool {
+        self.withdrawn.is_some()
+    }
+
     /// Runs the graph and returns the output of that name. A run longer than `limit` is stopped.
     pub(crate) fn run(
         &mut self,
