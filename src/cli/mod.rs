@@ -34,6 +34,7 @@ mod progress;
 mod push;
 mod render;
 mod repair;
+mod repair_options;
 mod replay;
 mod report;
 mod rig;

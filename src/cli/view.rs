@@ -65,6 +65,7 @@ impl View {
             origins: wildcity_server::Origins::default(),
             tls: None,
             backend: Arc::from(self.backend.backend()?),
+            repairs: Arc::default(),
             profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use wildcity_push::QueueLimits;
 use wildcity_render::Backend;
+use wildcity_repair::Models;
 use wildcity_scene::ProfileOverrides;
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DiskCacheSettings;
@@ -40,6 +41,8 @@ pub struct Config {
     pub tls: Option<TlsFiles>,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
+    /// The models that can repair images, by name. Each is loaded when a session asks for it.
+    pub repairs: Arc<Models>,
     /// Changes of the render profile of every twin; a session may change more.
     pub profile: ProfileOverrides,
     /// Time-outs, counts and bytes.
@@ -152,6 +155,7 @@ impl std::fmt::Debug for Config {
             origins,
             tls,
             backend,
+            repairs,
             profile,
             limits,
         } = self;
@@ -166,6 +170,7 @@ impl std::fmt::Debug for Config {
             .field("origins", origins)
             .field("tls", tls)
             .field("backend", &backend.name())
+            .field("repairs", &repairs.names().collect::<Vec<_>>())
             .field("profile", profile)
             .field("limits", limits)
             .finish()

@@ -81,6 +81,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         origins,
         tls,
         backend,
+        repairs,
         profile,
         limits,
     } = config;
@@ -100,6 +101,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         scenarios: Scenarios::in_dir(scenarios),
         backend,
         step_timeout: limits.step,
+        repairs,
     })?;
 
     // The socket.

@@ -161,6 +161,7 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
         scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
+        repairs: Arc::default(),
     })?)
 }
 
@@ -176,6 +177,7 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
         origins: wildcity_server::Origins::default(),
         tls: None,
         backend: settings.backend.clone(),
+        repairs: Arc::default(),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),
     };

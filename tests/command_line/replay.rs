@@ -32,6 +32,7 @@ async fn the_command_verifies_what_the_cpu_backend_served() {
         origins: wildcity_server::Origins::default(),
         tls: None,
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
+        repairs: Arc::default(),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),
     };

@@ -328,6 +328,7 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationM
             queue_ms: 0.5,
             render_ms: 12.25,
             encode_ms: 1.5,
+            repair_ms: None,
             stages_ms: vec![
                 Stage { name: "project".into(), ms: 2.0 },
                 Stage { name: "rasterize".into(), ms: 9.75 },

@@ -3,7 +3,8 @@
 use serde_json::json;
 use wildcity_repair::{Halo, View};
 
-use crate::support::{Folder, picture, trained};
+use crate::onnx_models::{Folder, trained};
+use crate::support::{picture};
 
 const ZERO_DCE: &str = "zero_dce_pp_rgb.onnx";
 

@@ -187,6 +187,7 @@ impl TestServer {
             origins: wildcity_server::Origins::default(),
             tls: None,
             backend: painter.clone(),
+            repairs: Arc::default(),
             profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };

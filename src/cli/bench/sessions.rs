@@ -107,6 +107,7 @@ impl Sessions {
             scenarios: Scenarios::in_dir(""),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
+            repairs: Arc::default(),
         })?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let mut out = io::stdout().lock();

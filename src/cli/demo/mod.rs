@@ -109,6 +109,7 @@ impl Demo {
             origins: wildcity_server::Origins::default(),
             tls: None,
             backend: Arc::from(self.backend.backend()?),
+            repairs: Arc::default(),
             profile: ProfileOverrides::default(),
             limits: Limits::default(),
         };

@@ -14,6 +14,7 @@ use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,
     RecordedSettings, RecordedVersion,
 };
+use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::record::recorder::{NewFile, Recorder};
 use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{PinnedVersion, SessionSettings};
@@ -55,7 +56,7 @@ impl Session {
         episode: &Episode,
         rendered: &RenderedObservation,
     ) -> FrameRecord {
-        let RenderedObservation { observation, captures, hashes, .. } = rendered;
+        let RenderedObservation { observation, captures, hashes, repairs, .. } = rendered;
         let all_cameras = self.settings.layout.cameras().len();
         let mut cameras: Vec<_> = captures.iter().map(|capture| capture.cameras.clone()).collect();
         if cameras.iter().all(|of_pose| of_pose.len() == all_cameras) {
@@ -74,6 +75,7 @@ impl Session {
             terminated: episode.terminated(),
             frame_hash: observation.frame_hash.to_hex().to_string(),
             images: hashes.iter().map(|hash| hash.to_hex().to_string()).collect(),
+            repairs: RecordedImageRepair::list(repairs),
         }
     }
 
@@ -126,7 +128,8 @@ impl Session {
             dynamics: episode.ego().dynamics(),
             start: episode.world_from_rig(),
             dt_us: settings.dt_us,
-            settings: recorded_settings(settings, pinned.coverage.is_some()),
+            settings: recorded_settings(settings, self.trust()),
+            repair: settings.repair.as_deref().map(RecordedRepair::of),
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
             scenario: traffic.map(|traffic| traffic.loaded().hash.clone()),

@@ -99,6 +99,7 @@ impl Drive {
             scenarios: Scenarios::in_dir(""),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
+            repairs: Arc::default(),
         })?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let report = runtime.block_on(self.drive(engine, &version.manifest))?;

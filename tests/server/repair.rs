@@ -1,0 +1,424 @@
+//! Repair of images in sessions, on the wire and on record. The models are small graphs, and a trained one.
+
+use std::fs;
+use std::sync::Arc;
+
+use serde_json::{Value, json};
+use wildcity_repair::{LoadOptions, Models};
+use wildcity_session::{RecordedEpisode, ReplayReport, ReplayUntil};
+use wildcity_twin::residency::Cache;
+use wildcity_twin::store::Catalog;
+
+use crate::episodes::{lines, tamper};
+use crate::onnx_doubles as doubles;
+use crate::onnx_models::{Folder, library, trained};
+use crate::support::{Agent, Painter, Seen, TestServer, refused};
+
+/// The models of some folders, with so many threads.
+fn models(folders: &[&Folder], threads: usize) -> Arc<Models> {
+    let paths: Vec<_> = folders.iter().map(|folder| folder.path()).collect();
+    let options = LoadOptions { threads, ..LoadOptions::new(library()) };
+    Arc::new(Models::read(&paths, options).unwrap())
+}
+
+async fn server(folders: &[&Folder], threads: usize) -> TestServer {
+    let repairs = models(folders, threads);
+    TestServer::configured(|config| config.repairs = repairs).await
+}
+
+/// A model that adds a tenth of the range.
+fn brighter() -> Folder {
+    Folder::new(&doubles::arithmetic("Add", 0.1), json!({"name": "brighter", "timeout_ms": 10_000}))
+}
+
+/// A model with the inputs `image` and `trust`.
+fn with_trust(onnx: &[u8], name: &str, timeout_ms: u64) -> Folder {
+    let inputs =
+        json!([{"name": "image", "role": "rgb"}, {"name": "trust", "role": "trust"}]);
+    Folder::new(onnx, json!({"name": name, "timeout_ms": timeout_ms, "inputs": inputs}))
+}
+
+/// Two cameras that see no ground, so that the trust depends on the distance from the drive alone: half of it
+/// is lost in 3.5 m.
+fn rig() -> Value {
+    let camera = |name: &str, width: u64| {
+        json!({"name": name, "width": width, "height": 16, "fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 12.0,
+            "camera_to_rig": {"xyz": [0.5, 0.0, 1.5], "q": [0.5, -0.5, 0.5, -0.5]}})
+    };
+    json!({"name": "pair", "cameras": [camera("left", 24), camera("right", 20)]})
+}
+
+/// What `open` has beside the repair.
+fn opening(name: &str, repair: Value) -> Value {
+    let mut open = json!({"session": name, "rig": rig(), "outputs": {"encoding": "raw", "trust": true}});
+    if !repair.is_null() {
+        open["repair"] = repair;
+    }
+    open
+}
+
+/// A step to a place beside the drive.
+fn beside(y_m: f64) -> Value {
+    json!({"type": "step", "pose": {"xyz": [3.0, y_m, 0.0], "q": [1.0, 0.0, 0.0, 0.0]}})
+}
+
+async fn step(agent: &mut Agent, y_m: f64) -> Seen {
+    agent.look(beside(y_m)).await
+}
+
+/// The status of each image.
+fn statuses(seen: &Seen) -> Vec<String> {
+    let images = seen.meta["images"].as_array().unwrap();
+    images.iter().map(|image| image["repair"]["status"].as_str().unwrap().to_owned()).collect()
+}
+
+fn hashes(seen: &Seen) -> Vec<String> {
+    let images = seen.meta["images"].as_array().unwrap();
+    images.iter().map(|image| image["hash"].as_str().unwrap().to_owned()).collect()
+}
+
+fn pixels(seen: &Seen, camera: &str) -> Vec<u8> {
+    seen.tensors().tensor(&format!("camera/{camera}/rgb")).unwrap().data().to_vec()
+}
+
+#[tokio::test]
+async fn beside_the_drive_images_are_repaired_and_on_it_no_byte_changes() {
+    let folder = brighter();
+    let server = server(&[&folder], 1).await;
+    let mut agent = Agent::connect(server.address()).await;
+    assert_eq!(agent.hello().await["repairs"], json!(["brighter"]));
+    let opened = agent.open(opening("a", json!({"model": "brighter", "at_least": 0.05}))).await;
+    let told = &opened["repair"];
+    assert_eq!((&told["below"], &told["above"]), (&json!(0.75), &json!(0.85)), "{told}");
+    assert_eq!((&told["at_least"], &told["per_step"]), (&json!(0.05), &json!(16)), "{told}");
+    assert_eq!((&told["on_failure"], &told["provider"]), (&json!("unrepaired"), &json!("cpu")));
+    assert_eq!(told["deterministic"], true);
+    let mut plain = server.agent().await;
+    assert_eq!(plain.open(opening("b", Value::Null)).await.get("repair"), None);
+
+    // The trust falls below 0.75 at 1.44 m, and above 0.85 at 0.81 m.
+    for (y_m, status) in [
+        (0.0, "kept"),
+        (1.2, "kept"),
+        (2.0, "repaired"),
+        (1.2, "repaired"),
+        (0.5, "kept"),
+        (1.2, "kept"),
+        (20.0, "kept"),
+    ] {
+        let seen = step(&mut agent, y_m).await;
+        let rendered = step(&mut plain, y_m).await;
+        assert_eq!(statuses(&seen), [status; 2], "{y_m}");
+        for (index, camera) in ["left", "right"].into_iter().enumerate() {
+            let image = &seen.meta["images"][index];
+            let bytes = pixels(&seen, camera);
+            let before = pixels(&rendered, camera);
+            assert_eq!(image["hash"], blake3::hash(&bytes).to_hex().as_str());
+            assert_eq!(image["repair"]["rendered_hash"], rendered.meta["images"][index]["hash"]);
+            assert_eq!(image["trust"], rendered.meta["images"][index]["trust"]);
+            let brighter: Vec<u8> = before
+                .iter()
+                .map(|value| (f32::from(*value) + 25.5).round().min(255.0) as u8)
+                .collect();
+            let wanted = if status == "repaired" { &brighter } else { &before };
+            let off = bytes.iter().zip(wanted).map(|(a, b)| a.abs_diff(*b)).max();
+            // A tenth of 255 is half-way between two steps.
+            assert!(off <= Some(1), "{y_m} {camera}: {off:?}");
+            assert_eq!(bytes == before, status == "kept", "{y_m} {camera}");
+        }
+        assert!(seen.meta["timings"]["repair_ms"].is_number());
+        // Who does not ask is told nothing of it.
+        assert_eq!(rendered.meta["images"][0].get("repair"), None);
+        assert_eq!(rendered.meta["timings"].get("repair_ms"), None);
+    }
+    // An observation has no history: 1.2 m is not repaired, whatever was before.
+    let at = |y_m: f64| json!({"xyz": [3.0, y_m, 0.0], "q": [1.0, 0.0, 0.0, 0.0]});
+    step(&mut agent, 2.0).await;
+    let seen = agent.look(json!({"type": "observe", "poses": [at(2.0), at(1.2)]})).await;
+    assert_eq!(statuses(&seen), ["repaired", "repaired", "kept", "kept"]);
+    assert_eq!(statuses(&step(&mut agent, 1.2).await), ["repaired"; 2], "the history went on");
+}
+
+#[tokio::test]
+async fn files_that_are_sent_are_of_the_repaired_pixels_and_the_count_is_per_pose() {
+    let folder = brighter();
+    let server = server(&[&folder], 1).await;
+    let mut agent = server.agent().await;
+    let mut open = opening("a", json!({"model": "brighter", "per_step": 1}));
+    // Without `outputs.trust` images are selected alike, and no trust is told.
+    open["outputs"] = json!({"encoding": "png", "frames": 2});
+    assert_eq!(agent.open(open).await["outputs"]["trust"], false);
+    for _ in 0..2 {
+        let seen = step(&mut agent, 2.0).await;
+        assert_eq!(statuses(&seen), ["repaired", "kept"]);
+        assert_eq!(seen.meta["images"][0].get("trust"), None);
+        let file = pixels(&seen, "left");
+        let decoded = image::load_from_memory(&file).unwrap().into_rgb8();
+        assert_eq!(blake3::hash(&decoded).to_hex().as_str(), hashes(&seen)[0]);
+    }
+    // The earlier frame of a bundle is the repaired one.
+    let seen = step(&mut agent, 2.5).await;
+    let past = &seen.meta["history"][0];
+    assert_eq!((&past["camera"], &past["repair"]["status"]), (&json!("left"), &json!("repaired")));
+    assert_ne!(past["hash"], past["repair"]["rendered_hash"]);
+    let closed = agent.ask(json!({"type": "close"})).await;
+    assert_eq!(closed["summary"].get("least_trust"), None, "{closed}");
+}
+
+#[tokio::test]
+async fn a_trained_model_gives_the_same_hashes_with_any_threads_and_beside_other_sessions() {
+    let Some(onnx) = trained("zero_dce_pp_rgb.onnx") else { return };
+    let ports = json!([{"name": "input", "role": "rgb"}]);
+    let output = json!([{"name": "output", "role": "rgb"}]);
+    let changes =
+        json!({"name": "zero-dce", "timeout_ms": 10_000, "inputs": ports, "outputs": output});
+    let folder = Folder::new(&onnx, changes);
+    let drive = async |agent: &mut Agent| {
+        let mut all = Vec::new();
+        for k in 0..6 {
+            let seen = step(agent, 2.0 + 0.3 * f64::from(k)).await;
+            assert_eq!(statuses(&seen), ["repaired"; 2]);
+            all.extend(hashes(&seen));
+        }
+        all
+    };
+    let mut runs = Vec::new();
+    for threads in [1, 2] {
+        let server = server(&[&folder], threads).await;
+        for name in ["alone", "again"] {
+            let mut agent = server.agent().await;
+            agent.open(opening(name, json!({"model": "zero-dce"}))).await;
+            runs.push(drive(&mut agent).await);
+        }
+        let mut first = server.agent().await;
+        let mut second = server.agent().await;
+        first.open(opening("first", json!({"model": "zero-dce"}))).await;
+        second.open(opening("second", json!({"model": "zero-dce"}))).await;
+        let (a, b) = tokio::join!(drive(&mut first), drive(&mut second));
+        runs.extend([a, b]);
+    }
+    assert_eq!(runs.len(), 8);
+    assert!(runs.iter().all(|run| *run == runs[0]), "{runs:?}");
+}
+
+#[tokio::test]
+async fn what_cannot_be_repaired_is_refused_at_open_and_names_the_field() {
+    let reference = Folder::new(
+        &doubles::difix(),
+        json!({"name": "difix", "size": {"multiple_of": 64, "fit": "resize", "pixels": 16384}, "inputs": [
+            {"name": "image", "role": "rgb", "dtype": "f16", "range": [-1, 1]},
+            {"name": "reference", "role": "reference", "dtype": "f16", "range": [-1, 1]},
+            {"name": "strength", "role": "constant", "dtype": "f16", "value": 0.5}],
+            "outputs": [{"name": "repaired", "role": "rgb", "range": [-1, 1]}]}),
+    );
+    let slow = Folder::new(&doubles::identity(), json!({"name": "slow", "timeout_ms": 60_000}));
+    let small = Folder::new(
+        &doubles::identity(),
+        json!({"name": "small", "size": {"fixed": [8, 8], "fit": "pad"}}),
+    );
+    let swapped = Folder::new(&doubles::identity(), json!({"name": "swapped"}));
+    let server = server(&[&reference, &slow, &small, &swapped], 1).await;
+    // Swapped while the server runs, before a session asked for it.
+    fs::write(swapped.folder.path().join("model.onnx"), doubles::global()).unwrap();
+    let mut agent = server.agent().await;
+    for (repair, code, field, message) in [
+        (json!({"model": "nix"}), "unknown_repair", "repair.model", "there is difix, slow, small, swapped"),
+        (json!({"model": "difix"}), "repair_unavailable", "repair.model", "needs the input \"reference\""),
+        (json!({"model": "small"}), "repair_unavailable", "repair.model", "camera \"left\": image: 24 x 16 px"),
+        (json!({"model": "swapped"}), "repair_unavailable", "repair.model", "the manifest pins"),
+        (json!({"model": "slow"}), "out_of_range", "deadline_ms", "timeout_ms"),
+        (json!({"model": "slow", "below": 2}), "out_of_range", "repair.below", "trust is 0 to 1"),
+        (json!({"model": "slow", "above": 0.5}), "out_of_range", "repair.above", "less than below"),
+        (json!({"model": "slow", "at_least": 0.8}), "out_of_range", "repair.at_least", "nothing would"),
+        (json!({"model": "slow", "on_failure": "hide"}), "invalid_request", "repair.on_failure", "unrepaired"),
+        (json!({"modell": "slow"}), "invalid_request", "repair.modell", "modell"),
+    ] {
+        let answer = agent.try_open(opening("a", repair.clone())).await;
+        refused(&answer, code);
+        assert_eq!(answer["field"], field, "{repair}: {answer}");
+        assert!(answer["message"].as_str().unwrap().contains(message), "{repair}: {answer}");
+    }
+    // The connection goes on.
+    agent.open(opening("a", Value::Null)).await;
+    step(&mut agent, 2.0).await;
+    assert_eq!(server.recorded().len(), 1);
+}
+
+#[tokio::test]
+async fn super_resolution_is_refused_by_its_scale() {
+    let Some(onnx) = trained("super_resolution_224_niazwazir.onnx") else { return };
+    let changes = json!({
+        "name": "super", "size": {"fixed": [224, 224], "fit": "tile"},
+        "inputs": [{"name": "input", "role": "luma"}],
+        "outputs": [{"name": "output", "role": "luma", "scale": 3}],
+    });
+    let folder = Folder::new(&onnx, changes);
+    let server = server(&[&folder], 1).await;
+    let answer = server.agent().await.try_open(opening("a", json!({"model": "super"}))).await;
+    refused(&answer, "repair_unavailable");
+    assert!(answer["message"].as_str().unwrap().contains("3 times as large"), "{answer}");
+}
+
+#[tokio::test]
+async fn a_hung_model_flags_the_frame_and_is_loaded_again_after_ten() {
+    let hung = with_trust(&doubles::endless_if_doubtful(), "hung", 200);
+    let server = server(&[&hung], 1).await;
+    let mut agent = server.agent().await;
+    agent.open(opening("a", json!({"model": "hung", "per_step": 1}))).await;
+    let mut plain = server.agent().await;
+    plain.open(opening("b", Value::Null)).await;
+    assert_eq!(statuses(&step(&mut agent, 2.0).await), ["repaired", "kept"]);
+    // The trust is 0.3 at 6 m: the model does not end, the frame comes as rendered and says so.
+    let rendered = step(&mut plain, 6.0).await;
+    for _ in 0..9 {
+        let seen = step(&mut agent, 6.0).await;
+        assert_eq!(statuses(&seen), ["failed", "kept"]);
+        assert_eq!(seen.meta["images"][0]["repair"]["failure"], "timed_out");
+        assert_eq!(pixels(&seen, "left"), pixels(&rendered, "left"));
+        assert_eq!(hashes(&seen), hashes(&rendered));
+    }
+    assert_eq!(statuses(&step(&mut agent, 2.0).await), ["repaired", "kept"], "it is usable");
+    for _ in 0..2 {
+        let seen = step(&mut agent, 6.0).await;
+        assert_eq!(seen.meta["images"][0]["repair"]["failure"], "withdrawn");
+    }
+    let seen = step(&mut agent, 2.0).await;
+    assert_eq!(seen.meta["images"][0]["repair"]["failure"], "withdrawn");
+    // A new session loads it again.
+    let mut other = server.agent().await;
+    other.open(opening("c", json!({"model": "hung"}))).await;
+    assert_eq!(statuses(&step(&mut other, 2.0).await), ["repaired"; 2]);
+    // What failed is on record as such, and a replay agrees.
+    agent.ask(json!({"type": "close"})).await;
+    let report = replay(&server, "a-1", &Models::default());
+    assert_eq!((report.difference, report.wrong_value), (None, None));
+    let frame = &lines(&server.episodes.path().join("a-1.jsonl"))[2];
+    assert_eq!(frame["repairs"], json!([{"failed": "timed_out"}, null]));
+}
+
+#[tokio::test]
+async fn nan_is_flagged_or_an_error_as_the_session_chose() {
+    let nan = with_trust(&doubles::nan_if_doubtful(), "nan", 10_000);
+    let server = server(&[&nan], 1).await;
+    let mut flagged = server.agent().await;
+    flagged.open(opening("a", json!({"model": "nan"}))).await;
+    let seen = step(&mut flagged, 6.0).await;
+    assert_eq!(statuses(&seen), ["failed"; 2]);
+    assert_eq!(seen.meta["images"][1]["repair"]["failure"], "not_finite");
+    assert_eq!(statuses(&step(&mut flagged, 2.0).await), ["repaired"; 2]);
+
+    let mut strict = server.agent().await;
+    strict.open(opening("b", json!({"model": "nan", "on_failure": "error"}))).await;
+    assert_eq!(statuses(&step(&mut strict, 2.0).await), ["repaired"; 2]);
+    let answer = strict.ask(beside(6.0)).await;
+    refused(&answer, "repair_failed");
+    let message = answer["message"].as_str().unwrap();
+    assert!(message.contains("\"left\"") && message.contains("NaN"), "{answer}");
+    // Nothing changed: the next step is the second, and the record has no other.
+    let seen = step(&mut strict, 2.0).await;
+    assert_eq!(seen.meta["step"], 2);
+    assert_eq!(lines(&server.episodes.path().join("b-1.jsonl")).len(), 3);
+}
+
+#[tokio::test]
+async fn a_model_that_is_swapped_on_disk_goes_on_as_it_was_loaded() {
+    let folder = brighter();
+    let server = server(&[&folder], 1).await;
+    let mut agent = server.agent().await;
+    let opened = agent.open(opening("a", json!({"model": "brighter"}))).await;
+    let before = hashes(&step(&mut agent, 2.0).await);
+    fs::write(folder.folder.path().join("model.onnx"), doubles::identity()).unwrap();
+    assert_eq!(hashes(&step(&mut agent, 2.0).await), before);
+    let mut other = server.agent().await;
+    let again = other.open(opening("b", json!({"model": "brighter"}))).await;
+    assert_eq!(again["repair"]["repair_hash"], opened["repair"]["repair_hash"]);
+    assert_eq!(hashes(&step(&mut other, 2.0).await), before);
+}
+
+fn replay(server: &TestServer, episode: &str, models: &Models) -> ReplayReport {
+    let path = server.episodes.path().join(format!("{episode}.jsonl"));
+    let recording = RecordedEpisode::read(&path).unwrap();
+    let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
+    let painter = Painter::default();
+    let mut ignore = |_: &_| Ok(());
+    recording.replay_repaired(&cache, &painter, models, ReplayUntil::End, &mut ignore).unwrap()
+}
+
+#[tokio::test]
+async fn a_replay_decides_and_repairs_again() {
+    let folder = brighter();
+    let server = server(&[&folder], 1).await;
+    let mut agent = server.agent().await;
+    agent.open(opening("a", json!({"model": "brighter"}))).await;
+    agent.look(json!({"type": "reset", "seed": 1})).await;
+    for y_m in [0.5, 1.2, 2.0, 1.2, 0.5, 1.2] {
+        step(&mut agent, y_m).await;
+    }
+    agent.ask(json!({"type": "snapshot", "name": "off"})).await;
+    step(&mut agent, 2.0).await;
+    step(&mut agent, 1.2).await;
+    agent.ask(json!({"type": "snapshot", "name": "on"})).await;
+    let at = json!({"xyz": [3.0, 2.0, 0.0], "q": [1.0, 0.0, 0.0, 0.0]});
+    agent.look(json!({"type": "observe", "poses": [at]})).await;
+    step(&mut agent, 0.0).await;
+    // A restored state remembers which cameras were in repair.
+    let restore = |name: &str| json!({"type": "restore", "name": name});
+    assert_eq!(statuses(&agent.look(restore("on")).await), ["repaired"; 2]);
+    assert_eq!(statuses(&step(&mut agent, 1.2).await), ["repaired"; 2]);
+    assert_eq!(statuses(&agent.look(restore("off")).await), ["kept"; 2]);
+    assert_eq!(statuses(&step(&mut agent, 1.2).await), ["kept"; 2]);
+    agent.ask(json!({"type": "close"})).await;
+
+    let again = models(&[&folder], 2);
+    for (episode, repaired) in [("a-1", 10), ("a-2", 4), ("a-3", 0)] {
+        let report = replay(&server, episode, &again);
+        assert_eq!((&report.difference, &report.wrong_value), (&None, &None), "{episode}");
+        assert_eq!(report.changes, []);
+        assert_eq!((report.repaired.compared, report.repaired.not_compared), (repaired, 0));
+        let report = replay(&server, episode, &Models::default());
+        assert_eq!((&report.difference, &report.wrong_value), (&None, &None), "{episode}");
+        assert_eq!((report.repaired.compared, report.repaired.not_compared), (0, repaired));
+    }
+    // Another model of that name is named, and not compared.
+    let other = Folder::new(&doubles::arithmetic("Add", 0.2), json!({"name": "brighter", "timeout_ms": 10_000}));
+    let report = replay(&server, "a-1", &models(&[&other], 1));
+    assert_eq!((report.changes[0].what, report.repaired.not_compared), ("repair hash", 10));
+
+    // Line 5 is the step to 2.0 m. A repaired hash that is altered is found with the model only.
+    let path = server.episodes.path().join("a-1.jsonl");
+    let whole = fs::read_to_string(&path).unwrap();
+    let at_line = 4;
+    assert!(lines(&path)[at_line]["repairs"][0]["repaired"].is_string());
+    tamper(&path, at_line, 0);
+    assert_eq!(replay(&server, "a-1", &again).difference.unwrap().line, at_line + 1);
+    assert_eq!(replay(&server, "a-1", &Models::default()).difference, None);
+    // A decision that does not follow from the trust is named.
+    let mut values: Vec<Value> = whole.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    let rendered = values[at_line]["repairs"][0]["repaired"].clone();
+    values[at_line]["images"][0] = rendered;
+    values[at_line]["repairs"][0] = Value::Null;
+    let text: Vec<String> = values.iter().map(Value::to_string).collect();
+    fs::write(&path, text.join("\n") + "\n").unwrap();
+    let wrong = replay(&server, "a-1", &again).wrong_value.unwrap();
+    assert_eq!((wrong.line, wrong.field), (at_line + 1, "repairs"), "{wrong}");
+    // A recorded episode with repair cannot be continued: the model's images are not in it.
+    let mut other = server.agent().await;
+    let branch = json!({"type": "branch", "from": {"episode": "a-2", "step": 2}});
+    let answer = other.ask(branch).await;
+    refused(&answer, "unknown_state");
+    assert!(answer["message"].as_str().unwrap().contains("repaired by a model"), "{answer}");
+}
+
+#[tokio::test]
+async fn manifests_are_checked_before_a_server_starts() {
+    let a = brighter();
+    let b = brighter();
+    let paths = [a.path(), b.path()];
+    let error = Models::read(&paths, LoadOptions::new(library())).unwrap_err();
+    assert!(error.to_string().contains("name: \"brighter\" is also that of"), "{error}");
+    let error = Models::read(&paths[..1], LoadOptions::default()).unwrap_err();
+    assert!(error.to_string().contains("--onnxruntime"), "{error}");
+    let nowhere = a.folder.path().join("nowhere.so");
+    let error = Models::read(&paths[..1], LoadOptions::new(nowhere)).unwrap_err();
+    assert!(error.to_string().contains("nowhere.so"), "{error}");
+}
