@@ -78,13 +78,14 @@ impl Replay {
         let extent =
             if self.out.is_some() { ReplayUntil::End } else { ReplayUntil::FirstDifference };
         let models = self.repair.models()?;
-        let report = recording.replay_repaired(&cache, &*backend, &models, extent, &mut |image| {
-            bar.inc(1);
-            match &self.out {
-                Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
-                None => Ok(()),
-            }
-        })?;
+        let report =
+            recording.replay_repaired(&cache, &*backend, &models, extent, &mut |image| {
+                bar.inc(1);
+                match &self.out {
+                    Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
+                    None => Ok(()),
+                }
+            })?;
         bar.finish_and_clear();
 
         for change in &report.changes {

@@ -130,11 +130,11 @@ impl Model {
         self.provider
     }
 
-    /// Version of the runtime, as its build says.
-    pub fn runtime(&self) -> &'static str {
+    /// The runtime: name of its library, which has the version, and the commit that it was built from.
+    pub fn runtime(&self) -> String {
         let build = onnx::build_info();
-        let branch = build.split("git-branch=").nth(1).and_then(|rest| rest.split(',').next());
-        branch.unwrap_or(build)
+        let commit = build.split("git-commit-id=").nth(1).and_then(|rest| rest.split(',').next());
+        format!("{}, commit {}", onnx::library_name(), commit.unwrap_or("unknown"))
     }
 
     /// BLAKE3 of all that decides the bytes beside the images: manifest (which pins the files), build of the

@@ -46,7 +46,8 @@ impl Models {
                 return Err(RepairError::RuntimeUnnamed);
             }
             let path = options.library.clone();
-            files::check_library(&path).map_err(|message| RepairError::Runtime { path, message })?;
+            files::check_library(&path)
+                .map_err(|message| RepairError::Runtime { path, message })?;
         }
         Ok(Models { options, entries })
     }

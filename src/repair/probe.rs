@@ -80,8 +80,7 @@ fn check_tiles(
             ..used_out
         };
         if returned.crop(within) != whole.crop(used_out) {
-            let message =
-                format!("with the measured halo of {halo} px they differ from the whole");
+            let message = format!("with the measured halo of {halo} px they differ from the whole");
             return Err(RepairError::Tiles { message });
         }
     }

@@ -54,7 +54,8 @@ impl Selection {
         }
         if self.at_least > self.below {
             let Selection { at_least, below, .. } = self;
-            let must = format!("{at_least:?}, more than below ({below:?}); nothing would be repaired");
+            let must =
+                format!("{at_least:?}, more than below ({below:?}); nothing would be repaired");
             return Err(("at_least", must));
         }
         Ok(())

@@ -40,7 +40,8 @@ fn check(manifest: &Manifest) -> Checked {
         return wrong("format", message);
     }
     let is_letter = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-    if manifest.name.is_empty() || manifest.name.len() > 64 || !manifest.name.chars().all(is_letter) {
+    if manifest.name.is_empty() || manifest.name.len() > 64 || !manifest.name.chars().all(is_letter)
+    {
         let message = format!("{:?}; 1 to 64 letters, digits, '.', '_' and '-'", manifest.name);
         return wrong("name", message);
     }
@@ -89,10 +90,7 @@ fn check_size(manifest: &Manifest) -> Checked {
         (Some(sides), None) if sides.iter().all(is_side) => 1,
         (None, Some(multiple)) if (1..=MAX_MULTIPLE_PX).contains(&multiple) => multiple,
         (Some(sides), None) => {
-            return wrong(
-                "fixed",
-                format!("{sides:?}; [height, width] from 1 to {MAX_SIDE_PX}"),
-            );
+            return wrong("fixed", format!("{sides:?}; [height, width] from 1 to {MAX_SIDE_PX}"));
         }
         (None, Some(multiple)) => {
             return wrong("multiple_of", format!("{multiple}; 1 to {MAX_MULTIPLE_PX}"));
@@ -139,9 +137,8 @@ fn check_inputs(manifest: &Manifest) -> Checked {
     }
     let mut images = 0;
     for (at, input) in manifest.inputs.iter().enumerate() {
-        let wrong = |field: &str, message: &str| {
-            Err((format!("inputs[{at}].{field}"), message.to_owned()))
-        };
+        let wrong =
+            |field: &str, message: &str| Err((format!("inputs[{at}].{field}"), message.to_owned()));
         let is_constant = input.role == InputRole::Constant;
         images += usize::from(matches!(input.role, InputRole::Rgb | InputRole::Luma));
         if manifest.inputs[..at].iter().any(|other| other.name == input.name) {

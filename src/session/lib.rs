@@ -51,8 +51,8 @@ pub use observe::observation::{
 };
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{
-    ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice, ScenarioOptions,
-    SessionOptions, Start, StepOptions,
+    ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice,
+    ScenarioOptions, SessionOptions, Start, StepOptions,
 };
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
@@ -64,8 +64,8 @@ pub use record::format::{
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::repairs::{RecordedImageRepair, RecordedRepair};
 pub use record::replay_report::{
-    ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
-    WrongValue,
+    ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
+    ReplayedImage, WrongValue,
 };
 pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};

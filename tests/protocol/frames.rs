@@ -4,7 +4,8 @@ use serde_json::{Map, Value, json};
 use wildcity_protocol::camera::{Windshield, WindshieldReference};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
 use wildcity_protocol::observation::{
-    Ego, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+    Ego, Image, ImageRepair, ObservationMetadata, RepairFailure, RepairStatus, Residency, Stage,
+    Timings, Trust,
 };
 
 use super::messages::{front, rear};
@@ -38,6 +39,8 @@ pub(crate) struct Recipe {
     pub(crate) instances: bool,
     /// Whether the images come with their trust, and the first camera is behind a windshield.
     pub(crate) trust_and_windshield: bool,
+    /// Whether the session asked for repair: the first image is repaired, the second failed.
+    pub(crate) repair: bool,
 }
 
 impl Recipe {
@@ -51,6 +54,7 @@ impl Recipe {
         normals: false,
         instances: false,
         trust_and_windshield: false,
+        repair: false,
     };
 }
 
@@ -164,10 +168,10 @@ impl Frame {
                 });
             }
         }
-        Self {
-            metadata: ObservationMetadata { history, ..observation(seq, images, frame_hash) },
-            tensors,
-        }
+        let mut metadata =
+            ObservationMetadata { history, ..observation(seq, images, frame_hash) };
+        metadata.timings.repair_ms = recipe.repair.then_some(7.25);
+        Self { metadata, tensors }
     }
 
     /// The frame's bytes.
@@ -289,6 +293,7 @@ fn image(
         camera_to_rig: camera.camera_to_rig,
         shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
+        repair: recipe.repair.then(|| repair(index, &hash)),
         hash,
         trust: recipe.trust_and_windshield.then_some(Trust {
             value: 0.5,
@@ -297,6 +302,22 @@ fn image(
             low_coverage: 0.03125,
             outside: 0.125,
         }),
+    }
+}
+
+fn repair(index: u64, hash: &str) -> ImageRepair {
+    let before = blake3::hash(b"as rendered").to_hex().to_string();
+    match index {
+        0 => ImageRepair {
+            status: RepairStatus::Repaired,
+            rendered_hash: before,
+            failure: None,
+        },
+        _ => ImageRepair {
+            status: RepairStatus::Failed,
+            rendered_hash: hash.to_owned(),
+            failure: Some(RepairFailure::TimedOut),
+        },
     }
 }
 

@@ -238,7 +238,7 @@ async fn public_addresses_are_refused() {
         origins: wildcity_server::Origins::default(),
         tls: None,
         backend: server.painter.clone(),
-        repairs: Arc::default(),
+        repairs: Default::default(),
         profile: ProfileOverrides::default(),
         limits: Limits::default(),
     };

@@ -33,8 +33,7 @@ fn brighter() -> Folder {
 
 /// A model with the inputs `image` and `trust`.
 fn with_trust(onnx: &[u8], name: &str, timeout_ms: u64) -> Folder {
-    let inputs =
-        json!([{"name": "image", "role": "rgb"}, {"name": "trust", "role": "trust"}]);
+    let inputs = json!([{"name": "image", "role": "rgb"}, {"name": "trust", "role": "trust"}]);
     Folder::new(onnx, json!({"name": name, "timeout_ms": timeout_ms, "inputs": inputs}))
 }
 
@@ -50,7 +49,8 @@ fn rig() -> Value {
 
 /// What `open` has beside the repair.
 fn opening(name: &str, repair: Value) -> Value {
-    let mut open = json!({"session": name, "rig": rig(), "outputs": {"encoding": "raw", "trust": true}});
+    let mut open =
+        json!({"session": name, "rig": rig(), "outputs": {"encoding": "raw", "trust": true}});
     if !repair.is_null() {
         open["repair"] = repair;
     }
@@ -127,7 +127,7 @@ async fn beside_the_drive_images_are_repaired_and_on_it_no_byte_changes() {
             assert_eq!(bytes == before, status == "kept", "{y_m} {camera}");
         }
         assert!(seen.meta["timings"]["repair_ms"].is_number());
-        // Who does not ask is told nothing of it.
+        // A session that does not ask is told nothing of it.
         assert_eq!(rendered.meta["images"][0].get("repair"), None);
         assert_eq!(rendered.meta["timings"].get("repair_ms"), None);
     }
@@ -222,15 +222,40 @@ async fn what_cannot_be_repaired_is_refused_at_open_and_names_the_field() {
     fs::write(swapped.folder.path().join("model.onnx"), doubles::global()).unwrap();
     let mut agent = server.agent().await;
     for (repair, code, field, message) in [
-        (json!({"model": "nix"}), "unknown_repair", "repair.model", "there is difix, slow, small, swapped"),
-        (json!({"model": "difix"}), "repair_unavailable", "repair.model", "needs the input \"reference\""),
-        (json!({"model": "small"}), "repair_unavailable", "repair.model", "camera \"left\": image: 24 x 16 px"),
+        (
+            json!({"model": "nix"}),
+            "unknown_repair",
+            "repair.model",
+            "there is difix, slow, small, swapped",
+        ),
+        (
+            json!({"model": "difix"}),
+            "repair_unavailable",
+            "repair.model",
+            "needs the input \"reference\"",
+        ),
+        (
+            json!({"model": "small"}),
+            "repair_unavailable",
+            "repair.model",
+            "camera \"left\": image: 24 x 16 px",
+        ),
         (json!({"model": "swapped"}), "repair_unavailable", "repair.model", "the manifest pins"),
         (json!({"model": "slow"}), "out_of_range", "deadline_ms", "timeout_ms"),
         (json!({"model": "slow", "below": 2}), "out_of_range", "repair.below", "trust is 0 to 1"),
         (json!({"model": "slow", "above": 0.5}), "out_of_range", "repair.above", "less than below"),
-        (json!({"model": "slow", "at_least": 0.8}), "out_of_range", "repair.at_least", "nothing would"),
-        (json!({"model": "slow", "on_failure": "hide"}), "invalid_request", "repair.on_failure", "unrepaired"),
+        (
+            json!({"model": "slow", "at_least": 0.8}),
+            "out_of_range",
+            "repair.at_least",
+            "nothing would",
+        ),
+        (
+            json!({"model": "slow", "on_failure": "hide"}),
+            "invalid_request",
+            "repair.on_failure",
+            "unrepaired",
+        ),
         (json!({"modell": "slow"}), "invalid_request", "repair.modell", "modell"),
     ] {
         let answer = agent.try_open(opening("a", repair.clone())).await;
@@ -340,8 +365,8 @@ fn replay(server: &TestServer, episode: &str, models: &Models) -> ReplayReport {
     let recording = RecordedEpisode::read(&path).unwrap();
     let cache = Cache::new(Catalog::open(server.twins.path()).unwrap());
     let painter = Painter::default();
-    let mut ignore = |_: &_| Ok(());
-    recording.replay_repaired(&cache, &painter, models, ReplayUntil::End, &mut ignore).unwrap()
+    let until = ReplayUntil::End;
+    recording.replay_repaired(&cache, &painter, models, until, &mut |_| Ok(())).unwrap()
 }
 
 #[tokio::test]
@@ -380,7 +405,10 @@ async fn a_replay_decides_and_repairs_again() {
         assert_eq!((report.repaired.compared, report.repaired.not_compared), (0, repaired));
     }
     // Another model of that name is named, and not compared.
-    let other = Folder::new(&doubles::arithmetic("Add", 0.2), json!({"name": "brighter", "timeout_ms": 10_000}));
+    let other = Folder::new(
+        &doubles::arithmetic("Add", 0.2),
+        json!({"name": "brighter", "timeout_ms": 10_000}),
+    );
     let report = replay(&server, "a-1", &models(&[&other], 1));
     assert_eq!((report.changes[0].what, report.repaired.not_compared), ("repair hash", 10));
 

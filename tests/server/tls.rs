@@ -96,7 +96,7 @@ async fn unusable_certificates_are_named() {
             origins: wildcity_server::Origins::default(),
             tls: Some(tls),
             backend: server.painter.clone(),
-            repairs: Arc::default(),
+            repairs: Default::default(),
             profile: wildcity_scene::ProfileOverrides::default(),
             limits: Limits::default(),
         };

@@ -15,8 +15,8 @@ use wildcity_repair::Selection;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    DamagedSummary, Encoding, Engine, EpisodeSummary, EpisodeTraffic, OnFailure, Outcome, PixelMaps,
-    Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
+    DamagedSummary, Encoding, Engine, EpisodeSummary, EpisodeTraffic, OnFailure, Outcome,
+    PixelMaps, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;

@@ -145,8 +145,12 @@ fn status_of(code: Code) -> StatusCode {
         Code::AnswerTooLarge | Code::UploadDigest | Code::PushRefused => {
             StatusCode::UNPROCESSABLE_ENTITY
         }
-        Code::TwinDamaged | Code::RepairFailed | Code::Internal => StatusCode::INTERNAL_SERVER_ERROR,
-        Code::Busy | Code::ShuttingDown | Code::RepairUnavailable => StatusCode::SERVICE_UNAVAILABLE,
+        Code::TwinDamaged | Code::RepairFailed | Code::Internal => {
+            StatusCode::INTERNAL_SERVER_ERROR
+        }
+        Code::Busy | Code::ShuttingDown | Code::RepairUnavailable => {
+            StatusCode::SERVICE_UNAVAILABLE
+        }
         Code::DeadlineExceeded => StatusCode::GATEWAY_TIMEOUT,
         Code::StorageFull => StatusCode::INSUFFICIENT_STORAGE,
     }

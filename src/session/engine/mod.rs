@@ -79,7 +79,8 @@ impl Engine {
     /// # Errors
     /// [`SessionError::Thread`] if a thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs } = settings;
+        let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs } =
+            settings;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),

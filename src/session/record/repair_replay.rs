@@ -75,7 +75,8 @@ impl<'a> RepairReplay<'a> {
         let needs = |role| self.model.as_ref().is_some_and(|model| model.needs(role));
         let normals = needs(wildcity_repair::InputRole::Normals);
         let depth = normals || needs(wildcity_repair::InputRole::Depth);
-        let map = |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
+        let map =
+            |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
         RenderedImage {
             rgb8: vec![0; 3 * pixels],
             depth_m: map(depth, 1),

@@ -20,7 +20,7 @@ pub struct RecordedRepair {
     pub repair_hash: String,
     /// `cpu`, `cuda` or `tensorrt`.
     pub provider: String,
-    /// The version of the runtime.
+    /// The runtime: name of its library, and its commit.
     pub runtime: String,
     /// Whether three runs at its load gave the same bytes.
     pub deterministic: bool,
@@ -49,7 +49,7 @@ impl RecordedRepair {
             version: model.manifest().version.clone(),
             repair_hash: model.repair_hash().to_hex().to_string(),
             provider: model.provider().name().to_owned(),
-            runtime: model.runtime().to_owned(),
+            runtime: model.runtime(),
             deterministic: model.is_deterministic(),
             selection: repair.selection,
             on_failure: repair.on_failure,
@@ -62,7 +62,9 @@ impl RecordedImageRepair {
     pub(crate) fn list(repairs: &[ImageRepair]) -> Vec<Option<Self>> {
         let record = |repair: &ImageRepair| match repair.status {
             RepairStatus::Kept => None,
-            RepairStatus::Repaired => Some(Self::Repaired(repair.rendered_hash.to_hex().to_string())),
+            RepairStatus::Repaired => {
+                Some(Self::Repaired(repair.rendered_hash.to_hex().to_string()))
+            }
             RepairStatus::Failed(failure) => Some(Self::Failed(failure)),
         };
         let list: Vec<Option<Self>> = repairs.iter().map(record).collect();

@@ -223,7 +223,8 @@ impl<'a> Replay<'a> {
                 };
                 let mut pairs = vec![(recorded_rendered, hash_of(&rendered.rgb8))];
                 let mut repaired = None;
-                if let (Some(RecordedImageRepair::Repaired(_)), Some(model)) = (repair, &self.repair)
+                if let (Some(RecordedImageRepair::Repaired(_)), Some(model)) =
+                    (repair, &self.repair)
                 {
                     repaired = model.repaired(mounted, rendered).map_err(|cause| {
                         let camera = mounted.name.clone();

@@ -104,9 +104,8 @@ impl Session {
                 let models = engine.repairs().clone();
                 let cameras = rig.cameras.clone();
                 let tells_trust = outputs.trust;
-                let open = move || {
-                    SessionRepair::open(&models, &asked, &cameras, deadline, tells_trust)
-                };
+                let open =
+                    move || SessionRepair::open(&models, &asked, &cameras, deadline, tells_trust);
                 Some(Arc::new(run_blocking(open).await??))
             }
         };

@@ -14,8 +14,8 @@ use crate::record::format::{
     BUILD, EpisodeHeader, FrameRecord, FrameRequest, Line, RecordedOrigin, RecordedOutputs,
     RecordedSettings, RecordedVersion,
 };
-use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::record::recorder::{NewFile, Recorder};
+use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{PinnedVersion, SessionSettings};
 

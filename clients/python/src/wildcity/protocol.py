@@ -341,7 +341,7 @@ class Welcome:
     limits: Limits
     backend: str
     twins: tuple[TwinInfo, ...]
-    repairs: tuple[str, ...] = ()
+    repairs: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -190,9 +190,8 @@ impl ObservationBuilder {
             }
             let is_later =
                 capture.as_ref().is_some_and(|capture| self.layout.is_shown_later(capture, camera));
-            let done = encoded(&self.layout, camera, &pixels, is_later).map_err(|reason| {
-                SessionError::Encode { camera: mounted.name.clone(), reason }
-            })?;
+            let done = encoded(&self.layout, camera, &pixels, is_later)
+                .map_err(|reason| SessionError::Encode { camera: mounted.name.clone(), reason })?;
             let rendered = &mut self.encoded[index];
             let rendered_hash = rendered.hash;
             self.timings.encode += done.took;
