@@ -6,6 +6,9 @@ use std::sync::Arc;
 
 use wildcity_repair::{LoadOptions, Models, RepairError};
 
+/// Most threads of a model.
+const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
+
 /// The models that repair images.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct RepairOptions {
@@ -19,8 +22,8 @@ pub(super) struct RepairOptions {
     onnxruntime: Option<PathBuf>,
 
     /// Threads of each repair model on the processor. The bytes do not depend on it.
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    repair_threads: usize,
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
+    repair_threads: u16,
 }
 
 /// The manifests, by their paths.
@@ -53,7 +56,8 @@ impl RepairOptions {
     pub(super) fn models(&self) -> Result<Arc<Models>, RepairError> {
         let Some(Manifests(paths)) = &self.repair else { return Ok(Arc::default()) };
         let library = runtime_library(self.onnxruntime.as_ref());
-        let options = LoadOptions { threads: self.repair_threads, ..LoadOptions::new(library) };
+        let threads = usize::from(self.repair_threads);
+        let options = LoadOptions { threads, ..LoadOptions::new(library) };
         Models::read(paths, options).map(Arc::new)
     }
 }

@@ -110,7 +110,7 @@ pub enum OnFailure {
     /// It is delivered as rendered and says so.
     #[default]
     Unrepaired,
-    /// The request is refused with [`SessionError::Repair`]; nothing changed.
+    /// The request is refused with [`SessionError::Repair`](crate::SessionError::Repair); nothing changed.
     Error,
 }
 

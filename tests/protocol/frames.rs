@@ -168,8 +168,7 @@ impl Frame {
                 });
             }
         }
-        let mut metadata =
-            ObservationMetadata { history, ..observation(seq, images, frame_hash) };
+        let mut metadata = ObservationMetadata { history, ..observation(seq, images, frame_hash) };
         metadata.timings.repair_ms = recipe.repair.then_some(7.25);
         Self { metadata, tensors }
     }
@@ -308,11 +307,7 @@ fn image(
 fn repair(index: u64, hash: &str) -> ImageRepair {
     let before = blake3::hash(b"as rendered").to_hex().to_string();
     match index {
-        0 => ImageRepair {
-            status: RepairStatus::Repaired,
-            rendered_hash: before,
-            failure: None,
-        },
+        0 => ImageRepair { status: RepairStatus::Repaired, rendered_hash: before, failure: None },
         _ => ImageRepair {
             status: RepairStatus::Failed,
             rendered_hash: hash.to_owned(),

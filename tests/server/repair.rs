@@ -165,6 +165,81 @@ async fn files_that_are_sent_are_of_the_repaired_pixels_and_the_count_is_per_pos
     assert_eq!(closed["summary"].get("least_trust"), None, "{closed}");
 }
 
+/// A PNG of 24 x 16 px that is opaque in its upper half and clear below.
+fn overlay() -> String {
+    let half = |_, y| image::Rgba(if y < 8 { [9, 8, 7, 255] } else { [0; 4] });
+    let picture = image::RgbaImage::from_fn(24, 16, half);
+    let mut png = std::io::Cursor::new(Vec::new());
+    picture.write_to(&mut png, image::ImageFormat::Png).unwrap();
+    format!("data:image/png;base64,{}", data_encoding::BASE64.encode(png.get_ref()))
+}
+
+#[tokio::test]
+async fn an_overlay_stays_on_top() {
+    let folder = brighter();
+    let server = server(&[&folder], 1).await;
+    let mut open = opening("a", json!({"model": "brighter"}));
+    open["rig"]["cameras"][0]["overlay"] = overlay().into();
+    let mut plain_open = opening("b", Value::Null);
+    plain_open["rig"] = open["rig"].clone();
+    let mut agent = server.agent().await;
+    agent.open(open).await;
+    let mut plain = server.agent().await;
+    plain.open(plain_open).await;
+    let seen = pixels(&step(&mut agent, 2.0).await, "left");
+    let rendered = pixels(&step(&mut plain, 2.0).await, "left");
+    let (above, below) = seen.split_at(3 * 24 * 8);
+    let (rendered_above, rendered_below) = rendered.split_at(3 * 24 * 8);
+    assert_eq!(above, rendered_above);
+    let changed = below.iter().zip(rendered_below).filter(|(a, b)| a != b).count();
+    // All but those that are white already.
+    assert!(changed > below.len() * 8 / 10, "{changed} of {}", below.len());
+}
+
+#[tokio::test]
+async fn a_model_gets_depth_opacity_and_normals_whether_or_not_they_are_sent() {
+    let input = |name: &str, role: &str| json!({"name": name, "role": role});
+    let inputs = json!([
+        input("image", "rgb"),
+        input("depth", "depth"),
+        input("opacity", "opacity"),
+        input("normals", "normals")
+    ]);
+    let changes = json!({"name": "maps", "timeout_ms": 10_000, "inputs": inputs});
+    let folder = Folder::new(&doubles::sum_of_maps(), changes);
+    let server = server(&[&folder], 1).await;
+    let mut plain = server.agent().await;
+    plain.open(opening("plain", Value::Null)).await;
+    let rendered = step(&mut plain, 2.0).await;
+    let mut all = Vec::new();
+    for (name, sent) in [
+        ("none", json!({})),
+        ("depth", json!({"depth": true})),
+        ("all", json!({"depth": true, "opacity": true, "normals": true, "instances": true})),
+    ] {
+        let mut open = opening(name, json!({"model": "maps"}));
+        open["outputs"] = json!({"encoding": "raw"});
+        open["outputs"].as_object_mut().unwrap().extend(sent.as_object().unwrap().clone());
+        let mut agent = server.agent().await;
+        agent.open(open).await;
+        let seen = step(&mut agent, 2.0).await;
+        assert_eq!(statuses(&seen), ["repaired"; 2]);
+        // The painter's depth is 1.5 m, and 2.5 m in the second view; its opacity 0.25, its normals -0.5.
+        for (camera, depth_m) in [("left", 1.5), ("right", 2.5)] {
+            let more = 255.0 * (0.02 * depth_m + 0.5 * 0.25 - 0.2 * 0.5);
+            for (value, before) in pixels(&seen, camera).iter().zip(pixels(&rendered, camera)) {
+                let wanted = (f64::from(before) + more).min(255.0);
+                assert!(
+                    (f64::from(*value) - wanted).abs() <= 0.51,
+                    "{camera}: {before} to {value}"
+                );
+            }
+        }
+        all.push(hashes(&seen));
+    }
+    assert!(all.iter().all(|hashes| *hashes == all[0]), "{all:?}");
+}
+
 #[tokio::test]
 async fn a_trained_model_gives_the_same_hashes_with_any_threads_and_beside_other_sessions() {
     let Some(onnx) = trained("zero_dce_pp_rgb.onnx") else { return };
@@ -420,15 +495,16 @@ async fn a_replay_decides_and_repairs_again() {
     tamper(&path, at_line, 0);
     assert_eq!(replay(&server, "a-1", &again).difference.unwrap().line, at_line + 1);
     assert_eq!(replay(&server, "a-1", &Models::default()).difference, None);
-    // A decision that does not follow from the trust is named.
+    // A decision that does not follow from the trust is named: the step to 0.5 m repaired nothing.
     let mut values: Vec<Value> = whole.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
-    let rendered = values[at_line]["repairs"][0]["repaired"].clone();
-    values[at_line]["images"][0] = rendered;
-    values[at_line]["repairs"][0] = Value::Null;
+    let kept = 2;
+    assert_eq!(values[kept].get("repairs"), None);
+    let hash = values[kept]["images"][0].clone();
+    values[kept]["repairs"] = json!([{ "repaired": hash }, null]);
     let text: Vec<String> = values.iter().map(Value::to_string).collect();
     fs::write(&path, text.join("\n") + "\n").unwrap();
-    let wrong = replay(&server, "a-1", &again).wrong_value.unwrap();
-    assert_eq!((wrong.line, wrong.field), (at_line + 1, "repairs"), "{wrong}");
+    let wrong = replay(&server, "a-1", &Models::default()).wrong_value.unwrap();
+    assert_eq!((wrong.line, wrong.field), (kept + 1, "repairs"), "{wrong}");
     // A recorded episode with repair cannot be continued: the model's images are not in it.
     let mut other = server.agent().await;
     let branch = json!({"type": "branch", "from": {"episode": "a-2", "step": 2}});

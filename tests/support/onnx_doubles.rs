@@ -168,6 +168,30 @@ fn graph_in_a_loop(
     Graph { nodes, constants, inputs, outputs }.onnx()
 }
 
+/// The image and 0.02 of `depth`, 0.5 of `opacity` and 0.2 of `normals`.
+pub(crate) fn sum_of_maps() -> Vec<u8> {
+    let weighted = |map: &'static str, weight: &'static str, product: &'static str| {
+        node("Mul", &[map, weight], &[product], &[])
+    };
+    let map = |name: &str, channels: u64| port(name, F32, &[Some(1), Some(channels), None, None]);
+    Graph {
+        nodes: vec![
+            weighted("depth", "of_depth", "a"),
+            weighted("opacity", "of_opacity", "b"),
+            weighted("normals", "of_normals", "c"),
+            node("Sum", &["image", "a", "b", "c"], &["repaired"], &[]),
+        ],
+        constants: vec![
+            floats("of_depth", &[], &[0.02]),
+            floats("of_opacity", &[], &[0.5]),
+            floats("of_normals", &[], &[0.2]),
+        ],
+        inputs: vec![map("image", 3), map("depth", 1), map("opacity", 1), map("normals", 3)],
+        outputs: vec![port("repaired", F32, &[Some(1), None, None, None])],
+    }
+    .onnx()
+}
+
 /// The signature of Difix: `image` and `reference` in f16, -1 to 1. The reference works on all pixels, as
 /// attention does: its mean is added, weighted by a constant `strength`.
 pub(crate) fn difix() -> Vec<u8> {
