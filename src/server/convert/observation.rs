@@ -7,8 +7,8 @@ use serde::Serialize;
 use crate::fault::Fault;
 use wildcity_protocol::message::RigCamera;
 use wildcity_protocol::observation::{
-    self as wire, Actor, Ego, Event, Image, ImageRepair, NavigationCommand, ObservationMetadata,
-    RepairFailure, RepairStatus, Residency, Route, Stage, Timings, Trust,
+    self as wire, Actor, Ego, Event, Image, NavigationCommand, ObservationMetadata, Residency,
+    Route, Stage, Timings, Trust,
 };
 use wildcity_render::FIRST_ACTOR_INSTANCE;
 use wildcity_scene::ActorBox;
@@ -279,7 +279,9 @@ fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
         .collect()
 }
 
-fn repair(repair: wildcity_session::ImageRepair) -> ImageRepair {
+fn repair(repair: wildcity_session::ImageRepair) -> wire::ImageRepair {
+    use wire::{RepairFailure, RepairStatus};
+
     let wildcity_session::ImageRepair { status, rendered_hash } = repair;
     let (status, failure) = match status {
         wildcity_session::RepairStatus::Kept => (RepairStatus::Kept, None),
@@ -294,7 +296,7 @@ fn repair(repair: wildcity_session::ImageRepair) -> ImageRepair {
             (RepairStatus::Failed, Some(failure))
         }
     };
-    ImageRepair { status, rendered_hash: rendered_hash.to_hex().to_string(), failure }
+    wire::ImageRepair { status, rendered_hash: rendered_hash.to_hex().to_string(), failure }
 }
 
 fn trust(trust: wildcity_session::Trust) -> Trust {

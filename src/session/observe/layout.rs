@@ -120,6 +120,11 @@ impl ObservationLayout {
         Ok(layout)
     }
 
+    /// Reserves room in the headers for what is told of repaired images. Comes before [`Self::reserve_header`].
+    pub(crate) fn reserve_repair(&mut self) {
+        self.image_bytes = HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES;
+    }
+
     pub(crate) fn cameras(&self) -> &[RigCamera] {
         &self.cameras
     }
@@ -206,11 +211,6 @@ impl ObservationLayout {
             return Err(SessionError::AnswerTooLarge { field, pixels, limit });
         }
         Ok(())
-    }
-
-    /// Reserves room in the headers for what is told of repaired images. Comes before [`Self::reserve_header`].
-    pub(crate) fn reserve_repair(&mut self) {
-        self.image_bytes = HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES;
     }
 
     /// Reserves room in the headers for what a scenario with so many actors tells.
