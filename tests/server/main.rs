@@ -32,6 +32,7 @@ mod profile;
 mod record;
 mod refused;
 mod repair;
+mod repair_failures;
 mod replay;
 mod resume;
 mod scenarios;

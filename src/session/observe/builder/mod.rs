@@ -126,8 +126,8 @@ impl ObservationBuilder {
             gate.as_ref().is_some_and(|gate| needs(&gate.session))
         };
         let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
-        let needs_depth = (normals && capture.shown || model_needs(SessionRepair::needs_depth))
-            && !(depth && capture.shown);
+        let uses_depth = (normals && capture.shown) || model_needs(SessionRepair::needs_depth);
+        let needs_depth = uses_depth && !(depth && capture.shown);
         let needs_normals =
             model_needs(SessionRepair::needs_normals) && !(normals && capture.shown);
         let extra_values =
@@ -138,7 +138,7 @@ impl ObservationBuilder {
         let mut normal_maps = zeroed_maps(frame.views, 3, needs_normals);
 
         // Where the renderer writes.
-        let raw_at = self.raw_places(capture);
+        let raw_at = gate.as_ref().map_or(Vec::new(), |_| self.raw_places(capture));
         let mut targets = self.targets(capture, scratch);
         for (target, opacity) in targets.iter_mut().zip(&mut opacity_maps) {
             target.opacity = Some(opacity);
