@@ -16,12 +16,12 @@
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
-//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, scene, sim, twin |
+//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, repair, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
 //! | [`wildcity_repair`] | repair of images by an ONNX model: manifest, tiles, checks, hashes | nothing of ours |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
 //! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, twin |
-//! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, protocol, push, render, scene, session, sim, twin |
+//! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, protocol, push, render, repair, scene, session, sim, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
@@ -34,14 +34,14 @@
 //!    only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
-//! 5. An image is a function of scene version, render profile, poses, cameras and actors. Caches change
-//!    latency, never pixels.
+//! 5. An image is a function of scene version, render profile, poses, cameras and actors; and, where it says so,
+//!    of the repair model's hash and the episode's history. Caches change latency, never pixels.
 //! 6. Every observation names the scene version and the render profile that it was made with. A new version
 //!    becomes visible only between two steps, and only to a session that asked for it.
 //! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative f32.
 //! 8. Every queue, message, buffer and count has a maximum, in the `limits` module of its package.
-//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses or actors there is no
-//!    buffer, pass, pipeline or library for them.
+//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses, actors or repair there is
+//!    no buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 //!
 //! [`wildcity_score`]: ../wildcity_score/index.html

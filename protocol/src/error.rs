@@ -44,6 +44,12 @@ pub enum Code {
     UnknownScenario,
     /// The scenario is malformed, does not fit the twin, or a hash that it names differs.
     ScenarioInvalid,
+    /// The server has no repair model of this name.
+    UnknownRepair,
+    /// The repair model cannot be loaded, or not be used for these images.
+    RepairUnavailable,
+    /// The repair model failed, and the session asked for an error then. Nothing changed.
+    RepairFailed,
     /// A session of this name already exists.
     SessionExists,
     /// A name is not 1 to 64 characters of `[a-z0-9._-]`, or starts with a dot.

@@ -299,6 +299,51 @@ pub struct Image {
     /// Confidence in the image, if the session asked for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<Trust>,
+    /// What became of the image, if the session asked for repair.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub repair: Option<ImageRepair>,
+}
+
+/// What became of an image in a session that asked for repair. Depth, opacity, normals and instances stay those of
+/// the scene.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ImageRepair {
+    /// What became of it.
+    pub status: RepairStatus,
+    /// BLAKE3 of the raw pixel bytes before the repair, in hex: the image's `hash` unless the status is `repaired`.
+    pub rendered_hash: String,
+    /// Why the model failed. Only with the status `failed`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failure: Option<RepairFailure>,
+}
+
+/// What became of an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum RepairStatus {
+    /// It was not selected: it is as rendered.
+    Kept,
+    /// It was repaired.
+    Repaired,
+    /// It was selected, but the model failed: it is as rendered.
+    Failed,
+}
+
+/// Why a model failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum RepairFailure {
+    /// It ran longer than its limit and was stopped.
+    TimedOut,
+    /// It returned NaN or infinity.
+    NotFinite,
+    /// It ran too long too often and is not used any more. Open another session to load it again.
+    Withdrawn,
+    /// Anything else. The server's log has the message.
+    Other,
 }
 
 /// Confidence in an image: how close it is to what was recorded, and the measurements behind that number.
@@ -331,6 +376,9 @@ pub struct Timings {
     pub render_ms: f64,
     /// CPU time of encoding and hashing, most of it in parallel with rendering.
     pub encode_ms: f64,
+    /// Wall time of the repair. Only if the session asked for repair.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub repair_ms: Option<f64>,
     /// Wall time of each render stage.
     pub stages_ms: Vec<Stage>,
 }

@@ -35,6 +35,7 @@ mod progress;
 mod push;
 mod render;
 mod repair;
+mod repair_options;
 mod replay;
 mod report;
 mod rig;

@@ -5,12 +5,15 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
-use wildcity_session::{FrameRequest, RecordedEpisode, ReplayUntil, ReplayedImage};
+use wildcity_session::{
+    FrameRequest, RecordedEpisode, RecordedRepair, RepairedImages, ReplayUntil, ReplayedImage,
+};
 use wildcity_twin::residency::Cache;
 
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::exit::Exit;
+use super::repair_options::RepairOptions;
 use super::{output, progress};
 
 /// Show a recorded episode, or render it again and compare every image with the recording.
@@ -39,6 +42,9 @@ pub(super) struct Replay {
 
     #[command(flatten)]
     backend: BackendOptions,
+
+    #[command(flatten)]
+    repair: RepairOptions,
 }
 
 /// The exit code of a recording that was cut and verifies as far as it goes.
@@ -48,6 +54,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity replay ~/.local/state/wildcity/episodes/agent-1.jsonl
   wildcity replay agent-1.jsonl --verify
+  wildcity replay agent-1.jsonl --verify --repair zero-dce.json   (repairs images again, too)
   wildcity replay agent-1.jsonl --out images --backend reference";
 
 impl Replay {
@@ -70,13 +77,15 @@ impl Replay {
         // With --out all images are rendered. Without it, the first difference decides the result.
         let extent =
             if self.out.is_some() { ReplayUntil::End } else { ReplayUntil::FirstDifference };
-        let report = recording.replay(&cache, &*backend, extent, &mut |image| {
-            bar.inc(1);
-            match &self.out {
-                Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
-                None => Ok(()),
-            }
-        })?;
+        let models = self.repair.models()?;
+        let report =
+            recording.replay_repaired(&cache, &*backend, &models, extent, &mut |image| {
+                bar.inc(1);
+                match &self.out {
+                    Some(dir) => write_png(dir, image).map_err(|error| format!("{error:#}")),
+                    None => Ok(()),
+                }
+            })?;
         bar.finish_and_clear();
 
         for change in &report.changes {
@@ -95,6 +104,17 @@ impl Replay {
             Some(difference) => {
                 writeln!(out, "differs     {difference}")?;
             }
+        }
+        let RepairedImages { compared, not_compared } = report.repaired;
+        if compared > 0 {
+            writeln!(out, "repaired    {compared} images, repaired again and compared")?;
+        }
+        if not_compared > 0 {
+            let model = header.repair.as_ref().map_or("", |repair| &repair.model);
+            writeln!(
+                out,
+                "repaired    {not_compared} images, compared as rendered only: give the model {model} with --repair"
+            )?;
         }
         match &report.wrong_value {
             None => {}
@@ -126,6 +146,11 @@ fn summary(out: &mut impl Write, recording: &RecordedEpisode) -> io::Result<()> 
     writeln!(out, "manifest    {}", header.version_hash)?;
     writeln!(out, "recorded by {}, backend {}", header.build, header.backend)?;
     writeln!(out, "rig         {}: {}", header.rig.name, cameras.join(", "))?;
+    if let Some(repair) = &header.repair {
+        let count = frames.iter().flat_map(|frame| &frame.repairs).flatten().count();
+        let RecordedRepair { model, version, provider, .. } = repair;
+        writeln!(out, "repair      {model} {version} on {provider}, {count} images")?;
+    }
     writeln!(out, "frames      {} with {images} images", frames.len())?;
     for (before, version) in versions {
         writeln!(out, "switched    to version {} after {before} frames", version.version)?;

@@ -15,6 +15,17 @@ pub enum RepairError {
         /// What is wrong, and what is accepted.
         message: String,
     },
+    /// There is no model of this name.
+    #[error(
+        "there is no repair model {name:?}; there is {}",
+        if known.is_empty() { "none".to_owned() } else { known.join(", ") }
+    )]
+    Unknown {
+        /// The name asked for.
+        name: String,
+        /// The names of the models.
+        known: Vec<String>,
+    },
     /// A file cannot be read.
     #[error("{}: {message}", path.display())]
     File {

@@ -26,6 +26,11 @@ pub(crate) struct GraphFiles {
     pub(crate) weights: Vec<(String, Arc<[u8]>)>,
 }
 
+/// Reads a manifest alone.
+pub(crate) fn read_manifest(path: &Path) -> Result<Manifest, RepairError> {
+    Manifest::parse(&read_at_most(path, MAX_MANIFEST_BYTES)?, path)
+}
+
 pub(crate) fn read(path: &Path) -> Result<ModelFiles, RepairError> {
     let manifest_bytes = read_at_most(path, MAX_MANIFEST_BYTES)?;
     let manifest = Manifest::parse(&manifest_bytes, path)?;

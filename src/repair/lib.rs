@@ -11,31 +11,38 @@
 //!
 //! | file | what it does |
 //! |---|---|
-//! | `manifest` | the file format and its checks |
+//! | `manifest`, `validate` | the file format, and its checks |
 //! | `files` | reads manifest and model, compares hashes |
 //! | `onnx` | the runtime: library, environment, session, worker thread, time-out |
 //! | `signature` | compares the manifest with the inputs and outputs of the graph |
 //! | `planes`, `resample`, `roles` | images as planes of f32, their sizes, their ranges |
 //! | `tiles`, `halo` | windows of an image; how far a pixel of the output depends on the input |
 //! | `merge` | output of the model to an image |
+//! | `runner`, `probe`, `fitted` | runs of the graph; what they show at load; the size in which it sees an image |
 //! | `model` | all of it in order |
+//! | `models` | the models that a program offers by name, each loaded when it is first asked for |
 //! | `select` | which views of a step are repaired, by trust |
 
 mod error;
 mod files;
+mod fitted;
 mod halo;
 mod image;
 pub mod limits;
 mod manifest;
 mod merge;
 mod model;
+mod models;
 mod onnx;
 mod planes;
+mod probe;
 mod resample;
 mod roles;
+mod runner;
 mod select;
 mod signature;
 mod tiles;
+mod validate;
 
 pub use error::RepairError;
 pub use halo::Halo;
@@ -45,5 +52,6 @@ pub use manifest::{
     Size, Unit,
 };
 pub use model::{LoadOptions, Model, Repaired};
+pub use models::Models;
 pub use onnx::is_loaded;
 pub use select::{Decision, Selection};

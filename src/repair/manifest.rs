@@ -1,14 +1,6 @@
 //! The manifest of a model: what its inputs mean, which sizes it takes, how its output is merged.
 
-use std::path::Path;
-
 use serde::{Deserialize, Serialize};
-
-use crate::error::RepairError;
-use crate::limits::{
-    MAX_CONSTANT_VALUES, MAX_FILES, MAX_INPUTS, MAX_MULTIPLE_PX, MAX_SCALE, MAX_SIDE_PX,
-    MAX_TIMEOUT_MS,
-};
 
 /// A model as its manifest describes it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -284,27 +276,16 @@ impl OutputRole {
     }
 }
 
+impl Size {
+    /// The sides must be multiples of this, in pixels; 1 if the size is fixed.
+    pub(crate) fn multiple(&self) -> usize {
+        self.multiple_of.unwrap_or(1) as usize
+    }
+}
+
 impl Manifest {
     /// The field `format`.
     pub const FORMAT: &str = "wildcity.repair/1";
-
-    /// Reads and checks the text of a manifest; `file` is named in errors.
-    ///
-    /// # Errors
-    /// [`RepairError::Manifest`] with the field that is wrong.
-    pub fn parse(bytes: &[u8], file: &Path) -> Result<Manifest, RepairError> {
-        let wrong = |field: String, message: String| RepairError::Manifest {
-            file: file.to_owned(),
-            field,
-            message,
-        };
-        let mut reader = serde_json::Deserializer::from_slice(bytes);
-        let manifest: Manifest = serde_path_to_error::deserialize(&mut reader)
-            .map_err(|error| wrong(error.path().to_string(), error.into_inner().to_string()))?;
-        reader.end().map_err(|error| wrong("end".to_owned(), error.to_string()))?;
-        manifest.check().map_err(|(field, message)| wrong(field, message))?;
-        Ok(manifest)
-    }
 
     /// The input of the image itself.
     pub(crate) fn image_input(&self) -> &Input {
@@ -316,179 +297,4 @@ impl Manifest {
     pub(crate) fn output(&self) -> &Output {
         &self.outputs[0]
     }
-
-    /// What the types do not say. The field and what is accepted.
-    fn check(&self) -> Result<(), (String, String)> {
-        let wrong = |field: &str, message: String| Err((field.to_owned(), message));
-        if self.format != Manifest::FORMAT {
-            let message = format!("{:?}; this program reads {:?}", self.format, Manifest::FORMAT);
-            return wrong("format", message);
-        }
-        let is_letter = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-        if self.name.is_empty() || self.name.len() > 64 || !self.name.chars().all(is_letter) {
-            let message = format!("{:?}; 1 to 64 letters, digits, '.', '_' and '-'", self.name);
-            return wrong("name", message);
-        }
-        if self.providers.is_empty() {
-            return wrong("providers", "empty; name \"cpu\", \"cuda\" or \"tensorrt\"".to_owned());
-        }
-        if !(1..=MAX_TIMEOUT_MS).contains(&self.timeout_ms) {
-            let message = format!("{}; 1 to {MAX_TIMEOUT_MS}", self.timeout_ms);
-            return wrong("timeout_ms", message);
-        }
-        if self.memory_mib == 0 {
-            return wrong("memory_mib", "0; at least 1".to_owned());
-        }
-        self.check_files()?;
-        self.check_size()?;
-        self.check_inputs()?;
-        self.check_output()
-    }
-
-    fn check_files(&self) -> Result<(), (String, String)> {
-        if self.files.is_empty() || self.files.len() > MAX_FILES {
-            let message =
-                format!("{} files; name 1 to {MAX_FILES}, the .onnx file first", self.files.len());
-            return Err(("files".to_owned(), message));
-        }
-        for (at, file) in self.files.iter().enumerate() {
-            let is_name =
-                Path::new(&file.path).file_name().is_some_and(|name| name == file.path.as_str());
-            if !is_name {
-                let message = format!("{:?}; the name of a file beside the manifest", file.path);
-                return Err((format!("files[{at}].path"), message));
-            }
-            if blake3::Hash::from_hex(&file.blake3).is_err() {
-                let message = format!("{:?}; 64 hexadecimal digits (`b3sum FILE`)", file.blake3);
-                return Err((format!("files[{at}].blake3"), message));
-            }
-        }
-        Ok(())
-    }
-
-    fn check_size(&self) -> Result<(), (String, String)> {
-        let wrong = |field: &str, message: String| Err((format!("size.{field}"), message));
-        let size = &self.size;
-        let is_side = |side: &u32| (1..=MAX_SIDE_PX as u32).contains(side);
-        let multiple = match (size.fixed, size.multiple_of) {
-            (Some(sides), None) if sides.iter().all(is_side) => 1,
-            (None, Some(multiple)) if (1..=MAX_MULTIPLE_PX).contains(&multiple) => multiple,
-            (Some(sides), None) => {
-                return wrong(
-                    "fixed",
-                    format!("{sides:?}; [height, width] from 1 to {MAX_SIDE_PX}"),
-                );
-            }
-            (None, Some(multiple)) => {
-                return wrong("multiple_of", format!("{multiple}; 1 to {MAX_MULTIPLE_PX}"));
-            }
-            _ => {
-                return wrong(
-                    "fixed",
-                    "give either \"fixed\": [height, width] or \"multiple_of\"".to_owned(),
-                );
-            }
-        };
-        let needs_pixels = size.fit == Fit::Resize && size.fixed.is_none();
-        let is_count = size.pixels.is_some_and(|pixels| (1..=1 << 28).contains(&pixels));
-        if needs_pixels && !is_count {
-            return wrong("pixels", "needed with \"fit\": \"resize\": 1 to 268435456".to_owned());
-        }
-        if !needs_pixels && size.pixels.is_some() {
-            return wrong(
-                "pixels",
-                "only with \"fit\": \"resize\" and \"multiple_of\"; remove it".to_owned(),
-            );
-        }
-        let needs_tile = size.fit == Fit::Tile && size.fixed.is_none();
-        let is_tile = |side: &u32| is_side(side) && side.is_multiple_of(multiple);
-        if needs_tile && !size.tile.is_some_and(|sides| sides.iter().all(is_tile)) {
-            return wrong(
-                "tile",
-                format!("needed with \"fit\": \"tile\": [height, width], multiples of {multiple}"),
-            );
-        }
-        if !needs_tile && size.tile.is_some() {
-            return wrong(
-                "tile",
-                "only with \"fit\": \"tile\" and \"multiple_of\"; remove it".to_owned(),
-            );
-        }
-        Ok(())
-    }
-
-    fn check_inputs(&self) -> Result<(), (String, String)> {
-        if self.inputs.is_empty() || self.inputs.len() > MAX_INPUTS {
-            let message = format!("{} inputs; 1 to {MAX_INPUTS}", self.inputs.len());
-            return Err(("inputs".to_owned(), message));
-        }
-        let mut images = 0;
-        for (at, input) in self.inputs.iter().enumerate() {
-            let wrong = |field: &str, message: &str| {
-                Err((format!("inputs[{at}].{field}"), message.to_owned()))
-            };
-            let is_constant = input.role == InputRole::Constant;
-            images += usize::from(matches!(input.role, InputRole::Rgb | InputRole::Luma));
-            if self.inputs[..at].iter().any(|other| other.name == input.name) {
-                return wrong("name", "named twice; each input of the graph has one entry");
-            }
-            if !is_range(input.range) {
-                return wrong("range", "[black, white]: two finite, different numbers");
-            }
-            if is_constant != input.value.is_some_and(f64::is_finite)
-                || (!is_constant && !input.shape.is_empty())
-            {
-                return wrong(
-                    "value",
-                    "a finite number, needed with the role \"constant\" and only there",
-                );
-            }
-            let values: f64 = input.shape.iter().map(|side| f64::from(*side)).product();
-            if values > MAX_CONSTANT_VALUES as f64 {
-                return wrong("shape", "more than 1048576 values");
-            }
-            if input.dtype == Dtype::I64 && !is_constant {
-                return wrong("dtype", "i64 only with the role \"constant\"; f32 or f16 here");
-            }
-        }
-        if images != 1 {
-            let message = format!("{images} have the role \"rgb\" or \"luma\"; exactly one must");
-            return Err(("inputs".to_owned(), message));
-        }
-        Ok(())
-    }
-
-    fn check_output(&self) -> Result<(), (String, String)> {
-        let wrong =
-            |field: &str, message: &str| Err((format!("outputs[0].{field}"), message.to_owned()));
-        let [output] = &self.outputs[..] else {
-            let message = format!("{} outputs; exactly one", self.outputs.len());
-            return Err(("outputs".to_owned(), message));
-        };
-        if !is_range(output.range) {
-            return wrong("range", "[black, white]: two finite, different numbers");
-        }
-        if !(1..=MAX_SCALE).contains(&output.scale) {
-            return wrong("scale", "1 to 4");
-        }
-        let is_luma_in = self.image_input().role == InputRole::Luma;
-        if (output.role == OutputRole::Luma) != is_luma_in {
-            return wrong("role", "\"luma\" if and only if an input has the role \"luma\"");
-        }
-        let adds = output.role == OutputRole::Residual || self.merge == Merge::Residual;
-        if adds && output.scale != 1 {
-            return wrong("scale", "1 with a residual: a larger image has nothing to add to");
-        }
-        if output.role == OutputRole::Residual && self.merge == Merge::Replace {
-            return Err((
-                "merge".to_owned(),
-                "\"residual\" with the output role \"residual\"".to_owned(),
-            ));
-        }
-        Ok(())
-    }
-}
-
-fn is_range(range: [f32; 2]) -> bool {
-    range.iter().all(|end| end.is_finite()) && range[0] != range[1]
 }

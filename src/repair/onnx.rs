@@ -70,6 +70,13 @@ pub(crate) fn build_info() -> &'static str {
     ort::info()
 }
 
+/// Name of the library's file, such as `libonnxruntime.so.1.32.0`; empty before one is loaded.
+pub(crate) fn library_name() -> String {
+    let runtime = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let name = runtime.as_ref().and_then(|runtime| runtime.library.file_name());
+    name.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
 /// An input or output of a graph.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Port {
@@ -183,6 +190,11 @@ impl Worker {
             }
         };
         Ok((Worker { jobs, timeouts: 0, withdrawn: None }, graph))
+    }
+
+    /// Whether no run will succeed any more.
+    pub(crate) fn is_withdrawn(&self) -> bool {
+        self.withdrawn.is_some()
     }
 
     /// Runs the graph and returns the output of that name. A run longer than `limit` is stopped.

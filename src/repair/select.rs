@@ -39,27 +39,39 @@ impl Selection {
     /// Checks the thresholds.
     ///
     /// # Errors
-    /// The field that is wrong and what is accepted.
-    pub fn check(&self) -> Result<(), String> {
+    /// The field that is wrong, and its value with what is accepted.
+    pub fn check(&self) -> Result<(), (&'static str, String)> {
         let fields = [("below", self.below), ("above", self.above), ("at_least", self.at_least)];
         for (field, value) in fields {
             if !(0.0..=1.0).contains(&value) {
-                return Err(format!("{field}: {value:?}; trust is 0 to 1"));
+                return Err((field, format!("{value:?}; trust is 0 to 1")));
             }
         }
         if self.above < self.below {
             let Selection { above, below, .. } = self;
-            return Err(format!(
-                "above: {above:?} is less than below ({below:?}); give at least {below:?}"
-            ));
+            let must = format!("{above:?}, less than below ({below:?}); give at least {below:?}");
+            return Err(("above", must));
         }
         if self.at_least > self.below {
             let Selection { at_least, below, .. } = self;
-            return Err(format!(
-                "at_least: {at_least:?} is more than below ({below:?}); nothing would be repaired"
-            ));
+            let must =
+                format!("{at_least:?}, more than below ({below:?}); nothing would be repaired");
+            return Err(("at_least", must));
         }
         Ok(())
+    }
+
+    /// Whether a camera is in repair at a trust, given whether it was before.
+    fn is_on(&self, was_on: bool, trust: f64) -> bool {
+        match was_on {
+            true => trust <= self.above,
+            false => trust < self.below,
+        }
+    }
+
+    /// Whether an image may be repaired, if `per_step` leaves room for it.
+    pub fn is_candidate(&self, was_on: bool, trust: f64) -> bool {
+        self.is_on(was_on, trust) && trust >= self.at_least
     }
 
     /// Decides a step. `trust` has a value per camera; `before` says which cameras were in repair after the
@@ -68,13 +80,10 @@ impl Selection {
     pub fn decide(&self, before: &[bool], trust: &[f64]) -> Decision {
         let trust: Vec<f64> = trust.iter().map(|t| if t.is_nan() { 0.0 } else { *t }).collect();
         let was_on = |camera: usize| before.get(camera).copied().unwrap_or(false);
-        let is_on = |camera: usize| match was_on(camera) {
-            true => trust[camera] <= self.above,
-            false => trust[camera] < self.below,
-        };
-        let is_on: Vec<bool> = (0..trust.len()).map(is_on).collect();
-        let is_chosen = |camera: &usize| is_on[*camera] && trust[*camera] >= self.at_least;
+        let is_on = |camera: usize| self.is_on(was_on(camera), trust[camera]);
+        let is_chosen = |camera: &usize| self.is_candidate(was_on(*camera), trust[*camera]);
         let mut cameras: Vec<usize> = (0..trust.len()).filter(is_chosen).collect();
+        let is_on: Vec<bool> = (0..trust.len()).map(is_on).collect();
         cameras.sort_by(|a, b| trust[*a].total_cmp(&trust[*b]).then(a.cmp(b)));
         cameras.truncate(self.per_step);
         cameras.sort_unstable();

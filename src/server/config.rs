@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use wildcity_push::QueueLimits;
 use wildcity_render::Backend;
+use wildcity_repair::Models;
 use wildcity_scene::ProfileOverrides;
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DiskCacheSettings;
@@ -47,6 +48,8 @@ pub struct Config {
     pub tls: Option<TlsFiles>,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
+    /// The models that can repair images, by name. Each is loaded when a session asks for it.
+    pub repairs: Arc<Models>,
     /// Changes of the render profile of every twin; a session may change more.
     pub profile: ProfileOverrides,
     /// Time-outs, counts and bytes.
@@ -65,6 +68,7 @@ impl Config {
             origins: Origins::default(),
             tls: None,
             backend,
+            repairs: Arc::default(),
             profile: ProfileOverrides::default(),
             limits: Limits::default(),
         }
@@ -166,8 +170,18 @@ impl Default for SpoolLimits {
 
 impl std::fmt::Debug for Config {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { listen, directories, cache, tokens, origins, tls, backend, profile, limits } =
-            self;
+        let Self {
+            listen,
+            directories,
+            cache,
+            tokens,
+            origins,
+            tls,
+            backend,
+            repairs,
+            profile,
+            limits,
+        } = self;
         f.debug_struct("Config")
             .field("listen", listen)
             .field("directories", directories)
@@ -176,6 +190,7 @@ impl std::fmt::Debug for Config {
             .field("origins", origins)
             .field("tls", tls)
             .field("backend", &backend.name())
+            .field("repairs", &repairs.names().collect::<Vec<_>>())
             .field("profile", profile)
             .field("limits", limits)
             .finish()

@@ -78,6 +78,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         origins,
         tls,
         backend,
+        repairs,
         profile,
         limits,
     } = config;
@@ -97,6 +98,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         scenarios: Scenarios::in_dir(scenarios),
         backend,
         step_timeout: limits.step,
+        repairs,
     })?;
 
     // The socket.

@@ -42,6 +42,9 @@ pub struct Episode {
     /// Whether a rule of the scenario ended it because the ego failed.
     #[serde(default, skip_serializing_if = "is_false")]
     failed: bool,
+    /// By camera, whether its images are being repaired; empty if none is.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    repairing: Vec<bool>,
 }
 
 fn is_false(value: &bool) -> bool {
@@ -120,6 +123,7 @@ impl Episode {
             begin_us,
             least_trust: None,
             failed: false,
+            repairing: Vec::new(),
         }
     }
 
@@ -307,6 +311,17 @@ impl Episode {
             let mean = sum / count;
             self.least_trust = Some(self.least_trust.map_or(mean, |least: f64| least.min(mean)));
         }
+    }
+
+    /// By camera, whether its images are being repaired; empty if none is.
+    pub(crate) fn repairing(&self) -> &[bool] {
+        &self.repairing
+    }
+
+    /// Takes over which cameras are being repaired after an observation; `None` changes nothing.
+    pub(crate) fn set_repairing(&mut self, repairing: Option<Vec<bool>>) {
+        let Some(repairing) = repairing else { return };
+        self.repairing = if repairing.contains(&true) { repairing } else { Vec::new() };
     }
 
     /// The ego history now.

@@ -1,6 +1,7 @@
 //! What can go wrong with a session.
 
 use wildcity_render::RenderError;
+use wildcity_repair::RepairError;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::route::RouteError;
 use wildcity_scene::sky::SkyError;
@@ -41,6 +42,30 @@ pub enum SessionError {
         name: String,
         /// The names of the rig's cameras.
         known: Vec<String>,
+    },
+    /// The server has no repair model of this name.
+    #[error("there is no repair model {name:?}; there is {}", joined_or_none(known))]
+    UnknownRepair {
+        /// The requested name.
+        name: String,
+        /// The names of the models.
+        known: Vec<String>,
+    },
+    /// The repair model cannot be loaded, or not be used for these images.
+    #[error("the repair model {name:?} cannot be used: {reason}")]
+    RepairUnavailable {
+        /// The requested name.
+        name: String,
+        /// Why.
+        reason: String,
+    },
+    /// The repair model failed, and the session asked for an error then.
+    #[error("the image of camera {camera:?} was not repaired: {cause}; nothing changed")]
+    Repair {
+        /// Name of the camera.
+        camera: String,
+        /// Why.
+        cause: Box<RepairError>,
     },
     /// A recorded drive of the twin is no route.
     #[error(transparent)]

@@ -14,6 +14,7 @@
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
+//! | `repair` | which images a model repairs, and what is told of each |
 //! | `scenario` | scenarios by name, and the files beside them |
 //! | `stills` | images from any views, without an episode |
 //! | [`limits`] | limits and defaults |
@@ -28,6 +29,7 @@ mod options;
 mod pin;
 mod prefetch;
 mod record;
+mod repair;
 mod scenario;
 mod session;
 mod snapshot;
@@ -49,8 +51,8 @@ pub use observe::observation::{
 };
 pub use observe::trust::{TrainingCoverage, Trust};
 pub use options::{
-    ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
-    SessionOptions, Start, StepOptions,
+    ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice,
+    ScenarioOptions, SessionOptions, Start, StepOptions,
 };
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
@@ -60,10 +62,13 @@ pub use record::format::{
     RecordedSettings, RecordedVersion, is_episode_name,
 };
 pub use record::recorded_episode::RecordedEpisode;
+pub use record::repairs::{RecordedImageRepair, RecordedRepair};
 pub use record::replay_report::{
-    ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
-    WrongValue,
+    ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
+    ReplayedImage, WrongValue,
 };
+pub use repair::session_repair::SessionRepair;
+pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
 pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
     asset_info,

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
+
 use wildcity_scene::ProfileOverrides;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
@@ -42,6 +44,8 @@ pub struct SessionOptions {
     pub deadline: Option<Duration>,
     /// The scenario that is driven; without one there are no actors.
     pub scenario: Option<ScenarioOptions>,
+    /// The repair of its images; none if absent.
+    pub repair: Option<RepairOptions>,
 }
 
 /// A scenario, and what of its ego section holds.
@@ -76,8 +80,38 @@ impl SessionOptions {
             warm_up_us: 0,
             deadline: None,
             scenario: None,
+            repair: None,
         }
     }
+}
+
+/// Which images are repaired, and by which model. For a field that is `None`, the default of
+/// [`Selection`](wildcity_repair::Selection) holds.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RepairOptions {
+    /// Name of the model.
+    pub model: String,
+    /// A camera is repaired from trust below this on.
+    pub below: Option<f64>,
+    /// A camera is no longer repaired from trust above this on.
+    pub above: Option<f64>,
+    /// Under this trust nothing is repaired.
+    pub at_least: Option<f64>,
+    /// Most images of one pose of the rig.
+    pub per_step: Option<u64>,
+    /// What happens when the model fails.
+    pub on_failure: OnFailure,
+}
+
+/// What happens to an image that could not be repaired.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OnFailure {
+    /// It is delivered as rendered and says so.
+    #[default]
+    Unrepaired,
+    /// The request is refused with [`SessionError::Repair`](crate::SessionError::Repair); nothing changed.
+    Error,
 }
 
 /// How a step is made, beside its command.

@@ -15,6 +15,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::RandomStart;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
+use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
 
@@ -40,6 +41,8 @@ pub(crate) struct SessionSettings {
     pub(crate) scenario: Option<SessionScenario>,
     /// Whether observations tell where the actors are.
     pub(crate) tells_actors: bool,
+    /// The repair of the images, if the session asked for it.
+    pub(crate) repair: Option<Arc<SessionRepair>>,
 }
 
 /// The version of the twin that a session shows, and how.
@@ -49,7 +52,7 @@ pub(crate) struct PinnedVersion {
     /// The version's profile with the session's overrides.
     pub(crate) profile: RenderProfile,
     pub(crate) profile_hash: blake3::Hash,
-    /// Where the twin was recorded; only if images come with their trust.
+    /// Where the twin was recorded; only if images come with their trust or may be repaired.
     pub(crate) coverage: Option<Arc<TrainingCoverage>>,
 }
 

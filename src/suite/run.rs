@@ -160,6 +160,7 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
         scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
+        repairs: Arc::default(),
     })?)
 }
 

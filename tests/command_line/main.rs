@@ -16,6 +16,8 @@ mod gpu;
 mod http;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/onnx_models.rs"]
+mod onnx_models;
 #[path = "../support/places.rs"]
 mod places;
 #[path = "../support/reported.rs"]

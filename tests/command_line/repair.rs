@@ -2,8 +2,12 @@
 
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::process::Stdio;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Stdio};
 
+use crate::onnx_models::{Folder, library, trained};
+use crate::support::{self, Agent};
 use crate::wildcity;
 
 /// A manifest whose model file has the text "not a graph".
@@ -47,23 +51,122 @@ fn mistakes_are_told_before_and_with_the_runtime_library() {
     assert!(said.contains("files[0].blake3") && said.contains("pin the new hash"), "{said}");
 }
 
-/// A server without repair maps no runtime library, even where the environment names one.
+/// A server, and what it has mapped.
+struct Serving(Child);
+
+impl Serving {
+    /// Serves the twins at an address of its own; `arguments` come last.
+    fn start(twins: &Path, episodes: &Path, arguments: &[&str]) -> (Serving, SocketAddr) {
+        let mut command = wildcity();
+        command.args(["serve", "--listen", "127.0.0.1:0", "--threads", "2"]);
+        command.arg("--twins").arg(twins).arg("--episodes").arg(episodes);
+        command.arg("--uploads").arg(episodes.join("uploads")).args(arguments);
+        let mut server = command.stdout(Stdio::piped()).spawn().unwrap();
+        let mut line = String::new();
+        BufReader::new(server.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let address = line.split("ws://").nth(1).and_then(|rest| rest.split('/').next());
+        let address = address.unwrap_or_else(|| panic!("{line}")).parse().unwrap();
+        (Serving(server), address)
+    }
+
+    fn has_runtime(&self) -> bool {
+        let maps = fs::read_to_string(format!("/proc/{}/maps", self.0.id())).unwrap();
+        assert!(maps.contains("wildcity"), "{maps}");
+        maps.contains("onnxruntime")
+    }
+}
+
+impl Drop for Serving {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The manifest of the trained model in a folder; none where the data is absent.
+fn zero_dce() -> Option<Folder> {
+    let changes = serde_json::json!({
+        "name": "zero-dce", "timeout_ms": 10_000,
+        "inputs": [{"name": "input", "role": "rgb"}], "outputs": [{"name": "output", "role": "rgb"}],
+    });
+    Some(Folder::new(&trained("zero_dce_pp_rgb.onnx")?, changes))
+}
+
+#[tokio::test]
+async fn only_a_session_that_asks_loads_the_library_and_its_record_is_repaired_again() {
+    let Some(folder) = zero_dce() else { return };
+    let manifest = folder.path().display().to_string();
+    let library = library().display().to_string();
+    let twins = support::twins();
+    let episodes = tempfile::tempdir().unwrap();
+    let repair = ["--repair", &manifest, "--onnxruntime", &library];
+    let (server, address) = Serving::start(twins.path(), episodes.path(), &repair);
+
+    // Cameras that see no ground: the trust depends on the distance alone.
+    let camera = serde_json::json!({"name": "front", "width": 64, "height": 16, "fx": 40.0, "fy": 40.0, "cx": 32.0,
+        "cy": 12.0, "camera_to_rig": {"xyz": [0.5, 0.0, 1.5], "q": [0.5, -0.5, 0.5, -0.5]}});
+    let rig = serde_json::json!({"name": "one", "cameras": [camera]});
+    let outputs = serde_json::json!({"encoding": "raw"});
+    let beside = |y_m: f64| {
+        let pose = serde_json::json!({"xyz": [2.0, y_m, 0.0], "q": [1.0, 0.0, 0.0, 0.0]});
+        serde_json::json!({"type": "step", "pose": pose})
+    };
+    let mut plain = Agent::connect(address).await;
+    plain.hello().await;
+    plain.open(serde_json::json!({"session": "plain", "rig": rig, "outputs": outputs})).await;
+    let rendered = plain.look(beside(2.0)).await;
+    assert!(!server.has_runtime(), "no session has asked");
+
+    let mut agent = Agent::connect(address).await;
+    agent.hello().await;
+    let asked = serde_json::json!({"session": "a", "rig": rig, "outputs": outputs, "repair": {"model": "zero-dce"}});
+    agent.open(asked).await;
+    assert!(server.has_runtime());
+    for y_m in [0.0, 2.0] {
+        let seen = agent.look(beside(y_m)).await;
+        let image = &seen.meta["images"][0];
+        let is_repaired = image["repair"]["status"] == "repaired";
+        assert_eq!(is_repaired, y_m > 0.0, "{image}");
+        assert_eq!(image["hash"] != image["repair"]["rendered_hash"], is_repaired, "{image}");
+        if is_repaired {
+            assert_eq!(image["repair"]["rendered_hash"], rendered.meta["images"][0]["hash"]);
+        }
+    }
+    agent.ask(serde_json::json!({"type": "close"})).await;
+    drop(server);
+
+    let replay = |arguments: &[&str]| {
+        let mut command = wildcity();
+        command.arg("replay").arg(episodes.path().join("a-1.jsonl")).arg("--verify");
+        command.arg("--twins").arg(twins.path()).args(arguments);
+        let output = command.output().unwrap();
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
+        text
+    };
+    let text = replay(&repair);
+    assert!(text.contains("zero-dce 1 on cpu, 1 images"), "{text}");
+    assert!(text.contains("1 images, repaired again and compared"), "{text}");
+    let text = replay(&[]);
+    assert!(text.contains("1 images, compared as rendered only"), "{text}");
+}
+
 #[test]
-fn a_server_loads_no_runtime_library() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut server = wildcity()
-        .args(["serve", "--listen", "127.0.0.1:0", "--twins", "twins", "--episodes", "episodes"])
-        .args(["--uploads", "uploads"])
-        .current_dir(folder.path())
-        .stdout(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut line = String::new();
-    BufReader::new(server.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    let maps = fs::read_to_string(format!("/proc/{}/maps", server.id()));
-    server.kill().unwrap();
-    server.wait().unwrap();
-    assert!(line.contains("listening"), "{line}");
-    let maps = maps.unwrap();
-    assert!(maps.contains("wildcity") && !maps.contains("onnxruntime"), "{maps}");
+fn a_manifest_that_is_wrong_stops_the_server_before_it_listens() {
+    let folder = folder();
+    let refused = |arguments: &[&str]| {
+        let mut command = wildcity();
+        command.args(["serve", "--listen", "127.0.0.1:0", "--twins", "twins", "--episodes", "e"]);
+        command.args(["--uploads", "u"]).args(arguments).env_remove("ORT_DYLIB_PATH");
+        let output = command.current_dir(folder.path()).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        assert!(output.stdout.is_empty());
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    let said = refused(&["--repair", "model.json"]);
+    assert!(said.contains("--onnxruntime") && said.contains("ORT_DYLIB_PATH"), "{said}");
+    let said = refused(&["--repair", "model.json,nowhere.json"]);
+    assert!(said.contains("nowhere.json: No such file"), "{said}");
+    let said = refused(&["--repair", "model.json,model.json", "--onnxruntime", "model.onnx"]);
+    assert!(said.contains("is also that of model.json"), "{said}");
 }

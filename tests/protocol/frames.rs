@@ -4,7 +4,8 @@ use serde_json::{Map, Value, json};
 use wildcity_protocol::camera::{Windshield, WindshieldReference};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
 use wildcity_protocol::observation::{
-    Ego, Geo, Image, ObservationMetadata, Residency, Stage, Timings, Trust,
+    Ego, Geo, Image, ImageRepair, ObservationMetadata, RepairFailure, RepairStatus, Residency,
+    Stage, Timings, Trust,
 };
 
 use super::messages::{front, rear};
@@ -39,6 +40,8 @@ pub(crate) struct Recipe {
     /// Whether the images come with their trust, the first camera is behind a windshield, and the place on the earth is
     /// known.
     pub(crate) trust_and_windshield: bool,
+    /// Whether the session asked for repair: the first image is repaired, the second failed.
+    pub(crate) repair: bool,
 }
 
 impl Recipe {
@@ -52,6 +55,7 @@ impl Recipe {
         normals: false,
         instances: false,
         trust_and_windshield: false,
+        repair: false,
     };
 }
 
@@ -171,10 +175,10 @@ impl Frame {
             altitude: 34.125,
             heading: 16.25,
         });
-        Self {
-            metadata: ObservationMetadata { history, geo, ..observation(seq, images, frame_hash) },
-            tensors,
-        }
+        let mut metadata =
+            ObservationMetadata { history, geo, ..observation(seq, images, frame_hash) };
+        metadata.timings.repair_ms = recipe.repair.then_some(7.25);
+        Self { metadata, tensors }
     }
 
     /// The frame's bytes.
@@ -296,6 +300,7 @@ fn image(
         camera_to_rig: camera.camera_to_rig,
         shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
+        repair: recipe.repair.then(|| repair(index, &hash)),
         hash,
         trust: recipe.trust_and_windshield.then_some(Trust {
             value: 0.5,
@@ -304,6 +309,18 @@ fn image(
             low_coverage: 0.03125,
             outside: 0.125,
         }),
+    }
+}
+
+fn repair(index: u64, hash: &str) -> ImageRepair {
+    let before = blake3::hash(b"as rendered").to_hex().to_string();
+    match index {
+        0 => ImageRepair { status: RepairStatus::Repaired, rendered_hash: before, failure: None },
+        _ => ImageRepair {
+            status: RepairStatus::Failed,
+            rendered_hash: hash.to_owned(),
+            failure: Some(RepairFailure::TimedOut),
+        },
     }
 }
 
@@ -336,6 +353,7 @@ fn observation(seq: u64, images: Vec<Image>, frame_hash: String) -> ObservationM
             queue_ms: 0.5,
             render_ms: 12.25,
             encode_ms: 1.5,
+            repair_ms: None,
             stages_ms: vec![
                 Stage { name: "project".into(), ms: 2.0 },
                 Stage { name: "rasterize".into(), ms: 9.75 },

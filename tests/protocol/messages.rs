@@ -206,6 +206,15 @@ fn requests() -> Vec<(&'static str, Request)> {
         Open { seq: 1, dynamics: Some(DynamicsChoice::Full(dynamics)), ..Open::twin("street") };
     let model = Some(DynamicsChoice::Model(DynamicsModel::Kinematic));
     let model = Open { seq: 1, dynamics: model, ..Open::twin("street") };
+    let repair = Repair {
+        model: "zero-dce".into(),
+        below: Some(0.625),
+        above: Some(0.875),
+        at_least: Some(0.125),
+        per_step: Some(4),
+        on_failure: Some(OnFailure::Error),
+    };
+    let repaired = Open { seq: 1, repair: Some(repair), ..Open::twin("street") };
     let step = |seq, pose, trajectory, action, terminate| Request::Step {
         seq,
         session: None,
@@ -290,6 +299,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("open_preset", Request::Open(Box::new(preset))),
         ("open_dynamics", Request::Open(Box::new(driven))),
         ("open_model", Request::Open(Box::new(model))),
+        ("open_repair", Request::Open(Box::new(repaired))),
         ("step", step(3, Some(there), None, None, false)),
         ("step_terminate", step(4, Some(there), None, None, true)),
         ("step_trajectory", step(3, None, Some(planned), None, false)),
@@ -358,6 +368,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         },
         backend: "cpu".into(),
         twins: vec![twin],
+        repairs: Vec::new(),
     };
     let profile = json!({"alpha_cap": 0.99, "antialiased": false, "near": 0.01});
     let opened = Opened {
@@ -389,8 +400,25 @@ fn answers() -> Vec<(&'static str, Answer)> {
         },
         trajectories: vec![trajectory],
         reserved_bytes: 36_000_000,
+        repair: None,
         scenario: None,
         trajectory: Some(drive()),
+    };
+    let repaired = Opened {
+        trajectory: None,
+        repair: Some(OpenedRepair {
+            model: "zero-dce".into(),
+            version: "1".into(),
+            repair_hash: blake3::hash(b"a model").to_hex().to_string(),
+            provider: "cpu".into(),
+            deterministic: true,
+            below: 0.625,
+            above: 0.875,
+            at_least: 0.125,
+            per_step: 4,
+            on_failure: OnFailure::Error,
+        }),
+        ..opened.clone()
     };
     let switched = Answer::Switched {
         seq: 8,
@@ -451,9 +479,15 @@ fn answers() -> Vec<(&'static str, Answer)> {
         field: None,
         fatal: true,
     };
+    let mut offering = welcome.clone();
+    if let Answer::Welcome { repairs, .. } = &mut offering {
+        repairs.extend(["deblur".to_owned(), "zero-dce".to_owned()]);
+    }
     vec![
         ("welcome", welcome),
+        ("welcome_repairs", offering),
         ("opened", Answer::Opened(Box::new(opened))),
+        ("opened_repair", Answer::Opened(Box::new(repaired))),
         ("resumed", resumed),
         ("resumed_also", resumed_also),
         ("ok", Answer::Ok { seq: 6 }),

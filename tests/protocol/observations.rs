@@ -10,7 +10,7 @@ use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
 /// The golden frames: name, `seq` of the request vector that the frame answers, recipe.
-fn golden() -> [(&'static str, u64, Recipe); 9] {
+fn golden() -> [(&'static str, u64, Recipe); 10] {
     let raw = Recipe::RAW;
     [
         ("raw", 3, raw),
@@ -21,6 +21,7 @@ fn golden() -> [(&'static str, u64, Recipe); 9] {
         ("normals", 3, Recipe { cameras: 1, normals: true, ..raw }),
         ("instances", 3, Recipe { cameras: 1, depth: false, instances: true, ..raw }),
         ("trust", 3, Recipe { depth: false, trust_and_windshield: true, ..raw }),
+        ("repair", 3, Recipe { depth: false, repair: true, ..raw }),
         // Between two decisions.
         ("no_images", 3, Recipe { cameras: 0, ..raw }),
     ]

@@ -173,6 +173,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
         scenarios: Scenarios::in_dir(""),
         backend: server.painter.clone(),
         step_timeout: TEST_TIMEOUT,
+        repairs: Arc::default(),
     });
     let engine = engine.unwrap();
     let latest = async || {

@@ -6,8 +6,9 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use wildcity_repair::{Image, LoadOptions, Model, Provider, RepairError, View};
 
-use crate::doubles;
-use crate::support::{Folder, library, picture};
+use crate::onnx_doubles as doubles;
+use crate::onnx_models::{Folder, library};
+use crate::support::picture;
 
 #[test]
 fn a_nan_is_an_error_at_load_and_in_a_run_and_the_model_goes_on() {

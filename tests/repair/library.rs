@@ -8,8 +8,9 @@ use serde_json::json;
 use tempfile::TempDir;
 use wildcity_repair::{LoadOptions, Model, RepairError, is_loaded};
 
-use crate::doubles;
-use crate::support::{Folder, library, maps};
+use crate::onnx_doubles as doubles;
+use crate::onnx_models::{Folder, library};
+use crate::support::maps;
 
 /// Runs `test` of this file alone in a process; `path` is what it gets.
 fn alone(test: &str, path: &std::path::Path) {

@@ -5,13 +5,17 @@
 
 #[path = "../support/data.rs"]
 mod data;
+#[path = "../support/onnx_doubles.rs"]
+mod onnx_doubles;
+#[path = "../support/onnx_models.rs"]
+mod onnx_models;
+#[path = "../support/onnx_protobuf.rs"]
+mod onnx_protobuf;
 #[path = "../support/root.rs"]
 mod root;
 
-mod doubles;
 mod errors;
 mod library;
-mod protobuf;
 mod select;
 mod support;
 mod trained;

@@ -53,7 +53,7 @@ fn thresholds_that_contradict_each_other_are_refused() {
         (Selection { above: f64::NAN, ..default }, "above"),
         (Selection { at_least: 0.8, ..default }, "at_least"),
     ] {
-        let message = selection.check().unwrap_err();
-        assert!(message.starts_with(field), "{message}");
+        let (at, must) = selection.check().unwrap_err();
+        assert_eq!(at, field, "{must}");
     }
 }

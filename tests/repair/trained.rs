@@ -3,7 +3,8 @@
 use serde_json::json;
 use wildcity_repair::{Halo, View};
 
-use crate::support::{Folder, picture, trained};
+use crate::onnx_models::{Folder, trained};
+use crate::support::picture;
 
 const ZERO_DCE: &str = "zero_dce_pp_rgb.onnx";
 
@@ -44,6 +45,8 @@ fn one_and_two_threads_and_repeated_runs_give_the_same_hash() {
         .collect();
     assert!(hashes.iter().all(|hash| *hash == hashes[0]), "{hashes:?}");
     assert_eq!(one.repair_hash(), two.repair_hash());
+    let runtime = one.runtime();
+    assert!(runtime.contains("onnxruntime") && runtime.contains(", commit "), "{runtime}");
     // Beside another.
     let beside = std::thread::scope(|scope| {
         let jobs = [&one, &two]

@@ -3,8 +3,9 @@
 use serde_json::json;
 use wildcity_repair::{Halo, Image, RepairError, View};
 
-use crate::doubles;
-use crate::support::{Folder, picture};
+use crate::onnx_doubles as doubles;
+use crate::onnx_models::Folder;
+use crate::support::picture;
 
 #[test]
 fn a_residual_of_a_model_that_changes_nothing_changes_no_byte() {

@@ -340,6 +340,7 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
         scenarios: Scenarios::in_dir(""),
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
+        repairs: Arc::default(),
     });
     let engine = engine.unwrap();
     for wanted_db in [35.0, 45.0] {

@@ -1,7 +1,15 @@
 //! The server from outside: bytes on a socket in, bytes on a socket out.
 
+#[path = "../support/data.rs"]
+mod data;
 #[path = "../support/episodes.rs"]
 mod episodes;
+#[path = "../support/onnx_doubles.rs"]
+mod onnx_doubles;
+#[path = "../support/onnx_models.rs"]
+mod onnx_models;
+#[path = "../support/onnx_protobuf.rs"]
+mod onnx_protobuf;
 #[path = "../support/root.rs"]
 mod root;
 #[path = "../support/server.rs"]
@@ -24,6 +32,8 @@ mod plans;
 mod profile;
 mod record;
 mod refused;
+mod repair;
+mod repair_failures;
 mod replay;
 mod resume;
 mod scenarios;

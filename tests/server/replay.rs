@@ -41,6 +41,7 @@ async fn what_was_recorded_is_rendered_again() {
             diverged: None,
             difference: None,
             wrong_value: None,
+            repaired: wildcity_session::RepairedImages::default(),
         }
     );
 }

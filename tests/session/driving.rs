@@ -34,6 +34,7 @@ pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend
         scenarios: Scenarios::in_dir(""),
         backend,
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
+        repairs: Arc::default(),
     });
     Bench { engine: engine.unwrap(), episodes }
 }

@@ -28,6 +28,7 @@ from wildcity import (
     RandomStart,
     RecordedPoint,
     Refused,
+    Repair,
     Rig,
     Shutter,
     SnapshotPoint,
@@ -96,6 +97,7 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "open_preset": lambda c: c.open("street", rig="vehicle6", profile={"tau_px": 2.0}),
     "open_dynamics": lambda c: c.open("street", dynamics=Dynamics("dynamic", 8.25, reverse=True)),
     "open_model": lambda c: c.open("street", dynamics="kinematic"),
+    "open_repair": lambda c: c.open("street", repair=Repair("zero-dce", 0.625, 0.875, 0.125, 4, "error")),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
     "step_trajectory": lambda c: c.step(PLANNED, False),
     "step_until": lambda c: c.step(
@@ -208,7 +210,7 @@ def with_unknown_fields(value: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    "name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "no_images"]
+    "name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "repair", "no_images"]
 )
 def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
@@ -397,7 +399,7 @@ def test_vectors_obey_the_schemas() -> None:
             with pytest.raises(jsonschema.ValidationError):
                 jsonschema.validate(message, schema)
     schema = json.loads((PROTOCOL / "schema/observation.json").read_text())
-    for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "no_images"):
+    for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "repair", "no_images"):
         metadata = vector(f"observations/{name}.expected.json")["observation"]
         jsonschema.validate(metadata, schema)
         del metadata["frame_hash"]

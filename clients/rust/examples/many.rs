@@ -4,6 +4,8 @@
 //!
 //! `cargo run --release -p wildcity-client --example many -- ws://127.0.0.1:8080/v1/session TWIN [SESSIONS] [STEPS]`
 
+#![allow(clippy::print_stdout, reason = "an example")]
+
 use std::time::Instant;
 
 use wildcity_client::protocol::message::{Encoding, Outputs, Rig, RigCamera, RigChoice};

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::drive::Drive;
-use super::open::{Dynamics, Outputs, RigCamera};
+use super::open::{Dynamics, OnFailure, Outputs, RigCamera};
 use super::pose::Pose;
 use crate::error::Code;
 
@@ -26,6 +26,9 @@ pub enum Answer {
         backend: String,
         /// Twins that can be opened.
         twins: Vec<TwinInfo>,
+        /// Names of the models that can repair images. Absent if there are none.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        repairs: Vec<String>,
     },
     /// Answer to `open` and to `branch`: every setting of the session, defaults included.
     Opened(Box<Opened>),
@@ -193,12 +196,41 @@ pub struct Opened {
     pub trajectories: Vec<TrajectoryInfo>,
     /// Memory of the server that is reserved for the largest frame of the session, in bytes.
     pub reserved_bytes: u64,
+    /// The repair of the images.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub repair: Option<OpenedRepair>,
     /// The scenario.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<OpenedScenario>,
     /// The part of a recorded drive that `open` asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trajectory: Option<Drive>,
+}
+
+/// The repair of a session's images.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct OpenedRepair {
+    /// Name of the model.
+    pub model: String,
+    /// Version of the model.
+    pub version: String,
+    /// BLAKE3 of what decides the repaired bytes beside the image, in hex: manifest, files, runtime, provider.
+    pub repair_hash: String,
+    /// Where it runs: `cpu`, `cuda` or `tensorrt`.
+    pub provider: String,
+    /// Whether three runs gave the same bytes when the model was loaded.
+    pub deterministic: bool,
+    /// A camera is repaired from trust below this on.
+    pub below: f64,
+    /// A camera is no longer repaired from trust above this on.
+    pub above: f64,
+    /// Under this trust nothing is repaired.
+    pub at_least: f64,
+    /// Most images that are repaired of one pose of the rig.
+    pub per_step: u64,
+    /// What happens when the model fails.
+    pub on_failure: OnFailure,
 }
 
 /// The scenario of a session.

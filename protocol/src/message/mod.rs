@@ -12,14 +12,14 @@ mod pose;
 mod request;
 
 pub use answer::{
-    Answer, Limits, Opened, OpenedScenario, Outcome, ResumedSession, ServerInfo, Summary,
-    TrajectoryInfo, TwinInfo,
+    Answer, Limits, Opened, OpenedRepair, OpenedScenario, Outcome, ResumedSession, ServerInfo,
+    Summary, TrajectoryInfo, TwinInfo,
 };
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose, DriveSection};
 pub use open::{
-    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, Open, Outputs, RandomStart, Rig,
-    RigCamera, RigChoice, ScenarioChoice, Start,
+    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, OnFailure, Open, Outputs,
+    RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice, Start,
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, SessionStep, TimedPose};

@@ -86,6 +86,9 @@ pub struct Open {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 10_000_000)))]
     pub decision_us: Option<i64>,
+    /// The repair of images by a model of the server. If absent, images are as rendered.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub repair: Option<Repair>,
     /// The scenario to drive. If absent, there are no actors and no route.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<ScenarioChoice>,
@@ -127,11 +130,51 @@ impl Open {
             dt_us: None,
             deadline_ms: None,
             decision_us: None,
+            repair: None,
             scenario: None,
             warm_up_us: None,
             trajectory: None,
         }
     }
+}
+
+/// Which images are repaired, and by which model. In `opened` every field but those of the model is there.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct Repair {
+    /// Name of the model, one of `welcome.repairs`.
+    pub model: String,
+    /// A camera is repaired from trust below this on. If absent, 0.75.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
+    pub below: Option<f64>,
+    /// A camera is no longer repaired from trust above this on. If absent, 0.85.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
+    pub above: Option<f64>,
+    /// Under this trust nothing is repaired. If absent, 0.1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
+    pub at_least: Option<f64>,
+    /// Most images that are repaired of one pose of the rig: those with the least trust, then the first cameras. If
+    /// absent, 16.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub per_step: Option<u64>,
+    /// What happens when the model fails. If absent, `unrepaired`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub on_failure: Option<OnFailure>,
+}
+
+/// What happens to an image that a model failed to repair.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum OnFailure {
+    /// It is delivered as rendered, with the status `failed`.
+    Unrepaired,
+    /// The request is refused with `repair_failed`, and nothing changed.
+    Error,
 }
 
 /// Where an episode starts.

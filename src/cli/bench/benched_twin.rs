@@ -38,6 +38,7 @@ impl BenchedTwin {
             scenarios: Scenarios::in_dir(""),
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
+            repairs: Arc::default(),
         })?;
         Ok((engine, version))
     }

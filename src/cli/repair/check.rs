@@ -11,6 +11,7 @@ use wildcity_repair::{Halo, Image, LoadOptions, Model, Provider};
 
 use super::sample::Sample;
 use crate::cli::output;
+use crate::cli::repair_options::runtime_library;
 
 /// Load a repair model, probe it, and measure it.
 ///
@@ -101,8 +102,7 @@ impl Check {
     }
 
     fn options(&self) -> LoadOptions {
-        let from_environment = || std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
-        let library = self.onnxruntime.clone().or_else(from_environment).unwrap_or_default();
+        let library = runtime_library(self.onnxruntime.as_ref());
         let provider = self.provider.map(|provider| match provider {
             ProviderOption::Cpu => Provider::Cpu,
             ProviderOption::Cuda => Provider::Cuda,

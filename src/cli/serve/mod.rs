@@ -22,6 +22,7 @@ use limit_options::{LimitOptions, gib_of};
 use super::backend_options::{BackendOptions, bytes_of_gib, gib};
 use super::directories::ServerDirectories;
 use super::profile_options::read_profile;
+use super::repair_options::{RepairOptions, runtime_library};
 
 /// Serve twins to agents over WebSocket.
 ///
@@ -93,6 +94,9 @@ pub(super) struct Serve {
     #[command(flatten)]
     backend: BackendOptions,
 
+    #[command(flatten)]
+    repair: RepairOptions,
+
     /// What to log, for example `warn` or `wildcity=debug` [default: $RUST_LOG, or info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
@@ -108,6 +112,7 @@ Examples:
   wildcity serve --twins ./twins --listen 127.0.0.1:0 --log debug
   wildcity serve --tokens tokens.json --listen 0.0.0.0:8080
   wildcity serve --tokens tokens.json --listen 0.0.0.0:8443 --tls-cert cert.pem --tls-key key.pem
+  wildcity serve --repair zero-dce.json,deblur.json --onnxruntime libonnxruntime.so.1.32.0
   wildcity serve --print-config > serve.toml
   wildcity serve --config serve.toml --sessions 16
   curl http://127.0.0.1:8080/v1/twins
@@ -140,6 +145,7 @@ impl Serve {
             "scenarios" => text(self.directories.scenarios.dir()?),
             "uploads" => text(self.directories.uploads.dir()?),
             "cache_dir" => self.directories.twins.cache().and_then(|cache| text(cache.dir)),
+            "onnxruntime" => text(runtime_library(None)).filter(|path| !path.is_empty()),
             "memory_gib" => Some(gib_of(default_memory_bytes()).to_string()),
             "log" => Some(self.log_filter()),
             _ => None,
@@ -192,6 +198,7 @@ impl Serve {
             origins: self.origin.unwrap_or_default(),
             tls,
             backend: Arc::from(self.backend.backend()?),
+            repairs: self.repair.models()?,
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
             limits: self.limits.limits(self.memory_gib.map(bytes_of_gib)),
         };

@@ -285,7 +285,7 @@ impl Connection {
         let engine = &self.state.engine;
         let mut twins = engine.twins().await?.twins;
         twins.retain(|twin| self.grant.allows_twin(&twin.name));
-        let text = convert::welcome(seq, &self.state.limits, engine.backend(), &twins)?;
+        let text = convert::welcome(seq, &self.state.limits, engine, &twins)?;
         tracing::debug!(client, "hello");
         self.hello_done = true;
         Ok(Answer::Text(text.into()))

@@ -11,11 +11,12 @@ use crate::sessions::ClosedSession;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
+use wildcity_repair::Selection;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
-    DamagedSummary, Encoding, EpisodeSummary, EpisodeTraffic, Outcome, PixelMaps, Session,
-    TrajectorySummary, TwinSummaries, TwinSummary,
+    DamagedSummary, Encoding, Engine, EpisodeSummary, EpisodeTraffic, OnFailure, Outcome,
+    PixelMaps, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
@@ -30,7 +31,7 @@ const SERVER_NAME: &str = "wildcity";
 pub(crate) fn welcome(
     seq: u64,
     server: &ServerLimits,
-    backend: &str,
+    engine: &Engine,
     twins: &[Arc<TwinSummary>],
 ) -> Result<String, Fault> {
     let limits = Limits {
@@ -50,8 +51,9 @@ pub(crate) fn welcome(
             version: env!("CARGO_PKG_VERSION").to_owned(),
         },
         limits,
-        backend: backend.to_owned(),
+        backend: engine.backend().to_owned(),
         twins: twins.iter().map(|twin| twin_info(twin)).collect(),
+        repairs: engine.repairs().names().map(str::to_owned).collect(),
     })
 }
 
@@ -113,9 +115,30 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),
+        repair: session.repair().map(opened_repair),
         scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
     })
+}
+
+fn opened_repair(repair: &SessionRepair) -> message::OpenedRepair {
+    let model = &repair.model;
+    let Selection { below, above, at_least, per_step } = repair.selection;
+    message::OpenedRepair {
+        model: model.manifest().name.clone(),
+        version: model.manifest().version.clone(),
+        repair_hash: model.repair_hash().to_hex().to_string(),
+        provider: model.provider().name().to_owned(),
+        deterministic: model.is_deterministic(),
+        below,
+        above,
+        at_least,
+        per_step: per_step as u64,
+        on_failure: match repair.on_failure {
+            OnFailure::Unrepaired => message::OnFailure::Unrepaired,
+            OnFailure::Error => message::OnFailure::Error,
+        },
+    }
 }
 
 fn opened_scenario(traffic: &EpisodeTraffic) -> message::OpenedScenario {

@@ -131,6 +131,7 @@ fn status_of(code: Code) -> StatusCode {
         | Code::UnknownSession
         | Code::UnknownState
         | Code::UnknownScenario
+        | Code::UnknownRepair
         | Code::UnknownUpload
         | Code::UnknownPush => StatusCode::NOT_FOUND,
         Code::TimedOut => StatusCode::REQUEST_TIMEOUT,
@@ -144,8 +145,12 @@ fn status_of(code: Code) -> StatusCode {
         Code::AnswerTooLarge | Code::UploadDigest | Code::PushRefused => {
             StatusCode::UNPROCESSABLE_ENTITY
         }
-        Code::TwinDamaged | Code::Internal => StatusCode::INTERNAL_SERVER_ERROR,
-        Code::Busy | Code::ShuttingDown => StatusCode::SERVICE_UNAVAILABLE,
+        Code::TwinDamaged | Code::RepairFailed | Code::Internal => {
+            StatusCode::INTERNAL_SERVER_ERROR
+        }
+        Code::Busy | Code::ShuttingDown | Code::RepairUnavailable => {
+            StatusCode::SERVICE_UNAVAILABLE
+        }
         Code::DeadlineExceeded => StatusCode::GATEWAY_TIMEOUT,
         Code::StorageFull => StatusCode::INSUFFICIENT_STORAGE,
     }
@@ -260,6 +265,9 @@ fn of_session(error: &SessionError) -> WireFault {
             _ => at(Code::ScenarioInvalid, &error.field()),
         },
         SessionError::UnknownRig { .. } => at(Code::UnknownRig, "rig"),
+        SessionError::UnknownRepair { .. } => at(Code::UnknownRepair, "repair.model"),
+        SessionError::RepairUnavailable { .. } => at(Code::RepairUnavailable, "repair.model"),
+        SessionError::Repair { .. } => plain(Code::RepairFailed),
         SessionError::UnknownCamera { field, .. } => at(Code::UnknownCamera, field),
         SessionError::CameraTwice { index, .. } => {
             at(Code::InvalidName, &format!("outputs.cameras[{index}]"))

@@ -139,16 +139,19 @@ fn metadata(
             shutter_end_us: time_us,
             hash: hash.to_hex().to_string(),
             trust: None,
+            repair: None,
         }
     };
     let drawn = |(drawn, name): (&wildcity_session::ImageInfo, &String)| Image {
         pose: drawn.pose as u64,
         trust: drawn.trust.map(trust),
+        repair: drawn.repair.map(repair),
         ..image(drawn.camera, format!("{name}/rgb"), drawn.time_us, &drawn.hash)
     };
     let past = |past: &PastImageInfo| Image {
         back: past.back as u64,
         trust: past.trust.map(trust),
+        repair: past.repair.map(repair),
         ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash)
     };
     let timings = &frame.timings;
@@ -188,6 +191,7 @@ fn metadata(
             queue_ms: ms(timings.queue),
             render_ms: ms(timings.render),
             encode_ms: ms(timings.encode),
+            repair_ms: session.repair().map(|_| ms(timings.repair)),
             stages_ms: timings.stages_ms.iter().map(stage).collect(),
         },
         residency: Residency {
@@ -288,6 +292,26 @@ fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
             }
         })
         .collect()
+}
+
+fn repair(repair: wildcity_session::ImageRepair) -> wire::ImageRepair {
+    use wire::{RepairFailure, RepairStatus};
+
+    let wildcity_session::ImageRepair { status, rendered_hash } = repair;
+    let (status, failure) = match status {
+        wildcity_session::RepairStatus::Kept => (RepairStatus::Kept, None),
+        wildcity_session::RepairStatus::Repaired => (RepairStatus::Repaired, None),
+        wildcity_session::RepairStatus::Failed(failure) => {
+            let failure = match failure {
+                wildcity_session::RepairFailure::TimedOut => RepairFailure::TimedOut,
+                wildcity_session::RepairFailure::NotFinite => RepairFailure::NotFinite,
+                wildcity_session::RepairFailure::Withdrawn => RepairFailure::Withdrawn,
+                wildcity_session::RepairFailure::Other => RepairFailure::Other,
+            };
+            (RepairStatus::Failed, Some(failure))
+        }
+    };
+    wire::ImageRepair { status, rendered_hash: rendered_hash.to_hex().to_string(), failure }
 }
 
 fn trust(trust: wildcity_session::Trust) -> Trust {

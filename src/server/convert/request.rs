@@ -14,8 +14,8 @@ use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::is_episode_name;
 use wildcity_session::{
-    Encoding, ImagePart, Outputs, PixelMaps, RandomStart, ResetOptions, RigChoice, ScenarioOptions,
-    ScenarioSource, SessionError, SessionOptions, Start, StepOptions,
+    Encoding, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions,
+    RigChoice, ScenarioOptions, ScenarioSource, SessionError, SessionOptions, Start, StepOptions,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
@@ -333,9 +333,19 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         dt_us: open.dt_us,
         deadline: open.deadline_ms.map(Duration::from_millis),
         decision_us: open.decision_us,
+        repair: open.repair.map(repair_of),
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
     Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })
+}
+
+fn repair_of(repair: message::Repair) -> RepairOptions {
+    let message::Repair { model, below, above, at_least, per_step, on_failure } = repair;
+    let on_failure = match on_failure {
+        None | Some(message::OnFailure::Unrepaired) => OnFailure::Unrepaired,
+        Some(message::OnFailure::Error) => OnFailure::Error,
+    };
+    RepairOptions { model, below, above, at_least, per_step, on_failure }
 }
 
 /// A scenario's name, its name with values, or the scenario itself, which has a format.

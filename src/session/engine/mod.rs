@@ -15,6 +15,7 @@ use parking_lot::Mutex;
 use tokio::time::{Instant, sleep};
 
 use wildcity_render::{Backend, RenderError};
+use wildcity_repair::Models;
 use wildcity_scene::{Rays, RenderProfile};
 use wildcity_twin::residency::{
     Cache, Prefetcher, Reservation, ResidencyError, Resident, RigExtent, Stats, Urgency, Viewpoint,
@@ -45,6 +46,8 @@ pub struct EngineSettings {
     pub backend: Arc<dyn Backend>,
     /// How long one step may take, time in queues included.
     pub step_timeout: Duration,
+    /// The models that can repair images, by name. Each is loaded when a session asks for it.
+    pub repairs: Arc<Models>,
 }
 
 /// The renderer and the twins, shared by all sessions.
@@ -55,6 +58,7 @@ pub struct Engine {
     episodes: PathBuf,
     scenarios: Scenarios,
     step_timeout: Duration,
+    repairs: Arc<Models>,
     queue: RenderQueue,
     session_numbers: AtomicU64,
     answer_budget: AnswerBudget,
@@ -75,7 +79,8 @@ impl Engine {
     /// # Errors
     /// [`SessionError::Thread`] if a thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { cache, episodes, scenarios, backend, step_timeout } = settings;
+        let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs } =
+            settings;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),
@@ -83,6 +88,7 @@ impl Engine {
             episodes,
             scenarios,
             step_timeout,
+            repairs,
             queue: RenderQueue::start(backend)?,
             session_numbers: AtomicU64::new(PUSHES + 1),
             answer_budget: AnswerBudget::default(),
@@ -104,6 +110,11 @@ impl Engine {
     /// The scenarios that can be opened by name.
     pub fn scenarios(&self) -> &Scenarios {
         &self.scenarios
+    }
+
+    /// The models that can repair images.
+    pub fn repairs(&self) -> &Arc<Models> {
+        &self.repairs
     }
 
     /// Checks that twins can be listed.

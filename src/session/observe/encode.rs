@@ -7,6 +7,7 @@ use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 
 use super::trust::Trust;
+use crate::repair::status::ImageRepair;
 
 /// How colour images travel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -28,6 +29,8 @@ pub(crate) struct EncodedImage {
     pub(crate) file: Vec<u8>,
     /// Its trust, if the session's images come with one.
     pub(crate) trust: Option<Trust>,
+    /// What became of it, if the session asked for repair.
+    pub(crate) repair: Option<ImageRepair>,
     /// How long hashing and encoding took on its thread.
     pub(crate) took: Duration,
 }
@@ -47,7 +50,14 @@ pub(crate) fn encode(
         Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality)?,
         Encoding::Png => png(rgb8, width, height)?,
     };
-    Ok(EncodedImage { hash, file, trust: None, took: started.elapsed() })
+    Ok(EncodedImage { hash, file, trust: None, repair: None, took: started.elapsed() })
+}
+
+/// An image that is hashed and not encoded yet.
+pub(crate) fn hashed(rgb8: &[u8]) -> EncodedImage {
+    let started = Instant::now();
+    let hash = blake3::hash(rgb8);
+    EncodedImage { hash, file: Vec::new(), trust: None, repair: None, took: started.elapsed() }
 }
 
 /// A JPEG file, 4:2:0, of `[height, width, 3]` pixels.

@@ -6,6 +6,7 @@ use super::schedule::Schedule;
 use super::trust::Trust;
 use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
+use crate::repair::status::ImageRepair;
 
 /// The frames that coming decisions will show, in the order in which they were taken. Copies share the
 /// frames' bytes.
@@ -23,6 +24,8 @@ pub(crate) struct PastFrame {
     pub(crate) hash: blake3::Hash,
     /// Its trust, if the session's images come with one.
     pub(crate) trust: Option<Trust>,
+    /// What became of it, if the session asked for repair.
+    pub(crate) repair: Option<ImageRepair>,
     /// As it travels: a JPEG or PNG file, or raw pixels.
     pub(crate) bytes: Vec<u8>,
 }

@@ -28,13 +28,17 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
 
+/// Room in the header per image for what is told of its repair: three texts, one of them a hash.
+const REPAIR_IMAGE_BYTES: usize = 256;
+
 /// Most images of one answer, whether of several poses or of several times.
 const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
 const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
 // A client accepts the longest header, and the renderer renders any rig in one frame.
 const _: () = assert!(
-    HEADER_BASE_BYTES + IMAGES * HEADER_IMAGE_BYTES <= limits::OBSERVATION_HEADER_BYTES as usize
+    HEADER_BASE_BYTES + IMAGES * (HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES)
+        <= limits::OBSERVATION_HEADER_BYTES as usize
 );
 const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 
@@ -49,6 +53,8 @@ pub(crate) struct ObservationLayout {
     schedule: Schedule,
     /// Room in the header for what a scenario tells.
     scenario_bytes: usize,
+    /// Room in the header per image.
+    image_bytes: usize,
 }
 
 /// What is rendered at once: some cameras of the rig, at one pose and time.
@@ -101,9 +107,22 @@ impl ObservationLayout {
             FieldMask::of(camera).map(|field| field.visible_share(camera))
         };
         let visible_shares = cameras.iter().map(visible_share).collect();
-        let layout = Self { cameras, visible_shares, encoding, maps, schedule, scenario_bytes: 0 };
+        let layout = Self {
+            cameras,
+            visible_shares,
+            encoding,
+            maps,
+            schedule,
+            scenario_bytes: 0,
+            image_bytes: HEADER_IMAGE_BYTES,
+        };
         layout.check_size("outputs", layout.schedule.frames())?;
         Ok(layout)
+    }
+
+    /// Reserves room in the headers for what is told of repaired images. Comes before [`Self::reserve_header`].
+    pub(crate) fn reserve_repair(&mut self) {
+        self.image_bytes = HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES;
     }
 
     pub(crate) fn cameras(&self) -> &[RigCamera] {
@@ -216,7 +235,7 @@ impl ObservationLayout {
         self.scenario_bytes = limits::SCENARIO_HEADER_BYTES + actors * limits::ACTOR_HEADER_BYTES;
         let images = self.schedule.frames() * self.cameras.len();
         let most = limits::OBSERVATION_HEADER_BYTES as usize;
-        let needed = HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES + self.scenario_bytes;
+        let needed = HEADER_BASE_BYTES + images * self.image_bytes + self.scenario_bytes;
         if needed <= most {
             return Ok(());
         }
@@ -232,7 +251,7 @@ impl ObservationLayout {
         let rendered: usize = captures.iter().map(|capture| capture.cameras.len()).sum();
         // With several frames per camera, an observation contains more images than it renders.
         let images = rendered.max(self.schedule.frames() * self.cameras.len());
-        HEADER_BASE_BYTES + images * HEADER_IMAGE_BYTES + self.scenario_bytes
+        HEADER_BASE_BYTES + images * self.image_bytes + self.scenario_bytes
     }
 
     /// Bytes that the renderer writes into the buffer for a capture.

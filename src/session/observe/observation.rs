@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::buffer::ObservationBuffer;
 use super::trust::Trust;
+use crate::repair::status::ImageRepair;
 
 /// A finished observation.
 #[derive(Debug)]
@@ -53,6 +54,8 @@ pub struct ImageInfo {
     pub hash: blake3::Hash,
     /// Its trust, if the session's images come with one.
     pub trust: Option<Trust>,
+    /// What became of it, if the session asked for repair.
+    pub repair: Option<ImageRepair>,
 }
 
 /// One earlier image of an [`Observation`].
@@ -68,6 +71,8 @@ pub struct PastImageInfo {
     pub hash: blake3::Hash,
     /// Its trust, if the session's images come with one.
     pub trust: Option<Trust>,
+    /// What became of it, if the session asked for repair.
+    pub repair: Option<ImageRepair>,
 }
 
 /// One tensor of an [`Observation`].
@@ -124,6 +129,8 @@ pub struct Timings {
     pub render: Duration,
     /// Encoding and hashing, summed over all threads.
     pub encode: Duration,
+    /// Repair, of all images.
+    pub repair: Duration,
     /// Wall time per render stage, in milliseconds, in the order of the stages.
     pub stages_ms: Vec<(&'static str, f64)>,
 }

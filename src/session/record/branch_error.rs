@@ -24,6 +24,11 @@ pub enum BranchError {
         "the episode drove a scenario, whose traffic a record does not restore: branch from a snapshot"
     )]
     Scenario,
+    /// The images of the episode were repaired.
+    #[error(
+        "images of the episode were repaired by a model, which a record does not have: branch from a snapshot"
+    )]
+    Repair,
     /// Driving the recorded commands leads elsewhere, or to other frames.
     #[error("{0}")]
     Diverged(String),

@@ -23,6 +23,7 @@ use wildcity_sim::{Command, Dynamics, Ego};
 use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
 use crate::observe::schedule::Schedule;
+use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 
 /// This build, as it is named in records.
 pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
@@ -77,6 +78,9 @@ pub struct EpisodeHeader {
     /// BLAKE3 of the resolved scenario, in hex; absent without a scenario.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<String>,
+    /// The repair of the images; absent if the session did not ask for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub repair: Option<RecordedRepair>,
 }
 
 /// Settings of a session that images do not depend on, but bundles, later versions and later episodes do.
@@ -153,8 +157,11 @@ pub struct FrameRecord {
     pub terminated: bool,
     /// BLAKE3 of the shown images' hashes, in hex.
     pub frame_hash: String,
-    /// BLAKE3 of each rendered image's pixels, in hex: pose by pose, camera by camera.
+    /// BLAKE3 of each image's pixels as sent, in hex: pose by pose, camera by camera.
     pub images: Vec<String>,
+    /// What the repair model did, in the order of `images`; absent if it was used on none of them.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub repairs: Vec<Option<RecordedImageRepair>>,
 }
 
 /// A command to the ego other than a pose.

@@ -12,6 +12,8 @@ pub(crate) mod error;
 pub(crate) mod format;
 pub(crate) mod recorded_episode;
 pub(crate) mod recorder;
+mod repair_replay;
+pub(crate) mod repairs;
 pub(crate) mod replay;
 pub(crate) mod replay_report;
 mod values;

@@ -144,5 +144,9 @@ fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     if images != expected {
         return Err(format!("{images} images, but {expected} cameras of {poses} poses"));
     }
+    let repairs = frame.repairs.len();
+    if repairs != 0 && repairs != images {
+        return Err(format!("repairs of {repairs} images, but {images} images"));
+    }
     Ok(())
 }

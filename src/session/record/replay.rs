@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use wildcity_render::{Backend, Frame, RenderError, Target};
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_repair::Models;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::rig::RigCamera;
 use wildcity_sim::Ground;
@@ -10,12 +11,16 @@ use wildcity_twin::residency::{Cache, Resident};
 
 use super::actor_replay::ActorReplay;
 use super::ego_replay::EgoReplay;
-use super::format::{BUILD, FrameRecord, RecordedVersion, profile_hash};
+use super::format::{BUILD, FrameRecord, FrameRequest, RecordedVersion, profile_hash};
 use super::recorded_episode::RecordedEpisode;
+use super::repair_replay::RepairReplay;
+use super::repairs::RecordedImageRepair;
 use super::replay_report::{
-    ImageDifference, ProvenanceChange, ReplayError, ReplayReport, ReplayUntil, ReplayedImage,
+    ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
+    ReplayedImage, WrongValue,
 };
 use super::values;
+use crate::repair::session_repair::RenderedImage;
 use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::viewpoints;
 
@@ -35,14 +40,29 @@ impl RecordedEpisode {
         until: ReplayUntil,
         visit: &mut VisitImage<'_>,
     ) -> Result<ReplayReport, ReplayError> {
+        self.replay_repaired(cache, backend, &Models::default(), until, visit)
+    }
+
+    /// As [`Self::replay`], and repairs images again by the recorded model, if it is one of `models`.
+    ///
+    /// # Errors
+    /// As [`Self::replay`], and if the model cannot be loaded or fails.
+    pub fn replay_repaired(
+        &self,
+        cache: &Cache,
+        backend: &dyn Backend,
+        models: &Models,
+        until: ReplayUntil,
+        visit: &mut VisitImage<'_>,
+    ) -> Result<ReplayReport, ReplayError> {
         let open = |version: u64| cache.open(&self.header.twin, Some(version));
         let actors = ActorReplay::new(self, cache)?;
-        let mut replay = Replay::new(self, open(self.header.version)?, actors, backend);
+        let mut replay = Replay::new(self, open(self.header.version)?, actors, backend, models)?;
         let mut switches = self.versions.iter().peekable();
         for (index, frame) in self.frames.iter().enumerate() {
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
             {
-                replay.switch_version(open(to.version)?, to);
+                replay.switch_version(open(to.version)?, to)?;
             }
             replay.actors.advance(index);
             replay.drive(frame, index)?;
@@ -73,8 +93,10 @@ struct Replay<'a> {
     actors: ActorReplay<'a>,
     /// Lines of the file, from 1, at which the frames are.
     frame_lines: &'a [usize],
-    /// The RGB buffer of each camera.
-    pixels: Vec<Vec<u8>>,
+    /// Set if images were repaired.
+    repair: Option<RepairReplay<'a>>,
+    /// The buffers of each camera.
+    images: Vec<RenderedImage>,
     report: ReplayReport,
 }
 
@@ -90,7 +112,8 @@ impl<'a> Replay<'a> {
         resident: Arc<Resident>,
         actors: ActorReplay<'a>,
         backend: &'a dyn Backend,
-    ) -> Self {
+        models: &Models,
+    ) -> Result<Self, ReplayError> {
         let header = &episode.header;
         let mut changes = Vec::new();
         add_change(&mut changes, "build", &header.build, BUILD);
@@ -100,8 +123,18 @@ impl<'a> Replay<'a> {
             RecordedHashes { version: &header.version_hash, profile: &header.profile_hash };
         add_scene_changes(&mut changes, &recorded, &resident, &header.profile);
 
+        let manifest = &resident.version.manifest;
+        let repair = RepairReplay::new(header, manifest, models, &mut changes)?;
         let cameras = &header.rig.cameras;
-        Self {
+        let buffers = |camera: &RigCamera| match &repair {
+            Some(repair) => repair.buffers(camera),
+            None => RenderedImage {
+                rgb8: vec![0; 3 * camera.camera.pixels()],
+                ..RenderedImage::default()
+            },
+        };
+        let images = cameras.iter().map(buffers).collect();
+        Ok(Self {
             cameras,
             backend,
             resident,
@@ -109,23 +142,33 @@ impl<'a> Replay<'a> {
             ego: EgoReplay::new(header),
             actors,
             frame_lines: &episode.frame_lines,
-            pixels: cameras.iter().map(|camera| vec![0; 3 * camera.camera.pixels()]).collect(),
+            repair,
+            images,
             report: ReplayReport {
                 images: 0,
                 changes,
                 diverged: None,
                 difference: None,
                 wrong_value: None,
+                repaired: RepairedImages::default(),
             },
-        }
+        })
     }
 
-    fn switch_version(&mut self, resident: Arc<Resident>, to: &'a RecordedVersion) {
+    fn switch_version(
+        &mut self,
+        resident: Arc<Resident>,
+        to: &'a RecordedVersion,
+    ) -> Result<(), ReplayError> {
+        if let Some(repair) = &mut self.repair {
+            repair.switch_version(&resident.version.manifest)?;
+        }
         self.resident = resident;
         self.profile = &to.profile;
         let recorded = RecordedHashes { version: &to.version_hash, profile: &to.profile_hash };
         let changes = &mut self.report.changes;
         add_scene_changes(changes, &recorded, &self.resident, self.profile);
+        Ok(())
     }
 
     /// Drives the step of a frame, if it is one.
@@ -158,29 +201,58 @@ impl<'a> Replay<'a> {
         until: ReplayUntil,
         visit: &mut VisitImage<'_>,
     ) -> Result<(), ReplayError> {
-        let mut recorded_hashes = frame.images.iter();
+        let mut next_image = 0;
         for pose in 0..frame.poses.len() {
             let selected = frame.cameras_of(pose, self.cameras.len());
             if selected.is_empty() {
                 continue;
             }
-            self.render_pose(frame, pose, &selected)?;
-            for (&camera, recorded) in selected.iter().zip(&mut recorded_hashes) {
+            let views = self.render_pose(frame, pose, &selected)?;
+            self.check_decision(frame, index, &selected, &views, [pose, next_image]);
+            for &camera in &selected {
+                let recorded = &frame.images[next_image];
+                let repair = frame.repairs.get(next_image).and_then(Option::as_ref);
+                next_image += 1;
+                let mounted = &self.cameras[camera];
+                let rendered = &self.images[camera];
+
+                // The rendered pixels, and those that the model makes of them.
+                let recorded_rendered = match repair {
+                    Some(RecordedImageRepair::Repaired(rendered)) => rendered,
+                    Some(RecordedImageRepair::Failed(_)) | None => recorded,
+                };
+                let mut pairs = vec![(recorded_rendered, hash_of(&rendered.rgb8))];
+                let mut repaired = None;
+                if let (Some(RecordedImageRepair::Repaired(_)), Some(model)) =
+                    (repair, &self.repair)
+                {
+                    repaired = model.repaired(mounted, rendered).map_err(|cause| {
+                        let camera = mounted.name.clone();
+                        ReplayError::Repair { step: frame.step, camera, cause: Box::new(cause) }
+                    })?;
+                    match &repaired {
+                        Some(pixels) => {
+                            self.report.repaired.compared += 1;
+                            pairs.push((recorded, hash_of(pixels)));
+                        }
+                        None => self.report.repaired.not_compared += 1,
+                    }
+                }
                 let image = ReplayedImage {
                     frame: index,
                     request: frame.request,
                     step: frame.step,
                     pose,
-                    camera: &self.cameras[camera],
-                    rgb8: &self.pixels[camera],
+                    camera: mounted,
+                    rgb8: repaired.as_deref().unwrap_or(&rendered.rgb8),
                 };
                 visit(&image).map_err(|reason| {
                     let camera = image.camera.name.clone();
                     ReplayError::Visit { step: frame.step, camera, reason }
                 })?;
                 self.report.images += 1;
-                let now = blake3::hash(image.rgb8).to_hex().to_string();
-                if now != *recorded && self.report.difference.is_none() {
+                let different = pairs.into_iter().find(|(recorded, now)| *recorded != now);
+                if let (Some((recorded, now)), None) = (different, &self.report.difference) {
                     self.report.difference = Some(ImageDifference {
                         line: self.frame_lines[index],
                         request: frame.request,
@@ -199,13 +271,44 @@ impl<'a> Replay<'a> {
         Ok(())
     }
 
-    /// Renders the colour of the selected cameras (indices, rising) at a pose of a frame into `pixels`.
+    /// Decides which images of a pose are repaired, and compares that with the record. `at` has the index of the
+    /// pose, and that of its first image.
+    fn check_decision(
+        &mut self,
+        frame: &FrameRecord,
+        index: usize,
+        selected: &[usize],
+        views: &[View],
+        [pose, first_image]: [usize; 2],
+    ) {
+        let Some(repair) = &mut self.repair else { return };
+        let is_observe = frame.request == FrameRequest::Observe;
+        let world_from_rig = &frame.poses[pose];
+        let chosen = repair.decide(is_observe, world_from_rig, selected, views, &mut self.images);
+        for (view, is_chosen) in chosen.into_iter().enumerate() {
+            let recorded = frame.repairs.get(first_image + view).is_some_and(Option::is_some);
+            if recorded != is_chosen && self.report.wrong_value.is_none() {
+                let camera = &self.cameras[selected[view]].name;
+                let text = |is_chosen| {
+                    format!("{camera} {}", if is_chosen { "selected" } else { "not selected" })
+                };
+                self.report.wrong_value = Some(WrongValue {
+                    line: self.frame_lines[index],
+                    field: "repairs",
+                    recorded: text(recorded),
+                    now: text(is_chosen),
+                });
+            }
+        }
+    }
+
+    /// Renders the selected cameras (indices, rising) at a pose of a frame into `images`. Returns their views.
     fn render_pose(
         &mut self,
         frame: &FrameRecord,
         pose: usize,
         selected: &[usize],
-    ) -> Result<(), ReplayError> {
+    ) -> Result<Vec<View>, ReplayError> {
         let step = frame.step;
         let taken_us = frame.taken_us(pose);
         let views = self.ego.episode().views(self.cameras, selected, frame.poses[pose], taken_us);
@@ -217,11 +320,14 @@ impl<'a> Replay<'a> {
         let detail = FrameDetail { viewpoints: &viewpoints, profile: self.profile };
         scene.place(self.actors.placed(taken_us, detail));
 
-        let all = self.pixels.iter_mut().zip(self.cameras).enumerate();
+        let all = self.images.iter_mut().zip(self.cameras).enumerate();
         let mut targets: Vec<Target<'_>> = all
             .filter(|(camera, _)| selected.contains(camera))
-            .map(|(_, (rgb8, camera))| Target {
-                rgb8: Some(rgb8),
+            .map(|(_, (image, camera))| Target {
+                rgb8: Some(&mut image.rgb8),
+                depth_m: used(&mut image.depth_m),
+                opacity: used(&mut image.opacity),
+                normals: used(&mut image.normals),
                 appearance: Some(&camera.appearance),
                 ..Target::default()
             })
@@ -229,8 +335,19 @@ impl<'a> Replay<'a> {
         let to_render = Frame { scene: &scene, profile: self.profile, views: &views };
         let rendered: Result<_, RenderError> =
             self.backend.render(&to_render, &mut targets, &|_, _| {});
-        rendered.map(|_| ()).map_err(|cause| ReplayError::Render { step, cause })
+        rendered.map_err(|cause| ReplayError::Render { step, cause })?;
+        drop(targets);
+        Ok(views)
     }
+}
+
+fn hash_of(rgb8: &[u8]) -> String {
+    blake3::hash(rgb8).to_hex().to_string()
+}
+
+/// A buffer that is not empty.
+fn used(map: &mut [f32]) -> Option<&mut [f32]> {
+    (!map.is_empty()).then_some(map)
 }
 
 /// Adds the changes of a version since it was recorded. The profile's hash changes with a build that knows

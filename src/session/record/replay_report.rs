@@ -4,6 +4,7 @@ use std::io;
 use std::path::PathBuf;
 
 use wildcity_render::RenderError;
+use wildcity_repair::RepairError;
 use wildcity_scene::rig::{RigCamera, RigError};
 use wildcity_twin::residency::ResidencyError;
 
@@ -24,6 +25,17 @@ pub struct ReplayReport {
     pub difference: Option<ImageDifference>,
     /// The first other value of the record that does not follow from the rest of it.
     pub wrong_value: Option<WrongValue>,
+    /// Images that a model had repaired.
+    pub repaired: RepairedImages,
+}
+
+/// Images that a model had repaired. Their rendered pixels and the decision are compared in any case.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct RepairedImages {
+    /// Repaired again, and compared.
+    pub compared: u64,
+    /// Not repaired again: the recorded model was not given, or does not repeat its bytes.
+    pub not_compared: u64,
 }
 
 /// A value of the record, beside poses and images, that is not what the replay computes.
@@ -31,7 +43,7 @@ pub struct ReplayReport {
 pub struct WrongValue {
     /// Line of the episode's file, from 1.
     pub line: usize,
-    /// The field: `step`, `time_us`, `frame_hash`, or one of the end: `outcome`, `steps`, `distance_m` ..
+    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, or one of the end: `outcome`, `steps`, `distance_m` ..
     pub field: &'static str,
     /// As recorded.
     pub recorded: String,
@@ -51,7 +63,7 @@ pub enum ReplayUntil {
 /// A difference between what recorded the episode and what replays it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ProvenanceChange {
-    /// `build`, `backend`, `backend detail`, `version hash` or `profile hash`.
+    /// `build`, `backend`, `backend detail`, `version hash`, `profile hash`, `repair hash` or `repair`.
     pub what: &'static str,
     /// As recorded.
     pub recorded: String,
@@ -146,6 +158,22 @@ pub enum ReplayError {
         /// Why.
         cause: RenderError,
     },
+    /// The repair model cannot be loaded.
+    #[error(transparent)]
+    Model(Box<RepairError>),
+    /// The repair model fails on an image that it had repaired.
+    #[error("step {step}, camera {camera:?}: {cause}")]
+    Repair {
+        /// The step.
+        step: u64,
+        /// Name of the camera.
+        camera: String,
+        /// Why.
+        cause: Box<RepairError>,
+    },
+    /// The images were repaired by their trust, which needs a recorded drive.
+    #[error("images were repaired by their trust, and the twin has no recorded drive any more")]
+    NoDrive,
     /// The caller's function failed on an image.
     #[error("step {step}, camera {camera:?}: {reason:#}")]
     Visit {

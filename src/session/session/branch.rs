@@ -89,6 +89,7 @@ impl Session {
         self.end_recording(Outcome::Completed).await;
 
         episode.add_trusts(rendered.trusts());
+        episode.set_repairing(rendered.repairing);
         self.begin(file, origin.clone());
         // After a switch of version, the frames of the present are as the original has them.
         let frame_history = state.frame_history.clone().or(&rendered.frame_history);
@@ -157,6 +158,9 @@ impl Session {
         if header.scenario.is_some() {
             return Err(BranchError::Scenario.into());
         }
+        if header.repair.is_some() {
+            return Err(BranchError::Repair.into());
+        }
         let cameras = header.rig.cameras;
         let recorded = match header.settings {
             Some(settings) => settings,
@@ -188,13 +192,14 @@ impl Session {
             drive: None,
             scenario: None,
             tells_actors: false,
+            repair: None,
         };
 
         // The state after the step, and the frames that coming observations show again.
         let driven = run_blocking(move || continuation.drive(&layout)).await??;
         Engine::bake_sky(driven.version.clone(), driven.profile).await?;
         let coverage = match recorded.trust {
-            true => Some(training_coverage(&driven.version).await?),
+            true => Some(training_coverage(&driven.version, "outputs.trust").await?),
             false => None,
         };
         let reservation = Engine::reserve(driven.version.clone(), extent, driven.profile).await?;
@@ -217,7 +222,7 @@ impl Session {
         for KeptFrames { episode, version, profile, frames } in kept {
             Engine::bake_sky(version.clone(), profile).await?;
             let coverage = match &self.version.coverage {
-                Some(_) => Some(training_coverage(&version).await?),
+                Some(_) => Some(training_coverage(&version, "outputs.trust").await?),
                 None => None,
             };
             let version = PinnedVersion::new(version, profile, coverage);

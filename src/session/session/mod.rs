@@ -33,6 +33,7 @@ use crate::options::PixelMaps;
 use crate::prefetch::latest_task::LatestTask;
 use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
+use crate::repair::session_repair::SessionRepair;
 use crate::scenario::EpisodeTraffic;
 use crate::snapshot::Snapshots;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -128,7 +129,13 @@ impl Session {
 
     /// Whether images come with their trust.
     pub fn trust(&self) -> bool {
-        self.version.coverage.is_some()
+        let is_told = self.settings.repair.as_ref().is_none_or(|repair| repair.tells_trust);
+        self.version.coverage.is_some() && is_told
+    }
+
+    /// The repair of its images, if it asked for it.
+    pub fn repair(&self) -> Option<&SessionRepair> {
+        self.settings.repair.as_deref()
     }
 
     /// How the ego moves.

@@ -23,6 +23,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
+use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
@@ -95,6 +96,19 @@ impl Session {
             .await??
         };
         let overlays = engine.answer_budget().reserve(overlay_bytes(&rig.cameras))?;
+
+        // The repair of the images. Loading a model takes seconds.
+        let repair = match options.repair {
+            None => None,
+            Some(asked) => {
+                let models = engine.repairs().clone();
+                let cameras = rig.cameras.clone();
+                let tells_trust = outputs.trust;
+                let open =
+                    move || SessionRepair::open(&models, &asked, &cameras, deadline, tells_trust);
+                Some(Arc::new(run_blocking(open).await??))
+            }
+        };
         let extent = rig_extent(&rig.cameras);
 
         // Which images an observation holds, and how they lie in its message.
@@ -107,6 +121,9 @@ impl Session {
         )?;
         let mut layout =
             ObservationLayout::new(rig.cameras, outputs.encoding, outputs.maps, schedule)?;
+        if repair.is_some() {
+            layout.reserve_repair();
+        }
         if let Some(found) = &loaded {
             let actors = found.loaded.scenario.traffic.actors.len();
             layout.reserve_header(if tells_actors { actors } else { 0 })?;
@@ -128,10 +145,11 @@ impl Session {
         engine.check_profile(&profile)?;
         Engine::bake_sky(resident.clone(), profile).await?;
 
-        // Where the twin was recorded, for the trust of images.
-        let coverage = match outputs.trust {
-            true => Some(training_coverage(&resident).await?),
-            false => None,
+        // Where the twin was recorded, for the trust of images, by which repair selects them.
+        let coverage = match (outputs.trust, &repair) {
+            (true, _) => Some(training_coverage(&resident, "outputs.trust").await?),
+            (false, Some(_)) => Some(training_coverage(&resident, "repair").await?),
+            (false, None) => None,
         };
 
         // The memory for the worst frame anywhere in the twin.
@@ -155,6 +173,7 @@ impl Session {
             drive,
             scenario,
             tells_actors,
+            repair,
         };
         let version = PinnedVersion::new(resident, profile, coverage);
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
@@ -221,7 +240,7 @@ impl Session {
         Engine::bake_sky(resident.clone(), profile).await?;
         let bytes = Engine::worst_case_bytes(resident.clone(), extent, profile).await?;
         let coverage = match &self.version.coverage {
-            Some(_) => Some(training_coverage(&resident).await?),
+            Some(_) => Some(training_coverage(&resident, "outputs.trust").await?),
             None => None,
         };
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
@@ -357,15 +376,17 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
     }
 }
 
-/// Where a version of the twin was recorded and trained.
+/// Where a version of the twin was recorded and trained. `field` of the request needs it.
 pub(super) async fn training_coverage(
     resident: &Arc<Resident>,
+    field: &'static str,
 ) -> Result<Arc<TrainingCoverage>, SessionError> {
     let resident = resident.clone();
     // Blocking: a long drive has half a million keyframes and blocks.
     let coverage = run_blocking(move || TrainingCoverage::new(&resident.version.manifest)).await?;
     coverage.map(Arc::new).ok_or_else(|| {
-        let must = "true, and the twin has no recorded drive to compare with".to_owned();
-        SessionError::OutOfRange { field: "outputs.trust", must }
+        let set = if field == "repair" { "set" } else { "true" };
+        let must = format!("{set}, and the twin has no recorded drive to compare with");
+        SessionError::OutOfRange { field, must }
     })
 }

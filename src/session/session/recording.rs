@@ -15,6 +15,7 @@ use crate::record::format::{
     RecordedSettings, RecordedVersion,
 };
 use crate::record::recorder::{NewFile, Recorder};
+use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{PinnedVersion, SessionSettings};
 
@@ -57,7 +58,7 @@ impl Session {
         episode: &Episode,
         rendered: &RenderedObservation,
     ) -> FrameRecord {
-        let RenderedObservation { observation, captures, hashes, .. } = rendered;
+        let RenderedObservation { observation, captures, hashes, repairs, .. } = rendered;
         let all_cameras = self.settings.layout.cameras().len();
         // Where the actors are in the warm-up depends on the time.
         let needs_times = self.settings.scenario.is_some() && captures.len() > 1;
@@ -79,6 +80,7 @@ impl Session {
             terminated: episode.terminated(),
             frame_hash: observation.frame_hash.to_hex().to_string(),
             images: hashes.iter().map(|hash| hash.to_hex().to_string()).collect(),
+            repairs: RecordedImageRepair::list(repairs),
         }
     }
 
@@ -131,7 +133,8 @@ impl Session {
             dynamics: episode.ego().dynamics(),
             start: episode.world_from_rig(),
             dt_us: settings.dt_us,
-            settings: recorded_settings(settings, pinned.coverage.is_some()),
+            settings: recorded_settings(settings, self.trust()),
+            repair: settings.repair.as_deref().map(RecordedRepair::of),
             state: (!episode.is_start_alone()).then(|| episode.clone()),
             origin,
             scenario: traffic.map(|traffic| traffic.loaded().hash.clone()),

@@ -4,7 +4,7 @@
 //! is dropped before that, nothing has happened, and the client can repeat it.
 
 use serde_json::Value;
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout_at};
 
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
@@ -19,6 +19,7 @@ use crate::error::SessionError;
 use crate::limits;
 use crate::observe::builder::ObservationBuilder;
 use crate::observe::builder::finish::RenderedObservation;
+use crate::observe::builder::repair::ObservationRepair;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
@@ -95,6 +96,7 @@ impl Session {
         self.record(record, traffic.as_ref()).await?;
 
         next.add_trusts(rendered.trusts());
+        next.set_repairing(rendered.repairing);
         let frame_history = rendered.frame_history;
         self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
@@ -210,6 +212,7 @@ impl Session {
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());
+        next.set_repairing(rendered.repairing);
         self.begin(file, None);
         let frame_history = rendered.frame_history;
         self.state = EpisodeState { episode: next, frame_history, traffic };
@@ -251,7 +254,11 @@ impl Session {
             version.coverage.clone(),
             episode,
             &captures,
-        )?;
+        )?
+        .with_repair(self.settings.repair.clone().map(|repair| {
+            let repairing = history.is_some().then(|| episode.repairing());
+            ObservationRepair::new(repair, layout.cameras().len(), repairing)
+        }));
         for capture in captures {
             if capture.cameras.is_empty() {
                 builder.add_capture(capture);
@@ -280,6 +287,11 @@ impl Session {
             let (rendered, queued) = self.engine.run(cost, deadline, work).await?;
             builder = rendered?;
             builder.add_queue_time(queued);
+            if builder.has_candidates() {
+                let repaired = run_blocking(move || builder.repair().map(|()| builder));
+                let in_time = timeout_at(deadline, repaired).await;
+                builder = in_time.map_err(|_| SessionError::DeadlineExceeded)???;
+            }
         }
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)

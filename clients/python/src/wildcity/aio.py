@@ -33,6 +33,7 @@ from .protocol import (
     Pose,
     RandomStart,
     RecordedPoint,
+    Repair,
     Resumed,
     Rig,
     SnapshotPoint,
@@ -96,6 +97,7 @@ class Client:
         decision_us: int | None = None,
         warm_up_us: int | None = None,
         scenario: str | Mapping[str, Any] | None = None,
+        repair: str | Repair | None = None,
         trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
@@ -103,6 +105,7 @@ class Client:
         A connection can have 64 sessions; while one is open, the next needs a name, `session`.
 
         `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
+        `repair` is the name of a model of the server's that repairs images, or a `Repair`.
 
         Raises `Refused` if the server refuses.
         """
@@ -122,6 +125,7 @@ class Client:
                 decision_us=decision_us,
                 warm_up_us=warm_up_us,
                 scenario=scenario,
+                repair=repair,
                 trajectory=trajectory,
             )
         )

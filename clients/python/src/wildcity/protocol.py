@@ -283,6 +283,23 @@ class Outputs:
 
 
 @dataclass(frozen=True)
+class Repair:
+    """Which images a model of the server repairs. Fields that are None have the server's default.
+
+    A camera is repaired from trust below `below` on, until its trust is above `above`; never under `at_least`. At
+    most `per_step` images of one pose are, those with the least trust. If the model fails, the image is delivered
+    as rendered with the status `failed`, or with `on_failure="error"` the request is refused as `repair_failed`.
+    """
+
+    model: str
+    below: float | None = None
+    above: float | None = None
+    at_least: float | None = None
+    per_step: int | None = None
+    on_failure: Literal["unrepaired", "error"] | None = None
+
+
+@dataclass(frozen=True)
 class ServerInfo:
     """Name and version of the server."""
 
@@ -334,6 +351,23 @@ class Welcome:
     limits: Limits
     backend: str
     twins: tuple[TwinInfo, ...]
+    repairs: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class OpenedRepair:
+    """The repair of a session's images. `repair_hash` is BLAKE3 of what decides the bytes beside the image."""
+
+    model: str
+    version: str
+    repair_hash: str
+    provider: str
+    deterministic: bool
+    below: float
+    above: float
+    at_least: float
+    per_step: int
+    on_failure: Literal["unrepaired", "error"]
 
 
 @dataclass(frozen=True)
@@ -368,6 +402,7 @@ class Opened:
     outputs: Outputs
     trajectories: tuple[TrajectoryInfo, ...]
     reserved_bytes: int
+    repair: OpenedRepair | None = None
     scenario: OpenedScenario | None = None
     trajectory: Drive | None = None
 
@@ -496,6 +531,19 @@ class Trust:
 
 
 @dataclass(frozen=True)
+class ImageRepair:
+    """What became of an image in a session that asked for repair.
+
+    `kept`: not selected. `repaired`: by the model. `failed`: the model failed, because of `failure`. `rendered_hash`
+    is BLAKE3 of the pixels before the repair, which is the image's `hash` unless it was repaired.
+    """
+
+    status: Literal["kept", "repaired", "failed"]
+    rendered_hash: str
+    failure: Literal["timed_out", "not_finite", "withdrawn", "other"] | None = None
+
+
+@dataclass(frozen=True)
 class ImageInfo:
     """Metadata of one image: its camera, the index of the request's pose, size, intrinsics, times, hash.
 
@@ -524,6 +572,7 @@ class ImageInfo:
     seen: float | None = None
     back: int = 0
     trust: Trust | None = None
+    repair: ImageRepair | None = None
 
 
 @dataclass(frozen=True)
@@ -542,6 +591,7 @@ class Timings:
     render_ms: float
     encode_ms: float
     stages_ms: tuple[Stage, ...]
+    repair_ms: float | None = None
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from .protocol import (
     RandomStart,
     RecordedPoint,
     Refusal,
+    Repair,
     Resumed,
     Rig,
     SnapshotPoint,
@@ -87,6 +88,7 @@ class SessionProtocol:
         decision_us: int | None = None,
         warm_up_us: int | None = None,
         scenario: str | Mapping[str, Any] | None = None,
+        repair: str | Repair | None = None,
         trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
@@ -102,6 +104,7 @@ class SessionProtocol:
             "decision_us": decision_us,
             "warm_up_us": warm_up_us,
             "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
+            "repair": encode(Repair(repair) if isinstance(repair, str) else repair),
             "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}

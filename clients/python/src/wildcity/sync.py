@@ -35,6 +35,7 @@ from .protocol import (
     Pose,
     RandomStart,
     RecordedPoint,
+    Repair,
     Resumed,
     Rig,
     SnapshotPoint,
@@ -95,6 +96,7 @@ class Client:
         decision_us: int | None = None,
         warm_up_us: int | None = None,
         scenario: str | Mapping[str, Any] | None = None,
+        repair: str | Repair | None = None,
         trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
@@ -102,6 +104,7 @@ class Client:
         A connection can have 64 sessions; while one is open, the next needs a name, `session`.
 
         `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
+        `repair` is the name of a model of the server's that repairs images, or a `Repair`.
 
         Raises `Refused` if the server refuses.
         """
@@ -121,6 +124,7 @@ class Client:
                 decision_us=decision_us,
                 warm_up_us=warm_up_us,
                 scenario=scenario,
+                repair=repair,
                 trajectory=trajectory,
             )
         )

@@ -3,6 +3,7 @@
 use std::mem;
 
 use super::ObservationBuilder;
+use super::repair::ObservationRepair;
 use crate::error::SessionError;
 use crate::limits;
 use crate::observe::encode::{EncodedImage, Encoding};
@@ -13,6 +14,7 @@ use crate::observe::observation::{
 };
 use crate::observe::trust::Trust;
 use crate::options::PixelMaps;
+use crate::repair::status::ImageRepair;
 
 /// A finished observation, and what it leaves for its record and for later observations.
 pub(crate) struct RenderedObservation {
@@ -23,6 +25,11 @@ pub(crate) struct RenderedObservation {
     pub(crate) captures: Vec<RigCapture>,
     /// The hash of each rendered image.
     pub(crate) hashes: Vec<blake3::Hash>,
+    /// What became of each rendered image; empty unless the session asked for repair.
+    pub(crate) repairs: Vec<ImageRepair>,
+    /// By camera, whether it is in repair after this observation. None without repair, and for poses that the
+    /// ego is not at.
+    pub(crate) repairing: Option<Vec<bool>>,
     trusts: Vec<Option<Trust>>,
 }
 
@@ -72,6 +79,8 @@ impl ObservationBuilder {
             frame_history,
             captures: self.captures,
             hashes: self.encoded.iter().map(|image| image.hash).collect(),
+            repairs: self.encoded.iter().filter_map(|image| image.repair).collect(),
+            repairing: self.repair.and_then(ObservationRepair::into_repairing),
             trusts: self.encoded.iter().map(|image| image.trust).collect(),
         })
     }
@@ -84,10 +93,10 @@ impl ObservationBuilder {
         for capture in &self.captures {
             for &camera in &capture.cameras {
                 if capture.shown {
-                    let EncodedImage { hash, trust, .. } = self.encoded[encoded];
+                    let EncodedImage { hash, trust, repair, .. } = self.encoded[encoded];
                     let time_us = capture.time_us;
                     shown.push(ShownImage {
-                        info: ImageInfo { camera, pose, time_us, hash, trust },
+                        info: ImageInfo { camera, pose, time_us, hash, trust, repair },
                         encoded,
                     });
                 }
@@ -156,10 +165,10 @@ impl ObservationBuilder {
         for capture in &self.captures {
             for (&camera, image) in capture.cameras.iter().zip(&mut encoded) {
                 if layout.is_shown_later(capture, camera) {
-                    let EncodedImage { hash, trust, .. } = *image;
+                    let EncodedImage { hash, trust, repair, .. } = *image;
                     let bytes = mem::take(&mut image.file);
                     let time_us = capture.time_us;
-                    let frame = PastFrame { camera, time_us, hash, trust, bytes };
+                    let frame = PastFrame { camera, time_us, hash, trust, repair, bytes };
                     history.add(&self.budget, frame)?;
                 }
             }
@@ -171,10 +180,11 @@ impl ObservationBuilder {
             let files: Vec<&[u8]> = earlier.iter().map(|one| &one.frame.bytes[..]).collect();
             self.buffer.append(&self.budget, &files)?;
             for (index, one) in earlier.iter().enumerate() {
-                let PastFrame { camera, time_us, hash, trust, ref bytes } = *one.frame;
+                let PastFrame { camera, time_us, hash, trust, repair, ref bytes } = *one.frame;
                 let shape = layout.colour_shape(camera, bytes.len());
                 tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
-                past_images.push(PastImageInfo { camera, back: one.back, time_us, hash, trust });
+                let back = one.back;
+                past_images.push(PastImageInfo { camera, back, time_us, hash, trust, repair });
             }
         }
         history.drop_unneeded(layout.schedule(), now_us);

@@ -1,6 +1,7 @@
 //! Builds an observation: lays out its buffer, renders into it, and appends the encoded images.
 
 pub(crate) mod finish;
+pub(crate) mod repair;
 
 use std::mem;
 use std::sync::{Arc, OnceLock};
@@ -9,7 +10,7 @@ use std::time::{Duration, Instant};
 use wildcity_render::{Backend, Frame, FrameStats, Target, View};
 
 use super::buffer::ObservationBuffer;
-use super::encode::{EncodedImage, Encoding, encode};
+use super::encode::{EncodedImage, Encoding, encode, hashed};
 use super::layout::{InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
@@ -18,13 +19,19 @@ use crate::engine::render_queue::Scratch;
 use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
 use crate::options::PixelMaps;
+use crate::repair::session_repair::SessionRepair;
+use crate::repair::status::{ImageRepair, RepairStatus};
+
+use self::repair::{Finished, ObservationRepair};
 
 /// An observation that is being built: one capture after the other is rendered, then `finish` closes it.
 pub(crate) struct ObservationBuilder {
     layout: Arc<ObservationLayout>,
     budget: AnswerBudget,
-    /// Where the twin was recorded, if images come with their trust.
+    /// Where the twin was recorded, if images come with their trust or may be repaired.
     coverage: Option<Arc<TrainingCoverage>>,
+    /// Set if images may be repaired.
+    repair: Option<ObservationRepair>,
     buffer: ObservationBuffer,
     history_count: usize,
     /// Where the next shown image's floats go, in bytes from the buffer's start.
@@ -74,6 +81,7 @@ impl ObservationBuilder {
             layout,
             budget: budget.clone(),
             coverage,
+            repair: None,
             buffer,
             history_count: count,
             floats_at,
@@ -84,6 +92,12 @@ impl ObservationBuilder {
             timings: Timings::default(),
             residency: ResidencyStats::default(),
         })
+    }
+
+    /// The same with images that may be repaired.
+    #[must_use]
+    pub(crate) fn with_repair(self, repair: Option<ObservationRepair>) -> Self {
+        Self { repair, ..self }
     }
 
     /// Renders the views of a capture that has cameras; captures come in order. Runs on a render thread.
@@ -98,18 +112,33 @@ impl ObservationBuilder {
         let coverage = self.coverage.clone();
         scratch.resize_with(scratch.len().max(frame.views.len()), Vec::new);
 
-        // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
-        // and normals are computed from depth.
-        let PixelMaps { depth, opacity, normals, .. } = layout.maps();
-        let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
-        let needs_depth = normals && !depth && capture.shown;
         let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
-        let extra_maps = u64::from(needs_opacity) + u64::from(needs_depth);
-        let _share = self.budget.reserve(4 * pixels * extra_maps)?;
-        let mut opacity_maps = zeroed_maps(frame.views, needs_opacity);
-        let mut depth_maps_m = zeroed_maps(frame.views, needs_depth);
+        let gate = match &mut self.repair {
+            Some(repair) => Some(repair.gate(&self.budget, capture, pixels)?),
+            None => None,
+        };
+        let tells_trust = gate.as_ref().is_none_or(|gate| gate.session.tells_trust);
+
+        // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
+        // normals are computed from depth, and a repair model may need each of them.
+        let PixelMaps { depth, opacity, normals, .. } = layout.maps();
+        let model_needs = |needs: fn(&SessionRepair) -> bool| {
+            gate.as_ref().is_some_and(|gate| needs(&gate.session))
+        };
+        let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
+        let uses_depth = (normals && capture.shown) || model_needs(SessionRepair::needs_depth);
+        let needs_depth = uses_depth && !(depth && capture.shown);
+        let needs_normals =
+            model_needs(SessionRepair::needs_normals) && !(normals && capture.shown);
+        let extra_values =
+            u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
+        let _share = self.budget.reserve(4 * pixels * extra_values)?;
+        let mut opacity_maps = zeroed_maps(frame.views, 1, needs_opacity);
+        let mut depth_maps_m = zeroed_maps(frame.views, 1, needs_depth);
+        let mut normal_maps = zeroed_maps(frame.views, 3, needs_normals);
 
         // Where the renderer writes.
+        let raw_at = gate.as_ref().map_or(Vec::new(), |_| self.raw_places(capture));
         let mut targets = self.targets(capture, scratch);
         for (target, opacity) in targets.iter_mut().zip(&mut opacity_maps) {
             target.opacity = Some(opacity);
@@ -117,35 +146,48 @@ impl ObservationBuilder {
         for (target, depth_m) in targets.iter_mut().zip(&mut depth_maps_m) {
             target.depth_m = Some(depth_m);
         }
+        for (target, normals) in targets.iter_mut().zip(&mut normal_maps) {
+            target.normals = Some(normals);
+        }
 
-        // Each image is encoded as soon as it is complete, while others are still rendered.
-        let slots: Vec<OnceLock<Result<EncodedImage, String>>> =
+        // Each image is encoded as soon as it is complete, while others are still rendered; one that may be
+        // repaired is copied instead.
+        let slots: Vec<OnceLock<FinishedView>> =
             frame.views.iter().map(|_| OnceLock::new()).collect();
         let finished = |index: usize, target: &Target<'_>| {
             let camera = capture.cameras[index];
-            let [height, width] = layout.size_px(camera).map(|side| side as u32);
             let pixels = target.rgb8.as_deref().unwrap_or_default();
-            let mut image = encode(pixels, width, height, layout.encoding());
+            let trust = coverage.as_ref().map(|coverage| {
+                let opacity = target.opacity.as_deref().unwrap_or_default();
+                coverage.trust(&capture.world_from_rig, &frame.views[index], opacity)
+            });
+            let repair = gate.as_ref().zip(trust);
+            let repair = repair.map(|(gate, trust)| gate.finished(index, trust.value, target));
+            let mut image = match &repair {
+                Some(Finished { candidate: Some(_), .. }) => Ok(hashed(pixels)),
+                _ => encoded(&layout, camera, pixels, layout.is_shown_later(capture, camera)),
+            };
             if let Ok(image) = &mut image {
-                if layout.encoding() == Encoding::Raw && layout.is_shown_later(capture, camera) {
-                    image.file = pixels.to_vec();
-                }
-                if let Some(coverage) = &coverage {
-                    let opacity = target.opacity.as_deref().unwrap_or_default();
-                    let view = &frame.views[index];
-                    image.trust = Some(coverage.trust(&capture.world_from_rig, view, opacity));
-                }
+                image.trust = trust.filter(|_| tells_trust);
+                let rendered_hash = image.hash;
+                image.repair = repair
+                    .is_some()
+                    .then_some(ImageRepair { status: RepairStatus::Kept, rendered_hash });
             }
             // Setting fails only if the backend finishes a view twice, which it does not.
-            let _ = slots[index].set(image);
+            let _ = slots[index].set((image, repair));
         };
         let started = Instant::now();
         let stats = backend.render(frame, &mut targets, &finished)?;
         self.timings.render += started.elapsed();
         self.add_stages(stats);
 
+        let first = self.encoded.len();
+        let mut repairs = Vec::new();
         for (slot, &camera) in slots.into_iter().zip(&capture.cameras) {
-            let image = slot.into_inner().unwrap_or_else(|| Err("it was never finished".into()));
+            let never = || (Err("it was never finished".to_owned()), None);
+            let (image, repair) = slot.into_inner().unwrap_or_else(never);
+            repairs.extend(repair);
             let image = image.map_err(|reason| {
                 let camera = layout.cameras()[camera].name.clone();
                 SessionError::Encode { camera, reason }
@@ -153,7 +195,22 @@ impl ObservationBuilder {
             self.timings.encode += image.took;
             self.encoded.push(image);
         }
+        if let (Some(repair), Some(gate)) = (&mut self.repair, &gate) {
+            repair.decide(capture, gate, repairs, &raw_at, first);
+        }
         Ok(())
+    }
+
+    /// Where the pixels of each view of a capture are in the buffer, if the observation holds them there.
+    fn raw_places(&self, capture: &RigCapture) -> Vec<Option<usize>> {
+        let is_raw = self.layout.encoding() == Encoding::Raw && capture.shown;
+        let mut next = self.raw_at;
+        let place = |camera: &usize| {
+            let at = next;
+            next += 3 * self.layout.cameras()[*camera].camera.pixels();
+            is_raw.then_some(at)
+        };
+        capture.cameras.iter().map(place).collect()
     }
 
     /// Where the renderer writes a capture's images: into the buffer what the observation holds as
@@ -238,10 +295,28 @@ impl ObservationBuilder {
     }
 }
 
-/// A map of zeros for each view; none at all unless `needed`.
-fn zeroed_maps(views: &[View], needed: bool) -> Vec<Vec<f32>> {
+/// What a render thread leaves of a view: the image, and what the selection needs if there is one.
+type FinishedView = (Result<EncodedImage, String>, Option<Finished>);
+
+/// The hash and the file of a camera's image; of raw pixels a copy if a later observation shows them.
+fn encoded(
+    layout: &ObservationLayout,
+    camera: usize,
+    pixels: &[u8],
+    is_shown_later: bool,
+) -> Result<EncodedImage, String> {
+    let [height, width] = layout.size_px(camera).map(|side| side as u32);
+    let mut image = encode(pixels, width, height, layout.encoding())?;
+    if layout.encoding() == Encoding::Raw && is_shown_later {
+        image.file = pixels.to_vec();
+    }
+    Ok(image)
+}
+
+/// A map of zeros, so many per pixel, for each view; none at all unless `needed`.
+fn zeroed_maps(views: &[View], values: usize, needed: bool) -> Vec<Vec<f32>> {
     let views = if needed { views } else { &[] };
-    views.iter().map(|view| vec![0.0; view.camera.pixels()]).collect()
+    views.iter().map(|view| vec![0.0; values * view.camera.pixels()]).collect()
 }
 
 /// Splits the first bytes off a slice.

@@ -1,5 +1,7 @@
 //! Writes ONNX graphs: the few messages of onnx.proto3 that the tests need, by their field numbers.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 /// A message as bytes.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Message(pub(crate) Vec<u8>);

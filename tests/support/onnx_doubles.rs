@@ -1,6 +1,8 @@
 //! Graphs that stand in for models: each does one thing.
 
-use crate::protobuf::{
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
+use crate::onnx_protobuf::{
     BOOL, Dim, F16, F32, Graph, I64, Message, floats, graph_attribute, int, ints, node, port,
     tensor,
 };
@@ -104,8 +106,47 @@ pub(crate) fn endless_if_bright() -> Vec<u8> {
     add_in_a_loop(nodes, vec![floats("limit", &[], &[0.9]), floats("many", &[], &[1e12])])
 }
 
+/// The image itself if the trust is above 0.4; under it a loop that never ends. Its inputs are `image` and `trust`.
+pub(crate) fn endless_if_doubtful() -> Vec<u8> {
+    let nodes = vec![
+        node("ReduceMax", &["trust"], &["max"], &[int("keepdims", 0)]),
+        node("Div", &["limit", "max"], &["ratio"], &[]),
+        node("Floor", &["ratio"], &["is_doubtful"], &[]),
+        node("Mul", &["is_doubtful", "many"], &["count"], &[]),
+        node("Cast", &["count"], &["trips"], &[int("to", I64)]),
+    ];
+    let constants = vec![floats("limit", &[], &[0.4]), floats("many", &[], &[1e12])];
+    graph_in_a_loop(nodes, constants, vec![port("trust", F32, &[Some(1), Some(1)])])
+}
+
+/// A brighter image if the trust is above 0.4, NaN under it. Its inputs are `image` and `trust`.
+pub(crate) fn nan_if_doubtful() -> Vec<u8> {
+    let nodes = vec![
+        node("Sub", &["trust", "limit"], &["spare"], &[]),
+        node("Sqrt", &["spare"], &["root"], &[]),
+        node("ReduceMax", &["root"], &["more"], &[int("keepdims", 0)]),
+        node("Add", &["image", "more"], &["repaired"], &[]),
+    ];
+    Graph {
+        nodes,
+        constants: vec![floats("limit", &[], &[0.4])],
+        inputs: vec![port("image", F32, &IMAGE), port("trust", F32, &[Some(1), Some(1)])],
+        outputs: vec![port("repaired", F32, &[Some(1), None, None, None])],
+    }
+    .onnx()
+}
+
 /// A loop with as many iterations as `trips` says.
-fn add_in_a_loop(mut nodes: Vec<Message>, mut constants: Vec<Message>) -> Vec<u8> {
+fn add_in_a_loop(nodes: Vec<Message>, constants: Vec<Message>) -> Vec<u8> {
+    graph_in_a_loop(nodes, constants, Vec::new())
+}
+
+/// The same with more inputs than the image.
+fn graph_in_a_loop(
+    mut nodes: Vec<Message>,
+    mut constants: Vec<Message>,
+    more_inputs: Vec<Message>,
+) -> Vec<u8> {
     let body = Graph {
         nodes: vec![
             node("Identity", &["go_on"], &["go_on_out"], &[]),
@@ -122,7 +163,33 @@ fn add_in_a_loop(mut nodes: Vec<Message>, mut constants: Vec<Message>) -> Vec<u8
     let body = graph_attribute("body", &body.message());
     nodes.push(node("Loop", &["trips", "go", "image"], &["repaired"], &[body]));
     constants.push(tensor("go", BOOL, &[], &[1]));
-    rgb(nodes, constants)
+    let inputs = [vec![port("image", F32, &IMAGE)], more_inputs].concat();
+    let outputs = vec![port("repaired", F32, &[Some(1), None, None, None])];
+    Graph { nodes, constants, inputs, outputs }.onnx()
+}
+
+/// The image and 0.02 of `depth`, 0.5 of `opacity` and 0.2 of `normals`.
+pub(crate) fn sum_of_maps() -> Vec<u8> {
+    let weighted = |map: &'static str, weight: &'static str, product: &'static str| {
+        node("Mul", &[map, weight], &[product], &[])
+    };
+    let map = |name: &str, channels: u64| port(name, F32, &[Some(1), Some(channels), None, None]);
+    Graph {
+        nodes: vec![
+            weighted("depth", "of_depth", "a"),
+            weighted("opacity", "of_opacity", "b"),
+            weighted("normals", "of_normals", "c"),
+            node("Sum", &["image", "a", "b", "c"], &["repaired"], &[]),
+        ],
+        constants: vec![
+            floats("of_depth", &[], &[0.02]),
+            floats("of_opacity", &[], &[0.5]),
+            floats("of_normals", &[], &[0.2]),
+        ],
+        inputs: vec![map("image", 3), map("depth", 1), map("opacity", 1), map("normals", 3)],
+        outputs: vec![port("repaired", F32, &[Some(1), None, None, None])],
+    }
+    .onnx()
 }
 
 /// The signature of Difix: `image` and `reference` in f16, -1 to 1. The reference works on all pixels, as

@@ -1,0 +1,87 @@
+//! The models that a program offers, by name. Each is loaded when it is first asked for, so that a program
+//! whose users ask for none loads no library.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use crate::error::RepairError;
+use crate::files;
+use crate::model::{LoadOptions, Model};
+
+/// The models of some manifests.
+#[derive(Debug, Default)]
+pub struct Models {
+    options: LoadOptions,
+    entries: BTreeMap<String, Entry>,
+}
+
+#[derive(Debug)]
+struct Entry {
+    manifest: PathBuf,
+    loaded: Mutex<Option<Arc<Model>>>,
+}
+
+impl Models {
+    /// Reads the manifests at `paths`, and nothing else: no model and no library is loaded. That the library
+    /// is a file is checked if there is a manifest.
+    ///
+    /// # Errors
+    /// A manifest cannot be read, two have the same name, or the library is not named or no file.
+    pub fn read(paths: &[PathBuf], options: LoadOptions) -> Result<Models, RepairError> {
+        let mut entries: BTreeMap<String, Entry> = BTreeMap::new();
+        for path in paths {
+            let name = files::read_manifest(path)?.name;
+            if let Some(other) = entries.get(&name) {
+                let message =
+                    format!("{name:?} is also that of {}; rename one", other.manifest.display());
+                let field = "name".to_owned();
+                return Err(RepairError::Manifest { file: path.clone(), field, message });
+            }
+            let entry = Entry { manifest: path.clone(), loaded: Mutex::default() };
+            entries.insert(name, entry);
+        }
+        if !entries.is_empty() {
+            if options.library.as_os_str().is_empty() {
+                return Err(RepairError::RuntimeUnnamed);
+            }
+            let path = options.library.clone();
+            files::check_library(&path)
+                .map_err(|message| RepairError::Runtime { path, message })?;
+        }
+        Ok(Models { options, entries })
+    }
+
+    /// The names, sorted.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.entries.keys().map(String::as_str)
+    }
+
+    /// The model of a name. Loads it if it is not loaded yet, or was withdrawn; callers of the same model wait
+    /// for each other.
+    ///
+    /// # Errors
+    /// [`RepairError::Unknown`], or those of [`Model::load`].
+    pub fn get(&self, name: &str) -> Result<Arc<Model>, RepairError> {
+        let Some(entry) = self.entries.get(name) else {
+            let known = self.entries.keys().cloned().collect();
+            return Err(RepairError::Unknown { name: name.to_owned(), known });
+        };
+        let mut loaded = entry.loaded.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(model) = loaded.as_ref().filter(|model| !model.is_withdrawn()) {
+            return Ok(Arc::clone(model));
+        }
+        *loaded = None;
+        let model = Arc::new(Model::load(&entry.manifest, &self.options)?);
+        if model.manifest().name != name {
+            let message = format!(
+                "{:?}; it was {name:?} when the program started: restart it, or restore the file",
+                model.manifest().name
+            );
+            let field = "name".to_owned();
+            return Err(RepairError::Manifest { file: entry.manifest.clone(), field, message });
+        }
+        *loaded = Some(Arc::clone(&model));
+        Ok(model)
+    }
+}

@@ -1,0 +1,178 @@
+//! The model of a session, and the repair of one image.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use wildcity_repair::{Image, InputRole, Model, Models, RepairError, Selection, View};
+use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::rig::RigCamera;
+
+use crate::error::SessionError;
+use crate::options::{OnFailure, RepairOptions};
+
+/// The repair of a session: the model, and when it is used.
+#[derive(Debug)]
+pub struct SessionRepair {
+    /// The model.
+    pub model: Arc<Model>,
+    /// Which images.
+    pub selection: Selection,
+    /// What happens when the model fails.
+    pub on_failure: OnFailure,
+    /// Whether observations tell the trust, by which the images are selected.
+    pub(crate) tells_trust: bool,
+}
+
+/// An image as it was rendered, and what the model may need beside it. Maps that it does not need are empty.
+#[derive(Debug, Default)]
+pub(crate) struct RenderedImage {
+    /// `[height, width, 3]`.
+    pub(crate) rgb8: Vec<u8>,
+    /// `[height, width]`, in metres.
+    pub(crate) depth_m: Vec<f32>,
+    /// `[height, width]`.
+    pub(crate) opacity: Vec<f32>,
+    /// `[height, width, 3]`.
+    pub(crate) normals: Vec<f32>,
+    /// The trust by which it was selected.
+    pub(crate) trust: f64,
+}
+
+impl SessionRepair {
+    /// Finds and loads the model, and checks that it can repair the images of some cameras. Blocks.
+    ///
+    /// # Errors
+    /// There is no such model, it cannot be loaded or used, or an option is out of range.
+    pub(crate) fn open(
+        models: &Models,
+        options: &RepairOptions,
+        cameras: &[RigCamera],
+        deadline: Duration,
+        tells_trust: bool,
+    ) -> Result<Self, SessionError> {
+        let selection = selection_of(options)?;
+        let name = &options.model;
+        let unavailable =
+            |reason: String| SessionError::RepairUnavailable { name: name.clone(), reason };
+        let model = models.get(name).map_err(|error| match error {
+            RepairError::Unknown { name, known } => SessionError::UnknownRepair { name, known },
+            other => unavailable(other.to_string()),
+        })?;
+        for input in &model.manifest().inputs {
+            let is_reference = matches!(
+                input.role,
+                InputRole::Reference | InputRole::ReferenceWarped | InputRole::ReferenceValid
+            );
+            if is_reference {
+                let role = input.role.name();
+                let must = "and twins have no recorded images yet; choose a model without it";
+                return Err(unavailable(format!("it needs the input {role:?}, {must}")));
+            }
+        }
+        let scale = model.manifest().outputs[0].scale;
+        if scale != 1 {
+            return Err(unavailable(format!(
+                "its output is {scale} times as large as its input; sessions take models of scale 1"
+            )));
+        }
+        for RigCamera { name, camera, .. } in cameras {
+            let checked = model.check_size(camera.width_px as usize, camera.height_px as usize);
+            checked.map_err(|error| unavailable(format!("camera {name:?}: {error}")))?;
+        }
+        let timeout_ms = model.manifest().timeout_ms;
+        if Duration::from_millis(timeout_ms) >= deadline {
+            let must = format!(
+                "{} ms, and the repair model may run for {timeout_ms} ms per image (its timeout_ms); give more",
+                deadline.as_millis()
+            );
+            return Err(SessionError::OutOfRange { field: "deadline_ms", must });
+        }
+        Ok(Self { model, selection, on_failure: options.on_failure, tells_trust })
+    }
+
+    /// Whether the model needs depth; normals are computed from it.
+    pub(crate) fn needs_depth(&self) -> bool {
+        self.model.needs(InputRole::Depth) || self.needs_normals()
+    }
+
+    /// Whether the model needs normals.
+    pub(crate) fn needs_normals(&self) -> bool {
+        self.model.needs(InputRole::Normals)
+    }
+
+    /// The repaired pixels of an image. Blocks.
+    pub(crate) fn repair(
+        &self,
+        camera: &RigCamera,
+        rendered: &RenderedImage,
+    ) -> Result<Vec<u8>, RepairError> {
+        repair(&self.model, camera, rendered)
+    }
+}
+
+/// The repaired pixels of a camera's image: black outside of the lens' field, with the camera's overlay.
+pub(crate) fn repair(
+    model: &Model,
+    camera: &RigCamera,
+    rendered: &RenderedImage,
+) -> Result<Vec<u8>, RepairError> {
+    let RenderedImage { rgb8, depth_m, opacity, normals, trust } = rendered;
+    let width = camera.camera.width_px as usize;
+    let height = camera.camera.height_px as usize;
+    let image = Image { width, height, rgb8: rgb8.clone() };
+    let mut mask = Vec::new();
+    let field = FieldMask::of(&camera.camera);
+    if field.is_some() || model.needs(InputRole::Mask) {
+        mask = vec![1.0; width * height];
+    }
+    if let Some(field) = field {
+        field.clear_outside(&camera.camera, 1, &mut mask);
+    }
+    let normals = planar(normals);
+    let given = |role: InputRole, values| model.needs(role).then_some(values);
+    let view = View {
+        depth_m: given(InputRole::Depth, &depth_m[..]),
+        opacity: given(InputRole::Opacity, &opacity[..]),
+        normals: given(InputRole::Normals, &normals[..]),
+        mask: (!mask.is_empty()).then_some(&mask[..]),
+        trust: Some(*trust as f32),
+        ..View::new(&image)
+    };
+    let mut repaired = model.repair(&view)?.image.rgb8;
+    if let Some(overlay) = &camera.appearance.overlay {
+        let alphas = overlay.rgba8().chunks_exact(4).map(|pixel| u32::from(pixel[3]));
+        let pixels = repaired.chunks_exact_mut(3).zip(rgb8.chunks_exact(3));
+        for ((out, rendered), alpha) in pixels.zip(alphas) {
+            for (out, rendered) in out.iter_mut().zip(rendered) {
+                let sum = (255 - alpha) * u32::from(*out) + alpha * u32::from(*rendered);
+                *out = ((sum + 127) / 255) as u8;
+            }
+        }
+    }
+    Ok(repaired)
+}
+
+/// All x, then all y, then all z.
+fn planar(interleaved: &[f32]) -> Vec<f32> {
+    let axis = |axis: usize| interleaved.iter().skip(axis).step_by(3).copied();
+    axis(0).chain(axis(1)).chain(axis(2)).collect()
+}
+
+fn selection_of(options: &RepairOptions) -> Result<Selection, SessionError> {
+    let default = Selection::default();
+    let selection = Selection {
+        below: options.below.unwrap_or(default.below),
+        above: options.above.unwrap_or(default.above),
+        at_least: options.at_least.unwrap_or(default.at_least),
+        per_step: options.per_step.map_or(default.per_step, |count| count as usize),
+    };
+    selection.check().map_err(|(field, must)| {
+        let field = match field {
+            "below" => "repair.below",
+            "above" => "repair.above",
+            _ => "repair.at_least",
+        };
+        SessionError::OutOfRange { field, must }
+    })?;
+    Ok(selection)
+}
