@@ -48,7 +48,7 @@ fn every_camera_sees_daylight_without_holes() {
             covered /= pixels;
             assert!(pixels > 0.3 * count, "{what}: {pixels} of the ground");
             assert!(thinnest > 0.6, "{what}: opacity {thinnest} somewhere");
-            assert!(covered > 0.98, "{what}: opacity {covered} on average");
+            assert!(covered > 0.985, "{what}: opacity {covered} on average");
             let dark = rgba.iter().filter(|[r, g, b, _]| r + g + b < 0.02).count();
             assert!((dark as f32) < 1e-3 * count, "{what}: {dark} pixels are black");
             seen_sky += rgba.iter().filter(|pixel| pixel[3] < 0.01 && pixel[2] > pixel[0]).count();
@@ -60,9 +60,13 @@ fn every_camera_sees_daylight_without_holes() {
     assert!(seen_sky > 20_000, "{seen_sky}");
 }
 
+/// A camera with larger pixels of its own, and not one whose image is the native image shrunk: that filter makes thin splats
+/// fainter, by up to 0.4 % of the opacity of a native image, which is no hole of the street (`tests/render/small_images.rs`
+/// bounds its error). Opacity on average is at least 0.986 in native images, 0.983 in shrunk ones and 0.989 in these.
 fn shrunk(camera: &Camera) -> Camera {
     let [width, height] = [camera.width_px, camera.height_px].map(|side| (side / SHRINK).into());
-    camera.scaled(width, height).expect("a quarter of a camera")
+    let scaled = camera.scaled(width, height).expect("a quarter of a camera");
+    Camera { native_size_px: None, ..scaled }
 }
 
 fn picture(cpu: &Cpu, scene: &Scene, view: View) -> Vec<[f32; 4]> {
