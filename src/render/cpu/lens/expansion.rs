@@ -126,8 +126,9 @@ impl LensProjection {
         expansion.shutter = Some(terms);
 
         // From the frame at the moment of exposure to the one at the end: (row · R v) is (Rᵀ row · v).
-        expansion.rows =
-            expansion.rows.map(|row| shutter.direction_to_end_frame(simd, row, remaining));
+        for row in &mut expansion.rows {
+            *row = shutter.direction_to_end_frame(simd, *row, remaining);
+        }
         Some(expansion)
     }
 
@@ -151,16 +152,16 @@ impl LensProjection {
         expansion.room = expansion.room.min(refraction.margin);
         // A displacement v becomes inside (unit · v) + by_x (x̂ - x unit) · v + by_y (ŷ - y unit) · v, where x̂ and ŷ
         // are the camera's axes. So each row has a part along the ray, and one along x̂ and ŷ.
-        expansion.rows = expansion.rows.map(|row| {
+        for row in &mut expansion.rows {
             let along_x = row.dot(refraction.by_x);
             let along_y = row.dot(refraction.by_y);
             let along = row.dot(inside) - unit.x * along_x - unit.y * along_y;
-            Vec3x16 {
+            *row = Vec3x16 {
                 x: unit.x.mul_add(along, along_x),
                 y: unit.y.mul_add(along, along_y),
                 z: unit.z * along,
-            }
-        });
+            };
+        }
         Some(expansion)
     }
 
@@ -212,7 +213,8 @@ impl LensProjection {
                 let kappa = (alpha * cos - beta) * per_sin;
                 let mu = (alpha - beta * cos) * per_sin;
 
-                let [[c, d], [e, f]] = px_from_round.map(|row| row.map(splat));
+                let [[c, d], [e, f]] = *px_from_round;
+                let [c, d, e, f] = [splat(c), splat(d), splat(e), splat(f)];
                 let plane = [
                     [
                         c.mul_add(cos_azimuth, d * sin_azimuth),
@@ -225,9 +227,9 @@ impl LensProjection {
                 ];
                 let away = Vec3x16 { x: cos * cos_azimuth, y: cos * sin_azimuth, z: -sin };
                 let around = Vec3x16 { x: -sin_azimuth, y: cos_azimuth, z: zero };
-                let rows = [away, around, point_m.scale(per_distance)];
+                let along = point_m.scale(per_distance).scale(per_distance);
                 Some(Expansion {
-                    rows: rows.map(|row| row.scale(per_distance)),
+                    rows: [away.scale(per_distance), around.scale(per_distance), along],
                     alpha,
                     beta,
                     gamma,
@@ -245,17 +247,9 @@ impl LensProjection {
                 let [fx, fy] = focal_px.map(splat);
                 let in_front = z.simd_gt(zero);
                 let room = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
-                Some(Expansion {
-                    rows: slope_rows(simd, x, y, inverse),
-                    alpha: one,
-                    beta: one,
-                    gamma: zero,
-                    kappa: zero,
-                    mu: zero,
-                    plane: [[fx, zero], [zero, fy]],
-                    room: in_front.select(room, splat(-1.0)),
-                    shutter: None,
-                })
+                let room = in_front.select(room, splat(-1.0));
+                let plane = [[fx, zero], [zero, fy]];
+                Some(Expansion::of_slopes(simd, [x, y], inverse, plane, room))
             }
             Model::Slopes { focal_px, k, p, s, max_slope2 } => {
                 let inverse = one / z;
@@ -287,42 +281,52 @@ impl LensProjection {
                     [fx * (along_x + twice(prism_x * x)), fx * (across + twice(prism_x * y))],
                     [fy * (across + twice(prism_y * x)), fy * (along_y + twice(prism_y * y))],
                 ];
-                Some(Expansion {
-                    rows: slope_rows(simd, x, y, inverse),
-                    alpha: one,
-                    beta: one,
-                    gamma: zero,
-                    kappa: zero,
-                    mu: zero,
-                    plane,
-                    room: splat(max_slope2.sqrt()) - r2.sqrt(),
-                    shutter: None,
-                })
+                let room = splat(max_slope2.sqrt()) - r2.sqrt();
+                Some(Expansion::of_slopes(simd, [x, y], inverse, plane, room))
             }
         }
     }
 }
 
-/// Rows that take displacements of points with slopes x, y at a depth of 1/`inverse` to (a, b, c).
-#[inline(always)]
-fn slope_rows<S: Simd>(simd: S, x: f32x16<S>, y: f32x16<S>, inverse: f32x16<S>) -> [Vec3x16<S>; 3] {
-    let zero = f32x16::splat(simd, 0.0);
-    [
-        Vec3x16 { x: inverse, y: zero, z: -(x * inverse) },
-        Vec3x16 { x: zero, y: inverse, z: -(y * inverse) },
-        Vec3x16 { x: zero, y: zero, z: inverse },
-    ]
-}
-
 impl<S: Simd> Expansion<S> {
+    /// The expansion of a lens of slopes x and y, around points at a depth of 1/`inverse`. `plane` leads from slopes to
+    /// pixels.
+    #[inline(always)]
+    fn of_slopes(
+        simd: S,
+        [x, y]: [f32x16<S>; 2],
+        inverse: f32x16<S>,
+        plane: [[f32x16<S>; 2]; 2],
+        room: f32x16<S>,
+    ) -> Self {
+        let zero = f32x16::splat(simd, 0.0);
+        let one = f32x16::splat(simd, 1.0);
+        let rows = [
+            Vec3x16 { x: inverse, y: zero, z: -(x * inverse) },
+            Vec3x16 { x: zero, y: inverse, z: -(y * inverse) },
+            Vec3x16 { x: zero, y: zero, z: inverse },
+        ];
+        Self {
+            rows,
+            alpha: one,
+            beta: one,
+            gamma: zero,
+            kappa: zero,
+            mu: zero,
+            plane,
+            room,
+            shutter: None,
+        }
+    }
+
     /// The rows that take a displacement to (a, b, c), for displacements in another frame: `camera_from_other`
     /// has the rows of its rotation.
     #[inline(always)]
     pub(in crate::cpu) fn in_frame(&mut self, camera_from_other: [Vec3x16<S>; 3]) {
         let [right, down, forward] = camera_from_other;
-        self.rows = self
-            .rows
-            .map(|row| right.scale(row.x).plus(down.scale(row.y)).plus(forward.scale(row.z)));
+        for row in &mut self.rows {
+            *row = right.scale(row.x).plus(down.scale(row.y)).plus(forward.scale(row.z));
+        }
     }
 
     /// The image of a Gaussian's axes, times their standard deviations, in metres.
