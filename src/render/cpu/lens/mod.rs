@@ -486,12 +486,12 @@ mod tests {
     /// Points on a spiral from the axis to far beyond the end of the field.
     #[test]
     fn projected_points_match_f64() {
-        let mut max_error_px: f64 = 0.0;
         for (name, camera, least_inside) in cameras() {
             for view in views(camera) {
                 let projection = LensProjection::new(&view).expect(&name);
                 let mut inside = 0;
                 let mut beyond = 0;
+                let mut max_error_px: f64 = 0.0;
                 for step in 0..5_000 {
                     let angle_rad = camera.limit_rad() * f64::from(step) / 4_000.0;
                     let (sin, cos) = angle_rad.sin_cos();
@@ -523,10 +523,11 @@ mod tests {
                 // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that drives
                 // towards them may have them within its field: 100 of those of a telephoto lens.
                 assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
+                eprintln!("{name}: {max_error_px:.1e} px");
+                // Behind a windshield and far beyond the image 2.0e-3 px were measured.
+                let bound_px = if is_bare { 1.5e-3 } else { 2.5e-3 };
+                assert!(max_error_px < bound_px, "{name}: {max_error_px:e} px");
             }
         }
-        eprintln!("largest error: {max_error_px:.1e} px");
-        // Measured 2.0e-3 px: behind a windshield, far beyond the image. Without windshields it is below 1.5e-3 px.
-        assert!(max_error_px < 2.5e-3, "{max_error_px:e} px");
     }
 }
