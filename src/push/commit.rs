@@ -47,14 +47,7 @@ pub(crate) fn commit(
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
             let profile = (!request.profile.is_empty()).then_some(profile);
-            let change = VersionChange {
-                profile,
-                rig: None,
-                trajectories: None,
-                sky: None,
-                geo: None,
-                provenance,
-            };
+            let change = VersionChange { profile, ..VersionChange::none(provenance) };
             commit.change(base.number, change)?
         }
         _ => {

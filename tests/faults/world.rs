@@ -384,5 +384,5 @@ fn open(disk: &SimDisk, clock: &Arc<SimClock>) -> Result<Catalog, String> {
 
 fn cells_alone() -> VersionChange {
     let provenance = provenance();
-    VersionChange { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance }
+    VersionChange::none(provenance)
 }

@@ -33,7 +33,7 @@ static EMPTY: Gaussians = Gaussians {
 fn change(source: &str) -> VersionChange {
     let mut provenance = settings().provenance;
     provenance.source = source.to_owned();
-    VersionChange { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance }
+    VersionChange::none(provenance)
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.

@@ -1,10 +1,9 @@
 //! `wildcity twin geo`.
 
-use std::io::{self, Write};
-
 use crate::cli::directories::{TwinVersion, Twins};
 use wildcity_scene::geo::GeoAnchor;
-use wildcity_twin::store::{CommitKind, StorageOptions, VersionChange};
+
+use super::change;
 
 /// Say where a twin lies on the earth, or remove that: makes a new version with the same Gaussians.
 ///
@@ -38,30 +37,10 @@ Examples:
 
 impl Geo {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
-        let catalog = self.twins.catalog()?;
-        let base = catalog.version(&self.twin.name, self.twin.number)?;
-        // The Gaussians stay, and so does what the version says of their origin.
-        let provenance = base.manifest.provenance.clone();
-        let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
-        let commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
-        let change = VersionChange {
-            profile: None,
-            rig: None,
-            trajectories: None,
-            sky: None,
-            geo: Some(self.anchor),
-            provenance,
-        };
-        let version = commit.change(base.number, change)?;
+        let anchor = self.anchor;
+        let version = change::commit(&self.twins, &self.twin, |change| change.geo = Some(anchor))?;
         let anchor = version.manifest.geo.as_ref();
         let what = anchor.map_or(Ok("no place on the earth".to_owned()), serde_json::to_string)?;
-        writeln!(
-            io::stdout().lock(),
-            "twin {} version {}: {what}\nblake3 {}",
-            self.twin.name,
-            version.number,
-            version.hash
-        )?;
-        Ok(())
+        change::print(&version, &what)
     }
 }

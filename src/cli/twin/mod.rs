@@ -1,5 +1,6 @@
 //! `wildcity twin`.
 
+mod change;
 mod diff;
 mod fsck;
 mod gc;

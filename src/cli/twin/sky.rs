@@ -1,10 +1,10 @@
 //! `wildcity twin sky`.
 
-use std::io::{self, Write};
-
 use crate::cli::directories::{TwinVersion, Twins};
 use crate::cli::sky_source::SkySource;
-use wildcity_twin::store::{CommitKind, NewSky, StorageOptions, VersionChange};
+use wildcity_twin::store::NewSky;
+
+use super::change;
 
 /// Add, replace or remove the sky of a twin: makes a new version with the same Gaussians.
 ///
@@ -37,33 +37,12 @@ Examples:
 impl Sky {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let sky = self.source.read("identity")?.map(NewSky::Put);
-        let catalog = self.twins.catalog()?;
-        let base = catalog.version(&self.twin.name, self.twin.number)?;
-        // The Gaussians stay, and so does what the version says of their origin.
-        let provenance = base.manifest.provenance.clone();
-        let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
-        let commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
-        let change = VersionChange {
-            profile: None,
-            rig: None,
-            trajectories: None,
-            sky: Some(sky),
-            geo: None,
-            provenance,
-        };
-        let version = commit.change(base.number, change)?;
+        let version = change::commit(&self.twins, &self.twin, |change| change.sky = Some(sky))?;
         let what = version
             .manifest
             .sky
             .as_ref()
             .map_or("no sky".to_owned(), |sky| format!("a sky of {} bytes", sky.bytes));
-        writeln!(
-            io::stdout().lock(),
-            "twin {} version {}: {what}\nblake3 {}",
-            self.twin.name,
-            version.number,
-            version.hash
-        )?;
-        Ok(())
+        change::print(&version, &what)
     }
 }

@@ -106,15 +106,7 @@ impl Catalog {
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
         let mut provenance = manifest.provenance.clone();
         provenance.options.push(option);
-        let change = VersionChange {
-            profile: None,
-            rig: None,
-            trajectories: None,
-            sky: None,
-            geo: None,
-            provenance,
-        };
-        let version = commit.change(base.number, change)?;
+        let version = commit.change(base.number, VersionChange::none(provenance))?;
         Ok(Cut { version, gaussians: cut })
     }
 

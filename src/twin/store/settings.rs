@@ -55,6 +55,11 @@ impl VersionSettings {
 }
 
 impl VersionChange {
+    /// Keeps everything of the base version.
+    pub fn none(provenance: Provenance) -> Self {
+        Self { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance }
+    }
+
     /// Checks everything but the sky, which needs the profile of the base.
     ///
     /// # Errors

@@ -1,0 +1,33 @@
+//! A new version of a twin with the same Gaussians.
+
+use std::io::{self, Write};
+
+use crate::cli::directories::{TwinVersion, Twins};
+use wildcity_twin::store::{CommitKind, StorageOptions, Version, VersionChange};
+
+/// Commits a version that differs from its base by what `edit` changes.
+pub(super) fn commit(
+    twins: &Twins,
+    twin: &TwinVersion,
+    edit: impl FnOnce(&mut VersionChange),
+) -> anyhow::Result<Version> {
+    let catalog = twins.catalog()?;
+    let base = catalog.version(&twin.name, twin.number)?;
+    // The Gaussians stay, and so does what the version says of their origin.
+    let mut change = VersionChange::none(base.manifest.provenance.clone());
+    edit(&mut change);
+    let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
+    let commit = catalog.begin(&twin.name, CommitKind::Import, storage)?;
+    Ok(commit.change(base.number, change)?)
+}
+
+/// Prints the number of a new version, what it has, and its hash.
+pub(super) fn print(version: &Version, what: &str) -> anyhow::Result<()> {
+    let Version { number, hash, manifest, .. } = version;
+    writeln!(
+        io::stdout().lock(),
+        "twin {} version {number}: {what}\nblake3 {hash}",
+        manifest.twin
+    )?;
+    Ok(())
+}
