@@ -4,6 +4,7 @@ mod benched_twin;
 mod drive;
 mod gpu;
 mod load;
+mod memory;
 mod sessions;
 mod soak;
 mod step;

@@ -1,7 +1,6 @@
 //! `wildcity bench soak`.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -17,16 +16,18 @@ use wildcity_scene::Trajectory;
 use wildcity_server::{Config, Directories, Limits};
 
 use super::benched_twin::BenchedTwin;
+use super::memory::{mib, rss_bytes};
 use crate::cli::backend_options::bytes_of_gib;
 use crate::cli::directories::TwinVersion;
 use crate::cli::exit::Exit;
 
 /// Drive many sessions of small cameras against a server for minutes or hours, and look for what grows or changes.
 ///
-/// The server runs in this process. Each session drives the same stretch of the twin's first trajectory again and
-/// again, and compares the hash of every image with its first time. Prints a line a minute. The exit code is 1 if
-/// a request failed, a hash changed, or the memory of the process grew by more than --growth after the first sixth
-/// of the time. --memory-gib below what the twin needs makes the server evict and load all the time.
+/// The server runs in this process. The twin needs a recorded drive: each session drives the same stretch of the first
+/// one again and again, and compares the hash of every image with that of its first round. Prints the memory of the
+/// process every minute. The exit code is 1 if a request fails, a hash changes, or the memory grows by more than
+/// --growth after the first sixth of the time. With --memory-gib below what the twin needs, the server evicts and
+/// loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {
@@ -137,7 +138,7 @@ impl Soak {
                     }
                 },
                 _ = tick.tick() => {
-                    let bytes = resident_bytes()?;
+                    let bytes = rss_bytes()?.now;
                     let elapsed = begun.elapsed();
                     if elapsed >= length.mul_f64(SETTLED_SHARE) {
                         settled.get_or_insert(bytes);
@@ -238,19 +239,6 @@ fn rig() -> anyhow::Result<Rig> {
         camera("rear", -0.6, [0.5, -0.5, -0.5, 0.5])
     ]);
     Ok(Rig { name: "soak".to_owned(), cameras: serde_json::from_value(cameras)? })
-}
-
-/// Memory of this process that is in RAM.
-fn resident_bytes() -> anyhow::Result<u64> {
-    let status = fs::read_to_string("/proc/self/status")
-        .context("the memory of a process is known on Linux only")?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
-    let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
-    Ok(kib.context("/proc/self/status has no VmRSS")? << 10)
-}
-
-fn mib(bytes: u64) -> f64 {
-    bytes as f64 / f64::from(1 << 20)
 }
 
 fn minutes(text: &str) -> Result<f64, String> {

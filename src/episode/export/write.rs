@@ -134,12 +134,7 @@ impl<W: Write + Seek> McapFile<W> {
             .map(|(k, camera)| transform("rig", &frame_of(k), time_us, &camera.rig_from_camera));
         let transforms: Vec<_> = transforms.collect();
         if !transforms.is_empty() {
-            self.proto(
-                "/tf",
-                "foxglove.FrameTransforms",
-                time_us,
-                &foxglove::FrameTransforms { transforms },
-            )?;
+            self.transforms(time_us, transforms)?;
         }
         let mut without_calibration = 0;
         for (k, camera) in cameras.iter().enumerate() {
@@ -154,17 +149,20 @@ impl<W: Write + Seek> McapFile<W> {
         Ok(without_calibration)
     }
 
+    fn transforms(
+        &mut self,
+        time_us: i64,
+        transforms: Vec<foxglove::FrameTransform>,
+    ) -> Result<(), ExportError> {
+        let message = foxglove::FrameTransforms { transforms };
+        self.proto("/tf", "foxglove.FrameTransforms", time_us, &message)
+    }
+
     /// The ego and its plan at a step.
     fn step(&mut self, episode: &EpisodeFile, frame: &Frame) -> Result<(), ExportError> {
         let time_us = frame.time_us;
         let Some(world_from_rig) = frame.poses.last() else { return Ok(()) };
-        let transforms = vec![transform("world", "rig", time_us, world_from_rig)];
-        self.proto(
-            "/tf",
-            "foxglove.FrameTransforms",
-            time_us,
-            &foxglove::FrameTransforms { transforms },
-        )?;
+        self.transforms(time_us, vec![transform("world", "rig", time_us, world_from_rig)])?;
         if let Some(poses) = plan_of(frame) {
             self.poses("/plan", "rig", time_us, poses)?;
         }

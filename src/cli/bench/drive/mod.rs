@@ -3,7 +3,6 @@
 mod report;
 mod step;
 
-use std::fs;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -18,6 +17,7 @@ use wildcity_session::{Encoding, Outputs, RigChoice, Session, SessionOptions, St
 use wildcity_twin::residency::Stats;
 
 use super::benched_twin::BenchedTwin;
+use super::memory::rss_bytes;
 use super::temporary_dir::TemporaryDir;
 use report::{Report, Row};
 use step::DriveStep;
@@ -206,23 +206,6 @@ fn cropped(mut rig: Rig, crop: u32) -> Rig {
 /// Numbers that fill [0, 1) evenly without being sorted: multiples of the golden ratio, modulo 1.
 fn scattered(number: u32) -> f64 {
     (0.5 + 0.618_033_988_749_895 * f64::from(number)).fract()
-}
-
-/// Memory of this process, in bytes.
-struct Rss {
-    now: u64,
-    peak: u64,
-}
-
-fn rss_bytes() -> anyhow::Result<Rss> {
-    let text = fs::read_to_string("/proc/self/status").context("/proc/self/status")?;
-    let field = |name: &str| {
-        let line = text.lines().find_map(|line| line.strip_prefix(name))?;
-        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
-    };
-    let both = field("VmRSS:").zip(field("VmHWM:"));
-    let memory = both.map(|(now, peak)| Rss { now, peak });
-    memory.context("/proc/self/status does not say how much memory is used")
 }
 
 fn speed(text: &str) -> Result<f64, String> {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
+use super::super::memory::mib;
 use super::step::DriveStep;
 use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Stats;
@@ -215,8 +216,4 @@ impl Report {
 
 fn ms(time: Duration) -> f64 {
     1e3 * time.as_secs_f64()
-}
-
-fn mib(bytes: u64) -> f64 {
-    bytes as f64 / f64::from(1 << 20)
 }

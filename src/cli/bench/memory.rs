@@ -1,0 +1,28 @@
+//! How much memory this process has.
+
+use std::fs;
+
+use anyhow::Context as _;
+
+/// Memory of this process that is in RAM, in bytes.
+pub(super) struct Rss {
+    pub(super) now: u64,
+    /// The most since the process began.
+    pub(super) peak: u64,
+}
+
+pub(super) fn rss_bytes() -> anyhow::Result<Rss> {
+    let text = fs::read_to_string("/proc/self/status")
+        .context("/proc/self/status; the memory of a process is known on Linux only")?;
+    let field = |name: &str| {
+        let line = text.lines().find_map(|line| line.strip_prefix(name))?;
+        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib << 10)
+    };
+    let both = field("VmRSS:").zip(field("VmHWM:"));
+    let memory = both.map(|(now, peak)| Rss { now, peak });
+    memory.context("/proc/self/status does not say how much memory is used")
+}
+
+pub(super) fn mib(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 20)
+}
