@@ -82,6 +82,8 @@ export const launch = () => chromium.launch({
 /** A page that fails the test if it says anything on its console, fails, or asks another server for anything. */
 export async function open(browser, server, address = "", options = {}) {
   const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, ...options });
+  // Six cameras take seconds on a machine of two cores that runs other tests too.
+  context.setDefaultTimeout(120_000);
   const page = await context.newPage();
   const complaints = [];
   page.on("console", (message) => complaints.push(message.text()));
