@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from functools import cache
 from typing import Any, get_args
 
 import jsonschema
@@ -388,23 +389,29 @@ def test_codes_are_those_of_the_schema() -> None:
     assert {variant["const"] for variant in schema["$defs"]["Code"]["oneOf"]} == set(get_args(Code))
 
 
+@cache
+def validator(name: str) -> jsonschema.Draft202012Validator:
+    """Of a schema, itself checked once."""
+    schema = json.loads((PROTOCOL / f"schema/{name}.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
 def test_vectors_obey_the_schemas() -> None:
     """The vectors are valid, and a message without a required field is not."""
     for schema_name, folder in (("request", "requests"), ("answer", "answers")):
-        schema = json.loads((PROTOCOL / f"schema/{schema_name}.json").read_text())
+        schema = validator(schema_name)
         for name in names(folder):
             message = vector(f"{folder}/{name}.json")
-            jsonschema.validate(message, schema)
+            schema.validate(message)
             del message["type"]
-            with pytest.raises(jsonschema.ValidationError):
-                jsonschema.validate(message, schema)
-    schema = json.loads((PROTOCOL / "schema/observation.json").read_text())
+            assert not schema.is_valid(message)
+    schema = validator("observation")
     for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "repair", "no_images"):
         metadata = vector(f"observations/{name}.expected.json")["observation"]
-        jsonschema.validate(metadata, schema)
+        schema.validate(metadata)
         del metadata["frame_hash"]
-        with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate(metadata, schema)
+        assert not schema.is_valid(metadata)
 
 
 MOVE = {"type": "step", "seq": 3}
@@ -434,9 +441,7 @@ ACTION = {"acceleration": 0.0, "curvature": 0.0}
     ids=str,
 )
 def test_the_schema_refuses_what_the_server_refuses(request_: dict[str, Any]) -> None:
-    schema = json.loads((PROTOCOL / "schema/request.json").read_text())
-    with pytest.raises(jsonschema.ValidationError):
-        jsonschema.validate(request_, schema)
+    assert not validator("request").is_valid(request_)
 
 
 def plain(value: Any) -> Any:

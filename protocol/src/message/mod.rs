@@ -26,7 +26,7 @@ pub use request::{Action, ClientInfo, Request, SessionStep, TimedPose};
 
 /// What names are, as a regular expression.
 #[cfg(feature = "schema")]
-pub(crate) const NAME_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
+pub const NAME_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
 
 /// Says in the schema of a step that it has exactly one movement.
 #[cfg(feature = "schema")]

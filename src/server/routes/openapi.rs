@@ -114,7 +114,7 @@ mod tests {
             // A trajectory may have any name.
             let mut schema = json!({ "type": "string" });
             if name != "name" {
-                schema["pattern"] = "^[a-z0-9_-][a-z0-9._-]{0,63}$".into();
+                schema["pattern"] = wildcity_protocol::message::NAME_PATTERN.into();
             }
             json!({ "name": name, "in": "path", "required": true, "schema": schema })
         });

@@ -52,8 +52,7 @@ impl SimdShutter {
         x_px: f32x16<S>,
         y_px: f32x16<S>,
     ) -> f32x16<S> {
-        let [a, b, c] = self.remaining.map(|value| f32x16::splat(simd, value));
-        let remaining = x_px.mul_add(a, y_px.mul_add(b, c));
+        let remaining = self.unclamped_remaining_at(simd, x_px, y_px);
         remaining.max(f32x16::splat(simd, 0.0)).min(f32x16::splat(simd, 1.0))
     }
 
