@@ -132,6 +132,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         StoreError::Clamped { .. }
         | StoreError::Profile(_)
         | StoreError::FieldMismatch { .. }
+        | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
         | StoreError::Overlap { .. } => true,
         StoreError::Io { .. }

@@ -53,12 +53,6 @@ pub const PREVIEW_SIDE_PX: u32 = 320;
 /// each at SH degree 1, 1.8 GB.
 pub const PREVIEW_GAUSSIANS: usize = 20_000_000;
 
-/// Cells beyond which a push must have [`GAUSSIANS_PER_CELL`] in each on average. They take 50 MB on disk at least.
-pub const SPARSE_CELLS: usize = 4096;
-
-/// Gaussians in each of many cells, on average. A cell of a street has tens of thousands.
-pub const GAUSSIANS_PER_CELL: usize = 16;
-
 /// Characters of a push's note.
 pub const NOTE_CHARS: usize = 1000;
 

@@ -20,7 +20,7 @@ use wildcity_scene::Gaussians;
 use wildcity_scene::chunk::cell_at;
 use wildcity_session::{Engine, LatestPin};
 use wildcity_twin::residency::Viewpoint;
-use wildcity_twin::store::{StoreError, Version};
+use wildcity_twin::store::{StoreError, Version, check_density};
 
 use crate::base::find_base;
 use crate::blocking::run_blocking;
@@ -168,7 +168,7 @@ fn compare_cells(
     for mean_m in &gaussians.means_m {
         *counts.entry(cell_at(mean_m)).or_insert(0) += 1;
     }
-    check_density(counts.len(), gaussians.len())
+    check_density(counts.len(), gaussians.len() as u64)
         .inspect_err(|_| push.set_report(report.clone()))?;
     let changes = CellChanges::new(&request.cells, base.map(|base| &base.manifest), &counts);
     let changes = changes.inspect_err(|_| push.set_report(report.clone()))?;
@@ -176,19 +176,6 @@ fn compare_cells(
     report.left_out = changes.left_out;
     push.set_report(report.clone());
     Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, report })
-}
-
-/// Refuses Gaussians that are scattered over many cells: each cell is an object of 12 kB at least, whatever it holds.
-fn check_density(cells: usize, gaussians: usize) -> Result<(), PushError> {
-    let is_sparse = gaussians < limits::GAUSSIANS_PER_CELL.saturating_mul(cells);
-    if cells <= limits::SPARSE_CELLS || !is_sparse {
-        return Ok(());
-    }
-    let reason = format!(
-        "{gaussians} Gaussians lie in {cells} cells of 64 m, fewer than {} in each: is the unit of the files metres?",
-        limits::GAUSSIANS_PER_CELL
-    );
-    Err(PushError::Content { reason, cells: Vec::new() })
 }
 
 /// A committed version that is not yet opened as the latest.
@@ -232,20 +219,5 @@ async fn preload(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec
         Ok(Ok(())) => {}
         Ok(Err(error)) => tracing::warn!(twin, "not loaded ahead: {error}"),
         Err(_) => tracing::warn!(twin, "not loaded ahead in time"),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn scattered_gaussians_are_refused_and_cities_are_not() {
-        let sparse = limits::SPARSE_CELLS + 1;
-        let error = check_density(100_000, 100_000).unwrap_err();
-        assert!(error.is_refusal() && error.to_string().contains("100000 cells"), "{error}");
-        assert!(check_density(sparse, limits::GAUSSIANS_PER_CELL * sparse - 1).is_err());
-        assert!(check_density(sparse, limits::GAUSSIANS_PER_CELL * sparse).is_ok());
-        assert!(check_density(limits::SPARSE_CELLS, limits::SPARSE_CELLS).is_ok());
     }
 }

@@ -181,11 +181,7 @@ impl Rig {
     /// # Errors
     /// Names the first camera that is invalid.
     pub fn check(&self) -> Result<(), RigError> {
-        let count = self.cameras.len();
-        if !(1..=Self::MAX_CAMERAS).contains(&count) {
-            let rig = self.name.clone();
-            return Err(RigError::Count { rig, count, limit: Self::MAX_CAMERAS });
-        }
+        check_count(&self.name, self.cameras.len())?;
         if !is_name(&self.name) {
             return Err(RigError::Name { name: self.name.clone() });
         }
@@ -204,6 +200,14 @@ impl Rig {
             looks.map_err(|cause| mounted.looks_wrong(cause))?;
         }
         check_overlays(&self.cameras)
+    }
+}
+
+fn check_count(rig: &str, count: usize) -> Result<(), RigError> {
+    let limit = Rig::MAX_CAMERAS;
+    match (1..=limit).contains(&count) {
+        true => Ok(()),
+        false => Err(RigError::Count { rig: rig.to_owned(), count, limit }),
     }
 }
 
@@ -280,13 +284,14 @@ struct RigFields {
     cameras: Vec<CameraFields>,
 }
 
-/// Stops at the first camera whose overlay exceeds the limit, so that no more overlays are decoded than a rig
-/// may have.
+/// Counts the cameras first, and stops at the first one whose overlay exceeds the limit, so that no more overlays are
+/// decoded than a rig may have.
 impl TryFrom<RigFields> for Rig {
     type Error = RigError;
 
     fn try_from(RigFields { name, cameras: fields }: RigFields) -> Result<Self, RigError> {
-        let mut cameras = Vec::with_capacity(fields.len().min(Self::MAX_CAMERAS));
+        check_count(&name, fields.len())?;
+        let mut cameras = Vec::with_capacity(fields.len());
         for camera in fields {
             cameras.push(camera.try_into()?);
             check_overlays(&cameras)?;
@@ -395,6 +400,17 @@ mod tests {
         assert_eq!(serde_json::from_str::<Rig>(&text).unwrap(), rig);
         let unknown = text.replace("\"fx\"", "\"k1\":0.1,\"fx\"");
         assert!(serde_json::from_str::<Rig>(&unknown).is_err(), "a lens that is not drawn");
+    }
+
+    /// Cameras are counted before any is looked at: a file of 100,000 must not cost more than reading it.
+    #[test]
+    fn too_many_cameras_are_refused_first() {
+        let camera = r#"{"name":"front","width":100,"height":80,"fx":100,"fy":100,"cx":50,"cy":40,
+            "overlay":"none","camera_to_rig":{"xyz":[0,0,0],"q":[1,0,0,0]}}"#;
+        let rig = |count| format!(r#"{{"name":"test","cameras":[{}]}}"#, [camera].repeat(count).join(","));
+        let refused = |count| serde_json::from_str::<Rig>(&rig(count)).unwrap_err().to_string();
+        assert!(refused(16).contains("overlay"), "{}", refused(16));
+        assert!(refused(100_000).contains("100000 cameras"), "{}", refused(100_000));
     }
 
     #[test]

@@ -55,6 +55,13 @@ pub const IMPORT_GAUSSIANS: u64 = u32::MAX as u64;
 /// Largest manifest, in bytes. The 20,000 chunks of a log are 7 MB, its 170,000 keyframes 30 MB.
 pub const MANIFEST_BYTES: u64 = 64 << 20;
 
+/// Cells beyond which one commit must have [`GAUSSIANS_PER_CELL`] in each on average. Each cell is an object of 12 kB
+/// at least, so they take 50 MB.
+pub const SPARSE_CELLS: usize = 4096;
+
+/// Gaussians in each of many cells, on average. A cell of a street has tens of thousands.
+pub const GAUSSIANS_PER_CELL: u64 = 16;
+
 /// Largest table of contents of one chunk, in bytes. 16 blocks of 29 levels are 464 rows of 78
 /// bytes, 36 kB.
 pub const CHUNK_TABLE_BYTES: usize = 64 << 10;

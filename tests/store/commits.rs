@@ -464,3 +464,22 @@ fn a_diff_names_cells_and_sizes() {
     assert_eq!(diff.settings, ["profile"]);
     assert_eq!(catalog.diff("street", 2, 2).unwrap().cells, []);
 }
+
+/// A small file must not become a gigabyte: a Gaussian in each of many cells is refused before anything is written.
+#[test]
+fn scattered_gaussians_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let mut scene = gaussians(5000, 0, 10.0, 1);
+    for (index, mean_m) in scene.means_m.iter_mut().enumerate() {
+        mean_m[0] = 64.0 * index as f64;
+    }
+    let mut commit = catalog.begin("street", CommitKind::Import, EXACT).unwrap();
+    let error = commit.put(&scene, None, &mut |_, _| {}).unwrap_err();
+    assert!(matches!(error, StoreError::Scattered { gaussians: 5000, cells: 5000 }), "{error}");
+    // 4096 such cells may be: a scene with many strays is still a scene.
+    let few = scene.select(0..4096);
+    commit.put(&few, None, &mut |_, _| {}).unwrap();
+    drop(commit);
+    assert!(catalog.list().unwrap().twins.is_empty());
+}

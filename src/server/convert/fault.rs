@@ -324,6 +324,7 @@ fn of_store(error: &StoreError) -> WireFault {
         | StoreError::Clamped { .. }
         | StoreError::Profile(_)
         | StoreError::FieldMismatch { .. }
+        | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
         | StoreError::NothingToCut { .. } => plain(Code::PushRefused),
         StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),

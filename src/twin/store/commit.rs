@@ -12,6 +12,7 @@ use wildcity_scene::{Gaussians, Manifest};
 
 use super::backend::Staging;
 use super::catalog::check_name;
+use super::density::check_density;
 use super::diff::Diff;
 use super::log::{CommitKind, LogRecord};
 use super::pack::{CellPacker, StorageOptions};
@@ -103,8 +104,8 @@ impl Commit {
     /// A twin of any size can be put part by part, as long as no cell is in two parts.
     ///
     /// # Errors
-    /// Before anything is written: a Gaussian that cannot be used, a cell that was put before, an
-    /// SH degree other than that of an earlier part. Otherwise what could not be written; nothing
+    /// Before anything is written: a Gaussian that cannot be used, [`StoreError::Scattered`], a cell that was put
+    /// before, an SH degree other than that of an earlier part. Otherwise what could not be written; nothing
     /// of this call is part of the version then.
     pub fn put(
         &mut self,
@@ -116,6 +117,7 @@ impl Commit {
         let sh_degree = gaussians.sh_degree;
         self.check_field("sh_degree", Some(sh_degree), self.sh_degree.unwrap_or(sh_degree))?;
         let packer = CellPacker::new(gaussians, self.storage, only);
+        check_density(packer.cells().count(), packer.gaussians())?;
         if let Some(cell) = packer.cells().find(|&[x, y]| self.chunks.contains_key(&[y, x])) {
             return Err(StoreError::DuplicateCell { name: self.name.clone(), cell });
         }

@@ -141,6 +141,18 @@ pub enum StoreError {
         /// Grid cell (x, y).
         cell: [i32; 2],
     },
+    /// Gaussians are scattered over many cells.
+    #[error(
+        "{gaussians} Gaussians lie in {cells} cells of 64 m, fewer than {} in each: is the unit of the file metres? \
+         Give its length with --scale, or remove Gaussians that are far from the scene",
+        limits::GAUSSIANS_PER_CELL
+    )]
+    Scattered {
+        /// Number of Gaussians.
+        gaussians: u64,
+        /// Number of cells that they lie in.
+        cells: usize,
+    },
     /// Gaussians were stored in another way than the rest of the twin.
     #[error(
         "{field} is {stored}, but twin {name:?} has {needed}: store the Gaussians with {needed}, or replace \
