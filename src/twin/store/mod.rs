@@ -55,6 +55,7 @@ mod commit;
 mod cut;
 mod diff;
 pub mod disk;
+mod edit;
 mod error;
 mod fsck;
 mod full_detail;
@@ -75,6 +76,7 @@ pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing
 pub use commit::{Commit, StoredCells};
 pub use cut::{CUT_ABOVE_M, Cut, CutPlace};
 pub use diff::{CellDiff, CellSize, Diff};
+pub use edit::Edit;
 pub use error::StoreError;
 pub use fsck::{DamagedObject, FsckReport, RecordSetAside, VerifyReport};
 pub use gc::{CollectionReport, ObjectTotals, Retention};
