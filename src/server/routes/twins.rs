@@ -7,6 +7,7 @@ use axum::extract::{Path, RawQuery, State};
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
+use wildcity_push::PushError;
 use wildcity_twin::store::StoreError;
 
 use crate::auth::{Grant, Role};
@@ -82,6 +83,25 @@ pub(super) async fn trajectory(
         convert::drive_body(&version, &section)
     });
     Ok(Json(body.await?).into_response())
+}
+
+/// `POST /v1/twins/{twin}/edits`: a version on level ground, with a drive and a rig.
+pub(super) async fn edit(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&name)?;
+    let request = convert::new_edit(name, &body)?;
+    // A client that goes away leaves a whole version, or none.
+    let edited = tokio::spawn(async move {
+        let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
+        wildcity_push::publish_edit(&state.engine, &state.pushes, request, &viewpoints).await
+    });
+    let edited = edited.await.map_err(|_| PushError::Crashed)?;
+    Ok(Json(convert::edited(&edited?)).into_response())
 }
 
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.
