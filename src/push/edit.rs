@@ -6,14 +6,16 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use wildcity_scene::align::{
-    Alignment, AlignmentError, PathError, drive_through, plane_through, scale_of,
+    Alignment, AlignmentError, GroundPlane, GroundSearch, PathError, SceneExtent, drive_through,
+    find_ground, plane_through, scale_of, scene_extent,
 };
-use wildcity_scene::Rig;
+use wildcity_scene::{Gaussians, Rig};
 use wildcity_session::Engine;
 use wildcity_twin::store::{CommitKind, Edit};
 
 use crate::blocking::run_blocking;
 use crate::error::PushError;
+use crate::limits;
 use crate::publish::{Viewpoints, pin_latest, preload};
 use crate::queue::PushQueue;
 use crate::status::PushedVersion;
@@ -128,6 +130,45 @@ pub async fn publish_edit(
     preload(engine, &twin, version.number, viewpoints(&twin)).await;
     drop(held);
     Ok(PushedVersion { number: version.number, hash: version.hash })
+}
+
+/// What is known of a version before it is edited.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Survey {
+    /// Number of the version.
+    pub version: u64,
+    /// Where most of the scene is.
+    pub extent: SceneExtent,
+    /// The ground that [`find_ground`] proposes, if it finds one.
+    pub ground: Option<GroundPlane>,
+}
+
+/// Looks for the ground of a version: of all its Gaussians, or of [`limits::SURVEYED_GAUSSIANS`] of them.
+///
+/// # Errors
+/// The version cannot be read.
+pub async fn survey(
+    engine: &Arc<Engine>,
+    queue: &PushQueue,
+    twin: String,
+    version: Option<u64>,
+) -> Result<Survey, PushError> {
+    // One at a time for each twin, as its pushes.
+    let turn = queue.turn(&twin, 0).await?;
+    let catalog = engine.catalog().clone();
+    run_blocking(move || {
+        let _turn = turn;
+        let version = catalog.version(&twin, version)?;
+        let stride = version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;
+        let sh_degree = version.manifest.sh_degree;
+        let mut some = Gaussians { sh_degree, ..Gaussians::default() };
+        catalog.visit_full_detail(&version, &|_| true, &mut |section| {
+            some.append(&section.select((0..section.len()).step_by(stride)));
+        })?;
+        let ground = find_ground(&some, &GroundSearch::default()).ok();
+        Ok(Survey { version: version.number, extent: scene_extent(&some), ground })
+    })
+    .await
 }
 
 #[cfg(test)]

@@ -33,7 +33,7 @@ mod source;
 mod status;
 
 pub use base::{check_base, default_id};
-pub use edit::{DriveRequest, EditRequest, publish_edit};
+pub use edit::{DriveRequest, EditRequest, Survey, publish_edit, survey};
 pub use error::PushError;
 pub use preview::PsnrPreview;
 pub use publish::{Viewpoints, publish};

@@ -84,14 +84,31 @@ struct Place {
     normal: Option<DVec3>,
 }
 
+/// Where most of a scene is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SceneExtent {
+    /// Median of the opaque Gaussians' means, by axis.
+    pub middle: DVec3,
+    /// Median distance of them from the middle: half of the scene is nearer.
+    pub radius: f64,
+}
+
+/// Where most of a scene is; at the origin, with a radius of 0, if nothing is opaque.
+pub fn scene_extent(gaussians: &Gaussians) -> SceneExtent {
+    extent(gaussians, &opaque(gaussians))
+}
+
+fn opaque(gaussians: &Gaussians) -> Vec<usize> {
+    (0..gaussians.len()).filter(|&i| gaussians.logit_opacities[i] >= LEAST_LOGIT).collect()
+}
+
 /// Finds the ground.
 ///
 /// # Errors
 /// There are too few opaque Gaussians, or no plane has enough of them on it.
 pub fn find_ground(gaussians: &Gaussians, search: &GroundSearch) -> Result<GroundPlane, GroundError> {
-    let opaque: Vec<usize> =
-        (0..gaussians.len()).filter(|&i| gaussians.logit_opacities[i] >= LEAST_LOGIT).collect();
-    let radius = radius(gaussians, &opaque);
+    let opaque = opaque(gaussians);
+    let radius = extent(gaussians, &opaque).radius;
     let places = places(gaussians, &opaque, radius / CUBES);
     if places.len() < LEAST_PLACES || radius <= 0.0 {
         return Err(GroundError::TooFew { count: places.len(), least: LEAST_PLACES });
@@ -116,15 +133,14 @@ pub fn find_ground(gaussians: &Gaussians, search: &GroundSearch) -> Result<Groun
     }
 }
 
-/// Median distance from the median point.
-fn radius(gaussians: &Gaussians, opaque: &[usize]) -> f64 {
+fn extent(gaussians: &Gaussians, opaque: &[usize]) -> SceneExtent {
     if opaque.is_empty() {
-        return 0.0;
+        return SceneExtent { middle: DVec3::ZERO, radius: 0.0 };
     }
     let axis = |axis: usize| median(opaque.iter().map(|&i| gaussians.means_m[i][axis]).collect());
     let middle = DVec3::new(axis(0), axis(1), axis(2));
     let distance = |&i: &usize| DVec3::from_array(gaussians.means_m[i]).distance(middle);
-    median(opaque.iter().map(distance).collect())
+    SceneExtent { middle, radius: median(opaque.iter().map(distance).collect()) }
 }
 
 fn median(mut values: Vec<f64>) -> f64 {

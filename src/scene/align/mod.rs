@@ -16,7 +16,9 @@ use crate::{Gaussians, Trajectory};
 pub use capture::{
     CaptureOptions, CapturedDrive, CapturedDriveError, PosedImage, captured_drive,
 };
-pub use ground::{GroundError, GroundPlane, GroundSearch, find_ground};
+pub use ground::{
+    GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, scene_extent,
+};
 pub use path::{DEFAULT_SPEED_M_S, PathError, drive_through};
 
 /// A change of a twin's axes and unit: `p_new = metres_per_unit * (new_from_old * p_old)`.

@@ -15,9 +15,10 @@ use wildcity_episode::{EpisodeFile, Listed};
 use wildcity_protocol::http;
 use wildcity_push::{
     CellChange, CellSelection, DriveRequest, EditRequest, FileReport, PushError, PushReport, PushRequest, PushedVersion,
-    RequestedFile, SourceAxes, State, Status,
+    RequestedFile, SourceAxes, State, Status, Survey,
 };
 use wildcity_scene::Rig;
+use wildcity_scene::align::GroundPlane;
 use wildcity_session::SessionError;
 use wildcity_twin::ingest::{BadGaussian, IngestError};
 use wildcity_twin::store::{LogEntry, Version};
@@ -209,6 +210,25 @@ pub(crate) fn new_edit(twin: String, body: &[u8]) -> Result<EditRequest, Fault> 
         }),
         drive,
         rig: rig.transpose()?,
+    })
+}
+
+/// Where a twin is, and its ground as the field `ground` of an edit.
+pub(crate) fn survey(survey: &Survey) -> Value {
+    let ground = survey.ground.map(|GroundPlane { point, up }| {
+        let (across, along) = up.any_orthonormal_pair();
+        let radius = survey.extent.radius;
+        let points = [point, point + radius * across, point + radius * along];
+        http::EditGround {
+            points: points.map(|point| point.to_array()),
+            above: (point + radius * up).to_array(),
+        }
+    });
+    json!({
+        "version": survey.version,
+        "middle": survey.extent.middle.to_array(),
+        "radius": survey.extent.radius,
+        "ground": ground,
     })
 }
 

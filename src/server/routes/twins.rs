@@ -85,6 +85,19 @@ pub(super) async fn trajectory(
     Ok(Json(body.await?).into_response())
 }
 
+/// `GET /v1/twins/{twin}/ground`: where the latest version is, and the ground that it seems to stand on.
+pub(super) async fn ground(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&name)?;
+    let version = state.engine.pinned_latest(&name);
+    let survey = wildcity_push::survey(&state.engine, &state.pushes, name, version).await?;
+    Ok(Json(convert::survey(&survey)).into_response())
+}
+
 /// `POST /v1/twins/{twin}/edits`: a version on level ground, with a drive and a rig.
 pub(super) async fn edit(
     State(state): State<Arc<ServerState>>,
