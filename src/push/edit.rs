@@ -113,7 +113,8 @@ pub async fn publish_edit(
         let twin = twin.clone();
         run_blocking(move || Ok(catalog.version(&twin, request.base)?)).await?
     };
-    let needed = if edit.alignment == Alignment::IDENTITY { 0 } else { base.manifest.stored_bytes() };
+    let needed =
+        if edit.alignment == Alignment::IDENTITY { 0 } else { base.manifest.stored_bytes() };
     let turn = queue.turn(&twin, needed).await?;
     let (version, held) = {
         let engine = engine.clone();
@@ -159,7 +160,8 @@ pub async fn survey(
     run_blocking(move || {
         let _turn = turn;
         let version = catalog.version(&twin, version)?;
-        let stride = version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;
+        let stride =
+            version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;
         let sh_degree = version.manifest.sh_degree;
         let mut some = Gaussians { sh_degree, ..Gaussians::default() };
         catalog.visit_full_detail(&version, &|_| true, &mut |section| {
@@ -217,7 +219,13 @@ mod tests {
         let name = refused(&|request| request.drive.as_mut().unwrap().name = "../x".to_owned());
         assert!(name.contains("\"../x\""), "{name}");
         let nothing = refused(&|request| {
-            *request = EditRequest { ground: None, scale: None, drive: None, rig: None, ..request.clone() };
+            *request = EditRequest {
+                ground: None,
+                scale: None,
+                drive: None,
+                rig: None,
+                ..request.clone()
+            };
         });
         assert!(nothing.contains("nothing is edited"), "{nothing}");
     }

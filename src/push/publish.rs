@@ -226,7 +226,12 @@ pub(crate) fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<Late
 
 /// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they
 /// switch. The version is already committed: what cannot be loaded now is loaded when it is opened.
-pub(crate) async fn preload(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
+pub(crate) async fn preload(
+    engine: &Arc<Engine>,
+    twin: &str,
+    version: u64,
+    frames: Vec<Vec<Viewpoint>>,
+) {
     let prepared = engine.preload(twin, version, frames);
     match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}

@@ -63,13 +63,25 @@ fn camera_poses(drive: &Trajectory) -> Vec<Pose> {
 
 fn write_colmap_text(dir: &Path, poses: &[Pose]) {
     fs::create_dir_all(dir).unwrap();
-    fs::write(dir.join("cameras.txt"), "# cameras\n1 OPENCV 1440 928 1800 1801 720 464 0.01 -0.02 0.001 0\n").unwrap();
+    fs::write(
+        dir.join("cameras.txt"),
+        "# cameras\n1 OPENCV 1440 928 1800 1801 720 464 0.01 -0.02 0.001 0\n",
+    )
+    .unwrap();
     let mut text = "# images\n".to_owned();
     for (index, pose) in poses.iter().enumerate() {
         let inverse = pose.inverse();
         let [w, x, y, z] = inverse.q_wxyz();
         let t = inverse.position_m;
-        writeln!(text, "{} {w} {x} {y} {z} {} {} {} 1 front view/{index}.png", index + 1, t.x, t.y, t.z).unwrap();
+        writeln!(
+            text,
+            "{} {w} {x} {y} {z} {} {} {} 1 front view/{index}.png",
+            index + 1,
+            t.x,
+            t.y,
+            t.z
+        )
+        .unwrap();
         // The points of an image: some, or an empty line.
         text.push_str(if index % 2 == 0 { "10.5 20.5 -1 3 4 7\n" } else { "\n" });
     }
@@ -159,7 +171,10 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     assert!(said.contains("40 keyframes, 19.5 m") && said.contains("cameras front-view"), "{said}");
     let drive: Trajectory = read(&at.join("drive/capture.json"));
     drive.check().unwrap();
-    assert!(drive.keyframes.iter().all(|k| k.world_from_rig.position_m.z.abs() < 0.05), "{drive:?}");
+    assert!(
+        drive.keyframes.iter().all(|k| k.world_from_rig.position_m.z.abs() < 0.05),
+        "{drive:?}"
+    );
     let rig: Rig = read(&at.join("drive/rig.json"));
     rig.check().unwrap();
     let height_m = rig.cameras[0].rig_from_camera.position_m.z;
@@ -171,7 +186,10 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     write_colmap_binary(&at.join("binary"), &poses);
     fs::write(at.join("transforms.json"), transforms(&poses).to_string()).unwrap();
     done(at, &["route", "from-colmap", "binary", "--twin", "street", "--out", "two"]);
-    done(at, &["route", "from-nerfstudio", "transforms.json", "--twin", "street", "--out", "three"]);
+    done(
+        at,
+        &["route", "from-nerfstudio", "transforms.json", "--twin", "street", "--out", "three"],
+    );
     for other in ["two", "three"] {
         let same: Trajectory = read(&at.join(other).join("capture.json"));
         for (a, b) in same.keyframes.iter().zip(&drive.keyframes) {
@@ -183,7 +201,15 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     }
 
     // 4. The twin gets them, and the Gaussians are where they were.
-    let give = ["twin", "drive", "street", "--trajectory", "drive/capture.json", "--rig", "drive/rig.json"];
+    let give = [
+        "twin",
+        "drive",
+        "street",
+        "--trajectory",
+        "drive/capture.json",
+        "--rig",
+        "drive/rig.json",
+    ];
     assert!(done(at, &give).contains("version 3: drives capture"));
     let catalog = Catalog::open(&at.join("wildcity/twins")).unwrap();
     let [second, third] = [2, 3].map(|number| catalog.version("street", Some(number)).unwrap());
@@ -208,9 +234,19 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
         ("cameras.txt", "OPENCV", "OPENKV", "cameras.txt:2: \"OPENKV\" is not a camera model"),
         ("cameras.txt", "OPENCV", "FOV", "cameras.txt:2: 8 parameters; FOV has 5"),
         ("cameras.txt", "1440", "wide", "cameras.txt:2: WIDTH is \"wide\", not a number"),
-        ("images.txt", " 1 front view/0", " 3 front view/0", "images.txt:2: camera 3 is not in m/cameras.txt"),
+        (
+            "images.txt",
+            " 1 front view/0",
+            " 3 front view/0",
+            "images.txt:2: camera 3 is not in m/cameras.txt",
+        ),
         ("images.txt", " front view/1.png", "", "images.txt:4: expected IMAGE_ID QW"),
-        ("images.txt", "# images\n1 ", "# images\n1 9", "images.txt:2: the quaternion (w, x, y, z) has length"),
+        (
+            "images.txt",
+            "# images\n1 ",
+            "# images\n1 9",
+            "images.txt:2: the quaternion (w, x, y, z) has length",
+        ),
     ];
     for (file, from, to, wanted) in cases {
         write_colmap_text(&text, &poses);
@@ -230,7 +266,8 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
     fs::write(text.join("images.bin"), [&whole[..], b"more"].concat()).unwrap();
     assert!(refused(at, &colmap).contains("4 bytes after the last entry"));
 
-    let nerfstudio = ["route", "from-nerfstudio", "t.json", "--camera-height-m", "1.6", "--out", "out"];
+    let nerfstudio =
+        ["route", "from-nerfstudio", "t.json", "--camera-height-m", "1.6", "--out", "out"];
     let whole = transforms(&poses);
     let told = |change: &dyn Fn(&mut Value)| {
         let mut changed = whole.clone();

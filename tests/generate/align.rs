@@ -12,10 +12,16 @@ fn poses() -> impl Iterator<Item = Pose> {
     let mut random = Random::new(10, "rotations", 0);
     (0..10).map(move |_| {
         let share = random.unit();
-        let [a, b] = [random.range(0.0, std::f64::consts::TAU), random.range(0.0, std::f64::consts::TAU)];
+        let [a, b] =
+            [random.range(0.0, std::f64::consts::TAU), random.range(0.0, std::f64::consts::TAU)];
         let (near, far) = ((1.0 - share).sqrt(), share.sqrt());
-        let rotation = DQuat::from_xyzw(near * a.sin(), near * a.cos(), far * b.sin(), far * b.cos());
-        let position_m = DVec3::new(random.range(-50.0, 50.0), random.range(-50.0, 50.0), random.range(-50.0, 50.0));
+        let rotation =
+            DQuat::from_xyzw(near * a.sin(), near * a.cos(), far * b.sin(), far * b.cos());
+        let position_m = DVec3::new(
+            random.range(-50.0, 50.0),
+            random.range(-50.0, 50.0),
+            random.range(-50.0, 50.0),
+        );
         Pose { position_m, rotation }
     })
 }

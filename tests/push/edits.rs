@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use crate::http::{get, post};
-use crate::support::{TEST_TIMEOUT, TestServer, refused};
+use crate::support::TestServer;
 
 async fn edit(server: &TestServer, body: Value) -> Value {
     let reply = post(server, "/v1/twins/test/edits", &body).await;
@@ -21,7 +21,8 @@ async fn an_edit_is_one_version_with_a_drive_on_its_ground() {
     let before = get(&server, "/v1/twins/test").await.body;
     let ground = json!({"points": [[0, 0, 2], [1, 0, 2], [0, 1, 2]], "above": [0, 0, 9]});
     let scale = json!({"points": [[0, 0, 0], [0, 1, 0]], "distance_m": 2});
-    let whole = json!({"base": 1, "ground": ground, "scale": scale, "drive": drive(), "rig": "surround6"});
+    let whole =
+        json!({"base": 1, "ground": ground, "scale": scale, "drive": drive(), "rig": "surround6"});
     let made = edit(&server, whole.clone()).await;
     assert_eq!(made["version"], 2);
     let after = get(&server, "/v1/twins/test").await.body;
@@ -36,7 +37,9 @@ async fn an_edit_is_one_version_with_a_drive_on_its_ground() {
 
     // A session drives it with the new rig.
     let mut agent = server.agent().await;
-    let opened = agent.open(json!({"twin": "test", "start": {"trajectory": "path", "station_m": 3.0}})).await;
+    let opened = agent
+        .open(json!({"twin": "test", "start": {"trajectory": "path", "station_m": 3.0}}))
+        .await;
     assert_eq!(opened["cameras"].as_array().unwrap().len(), 6);
     assert_eq!(opened["version"], 2);
 
@@ -44,7 +47,6 @@ async fn an_edit_is_one_version_with_a_drive_on_its_ground() {
     let again = post(&server, "/v1/twins/test/edits", &whole).await;
     again.refused(409, "conflict");
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 2);
-    tokio::time::timeout(TEST_TIMEOUT, server.stop()).await.unwrap();
 }
 
 #[tokio::test]
@@ -58,7 +60,12 @@ async fn what_cannot_be_edited_is_named_and_changes_nothing() {
         (json!({"drive": one}), 400, "invalid_request", "drive.points"),
         (json!({"rig": "nothing"}), 404, "unknown_rig", "rig"),
         (json!({"base": 9, "rig": "vehicle6"}), 404, "unknown_version", "version"),
-        (json!({"scale": {"points": [[0, 0, 0], [0, 0, 0]], "distance_m": 1}}), 400, "invalid_request", "scale"),
+        (
+            json!({"scale": {"points": [[0, 0, 0], [0, 0, 0]], "distance_m": 1}}),
+            400,
+            "invalid_request",
+            "scale",
+        ),
     ] {
         let reply = post(&server, "/v1/twins/test/edits", &body).await;
         reply.refused(status, code);

@@ -258,7 +258,8 @@ fn heading(world_from_camera: &Pose) -> f64 {
 /// The mean of rotations that are close to each other: of their quaternions, with the sign of the first.
 fn mean_rotation(rotations: &[DQuat]) -> DQuat {
     let first = rotations[0];
-    let sum = rotations.iter().fold(first * 0.0, |sum, &q| sum + if q.dot(first) < 0.0 { -q } else { q });
+    let sum =
+        rotations.iter().fold(first * 0.0, |sum, &q| sum + if q.dot(first) < 0.0 { -q } else { q });
     if sum.length() > 1e-9 { sum.normalize() } else { first }
 }
 
@@ -320,7 +321,10 @@ mod tests {
         let eye = DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5);
         let down = DQuat::from_rotation_y(0.1);
         let front = Pose { position_m: DVec3::new(0.0, 0.0, 1.5), rotation: down * eye };
-        let left = Pose { position_m: DVec3::new(-0.4, 0.3, 1.4), rotation: DQuat::from_rotation_z(1.2) * eye };
+        let left = Pose {
+            position_m: DVec3::new(-0.4, 0.3, 1.4),
+            rotation: DQuat::from_rotation_z(1.2) * eye,
+        };
         let camera = |focal: f64| {
             Camera::from_pinhole(640, 480, Pinhole { fx: focal, fy: focal, cx: 320.0, cy: 240.0 })
         };
@@ -330,7 +334,8 @@ mod tests {
             let at_m = 20.0 * DVec3::new(angle.sin(), 1.0 - angle.cos(), 0.01 * f64::from(i));
             let nod = DQuat::from_rotation_y(0.004 * (f64::from(i) - 5.5));
             let world_from_rig = Pose { position_m: at_m, rotation: DQuat::from_rotation_z(angle) };
-            let world_from_front = world_from_rig * Pose { rotation: nod * front.rotation, ..front };
+            let world_from_front =
+                world_from_rig * Pose { rotation: nod * front.rotation, ..front };
             images.push(PosedImage {
                 name: format!("front/{i}.png"),
                 camera: camera(500.0),
@@ -368,14 +373,25 @@ mod tests {
             let at_m = 20.0 * DVec3::new(angle.sin(), 1.0 - angle.cos(), 0.01 * i as f64);
             let pose = keyframe.world_from_rig;
             assert!((pose.position_m - at_m).length() < 1e-9, "{i}: {pose:?}");
-            assert!(pose.rotation.angle_between(DQuat::from_rotation_z(angle)) < 1e-6, "{i}: {pose:?}");
+            assert!(
+                pose.rotation.angle_between(DQuat::from_rotation_z(angle)) < 1e-6,
+                "{i}: {pose:?}"
+            );
         }
         let names: Vec<&str> = made.rig.cameras.iter().map(|camera| camera.name.as_str()).collect();
         assert_eq!(names, ["left-side", "front"]);
         for (camera, wanted) in made.rig.cameras.iter().zip([left, front]) {
             let pose = camera.rig_from_camera;
-            assert!((pose.position_m - wanted.position_m).length() < 1e-3, "{}: {pose:?}", camera.name);
-            assert!(pose.rotation.angle_between(wanted.rotation) < 1e-3, "{}: {pose:?}", camera.name);
+            assert!(
+                (pose.position_m - wanted.position_m).length() < 1e-3,
+                "{}: {pose:?}",
+                camera.name
+            );
+            assert!(
+                pose.rotation.angle_between(wanted.rotation) < 1e-3,
+                "{}: {pose:?}",
+                camera.name
+            );
         }
         assert!((0.02..0.023).contains(&made.most_tilt_rad), "{}", made.most_tilt_rad);
         assert_eq!(made.rig.cameras[1].camera.pinhole.fx, 500.0);
@@ -415,7 +431,10 @@ mod tests {
         let no_pair = captured_drive(&other, &Alignment::IDENTITY, &options()).unwrap_err();
         assert!(matches!(no_pair, CapturedDriveError::NoPair { .. }), "{no_pair}");
         let one = CaptureOptions { cameras: vec!["front".into()], ..options() };
-        assert_eq!(captured_drive(&other, &Alignment::IDENTITY, &one).unwrap().rig.cameras.len(), 1);
+        assert_eq!(
+            captured_drive(&other, &Alignment::IDENTITY, &one).unwrap().rig.cameras.len(),
+            1
+        );
     }
 
     #[test]

@@ -106,7 +106,10 @@ fn opaque(gaussians: &Gaussians) -> Vec<usize> {
 ///
 /// # Errors
 /// There are too few opaque Gaussians, or no plane has enough of them on it.
-pub fn find_ground(gaussians: &Gaussians, search: &GroundSearch) -> Result<GroundPlane, GroundError> {
+pub fn find_ground(
+    gaussians: &Gaussians,
+    search: &GroundSearch,
+) -> Result<GroundPlane, GroundError> {
     let opaque = opaque(gaussians);
     let radius = extent(gaussians, &opaque).radius;
     let places = places(gaussians, &opaque, radius / CUBES);
@@ -220,8 +223,10 @@ fn refine(places: &[Place], mut plane: GroundPlane, tolerance: f64) -> GroundPla
             };
             places.iter().filter(is_near).map(|place| place.at).collect()
         };
-        let heights: Vec<f64> =
-            near(&plane, 2.0 * tolerance).iter().map(|at| plane.up.dot(*at - plane.point)).collect();
+        let heights: Vec<f64> = near(&plane, 2.0 * tolerance)
+            .iter()
+            .map(|at| plane.up.dot(*at - plane.point))
+            .collect();
         if let Some(height) = densest(heights, 0.5 * tolerance) {
             plane.point += height * plane.up;
         }
@@ -319,7 +324,8 @@ mod tests {
     fn a_known_up_keeps_the_wall_from_being_the_ground() {
         let (gaussians, floor) = room(20_000);
         let across = floor.up.any_orthonormal_vector();
-        let found = find_ground(&gaussians, &GroundSearch { up: Some(across), ..GroundSearch::default() });
+        let found =
+            find_ground(&gaussians, &GroundSearch { up: Some(across), ..GroundSearch::default() });
         assert!(found.is_err() || found.unwrap().up.dot(across) > 0.7);
     }
 

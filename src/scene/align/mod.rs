@@ -13,12 +13,8 @@ use crate::geometry::Pose;
 use crate::trajectory::Keyframe;
 use crate::{Gaussians, Trajectory};
 
-pub use capture::{
-    CaptureOptions, CapturedDrive, CapturedDriveError, PosedImage, captured_drive,
-};
-pub use ground::{
-    GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, scene_extent,
-};
+pub use capture::{CaptureOptions, CapturedDrive, CapturedDriveError, PosedImage, captured_drive};
+pub use ground::{GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, scene_extent};
 pub use path::{DEFAULT_SPEED_M_S, PathError, drive_through};
 
 /// A change of a twin's axes and unit: `p_new = metres_per_unit * (new_from_old * p_old)`.
@@ -204,7 +200,10 @@ mod tests {
     use super::*;
 
     fn tilted() -> GroundPlane {
-        GroundPlane { point: DVec3::new(3.0, -1.0, 7.0), up: DVec3::new(0.3, -0.5, -0.8).normalize() }
+        GroundPlane {
+            point: DVec3::new(3.0, -1.0, 7.0),
+            up: DVec3::new(0.3, -0.5, -0.8).normalize(),
+        }
     }
 
     #[test]
@@ -227,7 +226,10 @@ mod tests {
     #[test]
     fn two_alignments_are_one_and_its_text_is_read_again() {
         let first = Alignment::onto(&tilted()).scaled(0.5).unwrap();
-        let plane = GroundPlane { point: DVec3::new(0.0, 1.0, -2.0), up: DVec3::new(0.1, 0.2, 0.9).normalize() };
+        let plane = GroundPlane {
+            point: DVec3::new(0.0, 1.0, -2.0),
+            up: DVec3::new(0.1, 0.2, 0.9).normalize(),
+        };
         let second = Alignment::onto(&plane).scaled(3.0).unwrap();
         let p = DVec3::new(1.0, -2.0, 0.5);
         let both = second.after(&first);

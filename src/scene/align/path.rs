@@ -43,7 +43,9 @@ pub enum PathError {
     )]
     Name(String),
     /// Longer than a drive may be.
-    #[error("the drive is {length_m:?} m long; at most {most_m:?} m are accepted: is the unit metres?")]
+    #[error(
+        "the drive is {length_m:?} m long; at most {most_m:?} m are accepted: is the unit metres?"
+    )]
     Length {
         /// Its length, in metres.
         length_m: f64,
@@ -57,14 +59,19 @@ pub enum PathError {
 ///
 /// # Errors
 /// Names what cannot be used.
-pub fn drive_through(name: &str, points_m: &[DVec3], speed_m_s: f64) -> Result<Trajectory, PathError> {
+pub fn drive_through(
+    name: &str,
+    points_m: &[DVec3],
+    speed_m_s: f64,
+) -> Result<Trajectory, PathError> {
     if !is_name(name) {
         return Err(PathError::Name(name.to_owned()));
     }
     if !(0.1..=100.0).contains(&speed_m_s) {
         return Err(PathError::Speed(speed_m_s));
     }
-    let is_place = |point: &DVec3| point.is_finite() && point.abs().max_element() < Pose::MAX_COORDINATE_M;
+    let is_place =
+        |point: &DVec3| point.is_finite() && point.abs().max_element() < Pose::MAX_COORDINATE_M;
     if let Some(index) = points_m.iter().position(|point| !is_place(point)) {
         return Err(PathError::Place { index });
     }
@@ -153,7 +160,8 @@ mod tests {
         drive.check().unwrap();
         assert!((40.0..44.0).contains(&drive.length_m()), "{}", drive.length_m());
         for point in corner {
-            let nearest = drive.keyframes.iter().map(|k| k.world_from_rig.position_m.distance(point));
+            let nearest =
+                drive.keyframes.iter().map(|k| k.world_from_rig.position_m.distance(point));
             assert!(nearest.fold(f64::MAX, f64::min) < 0.3, "{point}");
         }
         let ahead = |at: usize| drive.keyframes[at].world_from_rig.rotation * DVec3::X;
@@ -162,7 +170,8 @@ mod tests {
         let last = drive.keyframes[drive.keyframes.len() - 1];
         assert!((last.time_us as f64 * 1e-6 - drive.length_m() / 5.0).abs() < 0.02);
         for pair in drive.keyframes.windows(2) {
-            let step_m = pair[0].world_from_rig.position_m.distance(pair[1].world_from_rig.position_m);
+            let step_m =
+                pair[0].world_from_rig.position_m.distance(pair[1].world_from_rig.position_m);
             assert!((0.3..0.51).contains(&step_m), "{step_m}");
         }
     }
@@ -173,7 +182,8 @@ mod tests {
         tiny.check().unwrap();
         assert_eq!(tiny.keyframes.len(), 9);
         let two = [DVec3::ZERO, DVec3::X];
-        let refused = |name, points: &[DVec3], speed| drive_through(name, points, speed).unwrap_err();
+        let refused =
+            |name, points: &[DVec3], speed| drive_through(name, points, speed).unwrap_err();
         assert_eq!(refused("path", &[DVec3::X; 3], 5.0), PathError::Points { count: 1 });
         assert_eq!(refused("path", &two, 0.0), PathError::Speed(0.0));
         assert!(matches!(refused("../p", &two, 5.0), PathError::Name(_)));

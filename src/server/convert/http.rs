@@ -14,8 +14,8 @@ use crate::spool::{Announced, Upload};
 use wildcity_episode::{EpisodeFile, Listed};
 use wildcity_protocol::http;
 use wildcity_push::{
-    CellChange, CellSelection, DriveRequest, EditRequest, FileReport, PushError, PushReport, PushRequest, PushedVersion,
-    RequestedFile, SourceAxes, State, Status, Survey,
+    CellChange, CellSelection, DriveRequest, EditRequest, FileReport, PushError, PushReport,
+    PushRequest, PushedVersion, RequestedFile, SourceAxes, State, Status, Survey,
 };
 use wildcity_scene::Rig;
 use wildcity_scene::align::GroundPlane;

@@ -245,9 +245,14 @@ pub(super) fn guarded() -> Vec<Row> {
         .takes(Json("rollback"))
         .answers(200, Object)
         .does(twins::rollback),
-        op(Get, "/v1/twins/{twin}/ground", PUSH, "Where a twin is, and the ground it seems to stand on.")
-            .answers(200, Object)
-            .does(twins::ground),
+        op(
+            Get,
+            "/v1/twins/{twin}/ground",
+            PUSH,
+            "Where a twin is, and the ground it seems to stand on.",
+        )
+        .answers(200, Object)
+        .does(twins::ground),
         op(
             Post,
             "/v1/twins/{twin}/edits",

@@ -62,8 +62,7 @@ impl Catalog {
             return commit.change(base.number, change);
         }
 
-        let mut gaussians =
-            Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
+        let mut gaussians = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
         self.visit_full_detail(base, &|_| true, &mut |section| gaussians.append(&section))?;
         alignment.apply(&mut gaussians);
         commit.put(&gaussians, None, progress)?;

@@ -125,14 +125,13 @@ impl Align {
         catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
 
         let search = GroundSearch { up: self.up.0, seed: self.seed, ..GroundSearch::default() };
-        let ground = find_ground(&gaussians, &search)
-            .with_context(|| format!("twin {}", self.twin.name))?;
+        let ground =
+            find_ground(&gaussians, &search).with_context(|| format!("twin {}", self.twin.name))?;
         let alignment = Alignment::onto(&ground).scaled(metres_per_unit)?;
         print_proposal(&ground, &alignment)?;
 
         let picture = self.picture.clone();
-        let picture =
-            picture.unwrap_or_else(|| format!("{}-align.png", self.twin.name).into());
+        let picture = picture.unwrap_or_else(|| format!("{}-align.png", self.twin.name).into());
         let png = picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
         output::write(&picture, &png)?;
         writeln!(io::stdout().lock(), "picture {}", picture.display())?;
@@ -142,7 +141,8 @@ impl Align {
         }
 
         let bar = progress::count("writing");
-        let edit = Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
+        let edit =
+            Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
         let version = catalog.edit(&base, edit, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         if base.manifest.geo.is_some() {

@@ -107,8 +107,10 @@ fn grid(extent: &Extent) -> Vec<[DVec3; 2]> {
         let last = (to / step).floor() as i64;
         (first..=last).map(move |n| n as f64 * step)
     };
-    let along_y = whole(low.x, high.x).map(|x| [DVec3::new(x, low.y, 0.0), DVec3::new(x, high.y, 0.0)]);
-    let along_x = whole(low.y, high.y).map(|y| [DVec3::new(low.x, y, 0.0), DVec3::new(high.x, y, 0.0)]);
+    let along_y =
+        whole(low.x, high.x).map(|x| [DVec3::new(x, low.y, 0.0), DVec3::new(x, high.y, 0.0)]);
+    let along_x =
+        whole(low.y, high.y).map(|y| [DVec3::new(low.x, y, 0.0), DVec3::new(high.x, y, 0.0)]);
     along_y.chain(along_x).collect()
 }
 

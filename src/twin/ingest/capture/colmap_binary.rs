@@ -138,7 +138,11 @@ fn read_images(
     }
     bytes.check_end()?;
     if images.is_empty() {
-        return Err(CaptureError::at(path, Place::File, "there is no image in it: give a model with images"));
+        return Err(CaptureError::at(
+            path,
+            Place::File,
+            "there is no image in it: give a model with images",
+        ));
     }
     Ok(images)
 }

@@ -77,7 +77,8 @@ fn posed(
     }
     let row = |at: usize| DVec3::new(rows[at][0], rows[at][1], rows[at][2]);
     let world_from_opengl = DMat3::from_cols(row(0), row(1), row(2)).transpose();
-    let rotation = rotation_of(world_from_opengl * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
+    let rotation =
+        rotation_of(world_from_opengl * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
     let Some(rotation) = rotation else {
         return Err(matrix(
             "the left 3 x 3 numbers are not a rotation: rows must have length 1, at right angles, without a \
@@ -128,8 +129,9 @@ impl Intrinsics {
                 Lens::opencv(OpenCv::new([k1, k2, k3, k4, 0.0, 0.0], p, [0.0; 4]))
             }
             Some(other) => {
-                let reason =
-                    format!("is {other:?}; OPENCV, PINHOLE and OPENCV_FISHEYE can be read: undistort the images");
+                let reason = format!(
+                    "is {other:?}; OPENCV, PINHOLE and OPENCV_FISHEYE can be read: undistort the images"
+                );
                 return Err(Wrong { field: "camera_model", reason });
             }
         };
@@ -161,7 +163,9 @@ impl Intrinsics {
         let usable = side.filter(|side| side.fract() == 0.0 && (1.0..=1e6).contains(side));
         usable.map(|side| side as u32).ok_or_else(|| {
             let given = side.map_or("is missing".to_owned(), |side| format!("is {side:?}"));
-            let reason = format!("{given}: add the size of the images to the frame or to the file, in pixels");
+            let reason = format!(
+                "{given}: add the size of the images to the frame or to the file, in pixels"
+            );
             Wrong { field, reason }
         })
     }
