@@ -28,9 +28,9 @@ type Step = "ground" | "scale" | "path";
 const FIELD_OF_VIEW = (60 * Math.PI) / 180;
 const NEEDED: Record<Step, number> = { ground: 3, scale: 2, path: 1000 };
 const HELP: Record<Step, string> = {
-  ground: "Click three places on the ground, far apart. The grid shows the ground that was found; keep it if it lies well.",
+  ground: "Keep the grid if it lies on the ground. Otherwise click three places on the ground, far apart; or say which axis is up, and click one place.",
   scale: "Click the two ends of something whose size you know, and give the size. Skip it if the twin is in metres.",
-  path: "Click places along the way that the vehicle shall drive, at least two.",
+  path: "Click places of the ground along the way that the vehicle shall drive, at least two.",
 };
 /** Pixels that the pointer may move within a click. */
 const CLICK_PX = 5;
@@ -54,6 +54,9 @@ export class PlacePage implements Page {
   private step: Step = "ground";
   private orbit: Orbit | undefined;
   private proposal: Ground | undefined;
+  /** The axis that is up, if it was said. */
+  private axis: Vector | undefined;
+  private readonly up: HTMLElement;
   private client: Client | undefined;
   private shown: Observation | undefined;
   private shownPose: Pose | undefined;
@@ -84,19 +87,18 @@ export class PlacePage implements Page {
     this.scaleRow = el("div.buttons.distance", {}, button("−1", more(-1)), button("−0.1", more(-0.1)), this.distance, "m",
       button("+0.1", more(0.1)), button("+1", more(1)));
     for (const name of ["vehicle6", "surround6", "alpamayo1", "alpamayo2"]) this.rig.append(el("option", { value: name }, name));
-    const up = el("div.buttons.up", {}, "Up in the picture", ...(["z", "-z", "y", "-y", "x", "-x"] as const).map((axis) =>
-      button(axis.replace("-", "−"), () => this.setUp(axisOf(axis)), "Turn the picture; the ground itself is step 1")));
+    this.up = el("div.buttons.up", {}, "Up is", ...(["z", "-z", "y", "-y", "x", "-x"] as const).map((axis) =>
+      button(axis.replace("-", "−"), () => this.setAxis(axisOf(axis)))));
     this.save.addEventListener("click", () => void this.publish());
     this.picture = el("div.picture", {}, this.canvas, this.overlay);
     const left = el("div.left.place", {}, this.picture);
     this.element = el("div.view.placing", {}, left, el("aside.right", {},
       el("div.buttons.tabs", {}, ...Object.values(this.tabs)),
-      this.help, this.found, this.scaleRow,
+      this.help, this.up, this.found, this.scaleRow,
       el("div.buttons", {}, button("Undo", () => this.undo()), button("Clear", () => this.clear()),
         button("Next", () => this.turnTo(this.step === "ground" ? "scale" : "path"))),
       el("div.buttons.rig", {}, "Rig ", this.rig),
       el("div.buttons", {}, this.save),
-      up,
       el("p.keys", {}, "Drag: turn · right button or two fingers: move · wheel or pinch: nearer · double click: turn about that place")));
     place(el("b", {}, twin), " · place a drive");
     this.listen();
@@ -118,7 +120,7 @@ export class PlacePage implements Page {
       this.version = survey.version;
       this.proposal = survey.ground ?? undefined;
       const radius = survey.radius || 1;
-      this.orbit = new Orbit(survey.middle, 2.5 * radius);
+      this.orbit = new Orbit(survey.middle, 4 * radius);
       if (this.proposal) this.orbit.up = normalOf(this.proposal);
       const { clientWidth, clientHeight } = this.picture;
       const aspect = clamp(clientWidth / (clientHeight || clientWidth), 0.6, 2.4);
@@ -234,54 +236,85 @@ export class PlacePage implements Page {
     new ResizeObserver(() => this.drawOverlay()).observe(picture);
   }
 
-  /** The place of the twin that a pixel of the window shows. */
-  private placeAt(clientX: number, clientY: number): Vector | undefined {
-    const { shown, shownPose } = this;
-    const box = this.canvas.getBoundingClientRect();
-    if (!shown || !shownPose || box.width === 0) return undefined;
+  /** Column and row of the picture at a pixel of the window. */
+  private pixelAt(clientX: number, clientY: number): [number, number] | undefined {
+    const box = this.shownBox();
     const [w, h] = this.size;
     const column = Math.floor(((clientX - box.left) / box.width) * w);
     const row = Math.floor(((clientY - box.top) / box.height) * h);
-    if (column < 0 || row < 0 || column >= w || row >= h) return undefined;
-    const tensor = [...shown.tensors].find(([name]) => name.endsWith("depth"))?.[1];
-    if (!tensor) return undefined;
+    return column >= 0 && row >= 0 && column < w && row < h ? [column, row] : undefined;
+  }
+
+  /** The picture within its canvas, which it fills in one direction. */
+  private shownBox(): { left: number; top: number; width: number; height: number } {
+    const box = this.canvas.getBoundingClientRect();
+    const [w, h] = this.size;
+    const scale = Math.min(box.width / w, box.height / h);
+    const [width, height] = [w * scale, h * scale];
+    return { left: box.left + (box.width - width) / 2, top: box.top + (box.height - height) / 2, width, height };
+  }
+
+  /** From the camera to what a pixel of the window shows, at a depth of 1. */
+  private rayTo(clientX: number, clientY: number): Vector | undefined {
+    const pixel = this.pixelAt(clientX, clientY);
+    if (!pixel || !this.shownPose) return undefined;
+    const [w, h] = this.size;
+    const camera: Vector = [(pixel[0] + 0.5 - w / 2) / this.focal, (pixel[1] + 0.5 - h / 2) / this.focal, 1];
+    return rotate(this.shownPose.q, rotate(RIG_FROM_CAMERA.q, camera));
+  }
+
+  /** The place of the twin that a pixel of the window shows. */
+  private placeAt(clientX: number, clientY: number): Vector | undefined {
+    const { shown, shownPose } = this;
+    const pixel = this.pixelAt(clientX, clientY);
+    const ray = this.rayTo(clientX, clientY);
+    const tensor = [...(shown?.tensors ?? [])].find(([name]) => name.endsWith("depth"))?.[1];
+    if (!tensor || !pixel || !ray || !shownPose) return undefined;
     const depths = new DataView(tensor.bytes.buffer, tensor.bytes.byteOffset, tensor.bytes.byteLength);
-    const depth = depths.getFloat32(4 * (row * w + column), true);
-    if (!(depth > 0)) return undefined;
-    const camera: Vector = [((column + 0.5 - w / 2) * depth) / this.focal, ((row + 0.5 - h / 2) * depth) / this.focal, depth];
-    return add(shownPose.xyz, rotate(shownPose.q, rotate(RIG_FROM_CAMERA.q, camera)));
+    const depth = depths.getFloat32(4 * (pixel[1] * this.size[0] + pixel[0]), true);
+    return depth > 0 ? add(shownPose.xyz, scaled(ray, depth)) : undefined;
   }
 
   private click(x: number, y: number): void {
-    let at = this.placeAt(x, y);
     const places = this.clicked[this.step];
+    // A path is on the ground, also where a bush is before it, and where nothing was captured.
+    const { ground } = this;
+    const at = this.step === "path" && ground ? this.onGround(ground, x, y) : this.placeAt(x, y);
     if (!at) return say("there is nothing at that place: click on a surface", "bad");
     if (places.length >= NEEDED[this.step]) places.length = 0;
-    // A path is on the ground, also where a bush is before it.
-    if (this.step === "path" && this.ground) at = this.onGround(at);
     places.push(at);
     say("");
     if (this.step === "ground" && places.length === 3 && this.ground) this.setUp(normalOf(this.ground));
     this.refresh();
   }
 
-  /** The place of the ground on the ray to a place. */
-  private onGround(at: Vector): Vector {
-    const { ground, shownPose } = this;
-    if (!ground || !shownPose) return at;
+  /** The place of the ground that a pixel of the window shows. */
+  private onGround(ground: Ground, clientX: number, clientY: number): Vector | undefined {
+    const ray = this.rayTo(clientX, clientY);
+    if (!ray || !this.shownPose) return undefined;
+    const { xyz } = this.shownPose;
     const normal = normalOf(ground);
-    const ray = subtract(at, shownPose.xyz);
-    const slope = dot(ray, normal);
-    const height = dot(subtract(shownPose.xyz, ground.points[0]), normal);
-    const share = -height / slope;
-    return Math.abs(slope) > 1e-9 && share > 0 ? add(shownPose.xyz, scaled(ray, share)) : at;
+    const share = dot(subtract(ground.points[0], xyz), normal) / dot(ray, normal);
+    // Above the horizon there is no ground, and near it a pixel is half a world.
+    return share > 0 && share * length(ray) < 50 * this.orbit!.distance ? add(xyz, scaled(ray, share)) : undefined;
   }
 
   /** The ground that was clicked, or the one that was found. */
   private get ground(): Ground | undefined {
     const [a, b, c] = this.clicked.ground;
-    if (!a || !b || !c) return this.proposal;
-    return { points: [a, b, c], above: this.shownPose?.xyz ?? a };
+    const { axis, proposal } = this;
+    if (a && b && c) return { points: [a, b, c], above: this.shownPose?.xyz ?? a };
+    if (a && axis) {
+      const across = normalize(cross(axis, Math.abs(axis[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+      return { points: [a, add(a, across), add(a, cross(axis, across))], above: add(a, axis) };
+    }
+    return proposal && (!axis || dot(normalOf(proposal), axis) > 0.7) ? proposal : undefined;
+  }
+
+  private setAxis(axis: Vector): void {
+    this.axis = axis;
+    this.setUp(axis);
+    this.refresh();
   }
 
   private setUp(up: Vector): void {
@@ -316,11 +349,12 @@ export class PlacePage implements Page {
     for (const [step, tab] of Object.entries(this.tabs)) tab.ariaPressed = String(step === this.step);
     this.help.textContent = HELP[this.step];
     this.scaleRow.hidden = this.step !== "scale";
+    this.up.hidden = this.step !== "ground";
     const path = this.clicked.path;
     let metres = 0;
     for (let at = 1; at < path.length; at++) metres += length(subtract(path[at]!, path[at - 1]!)) * this.metresPerUnit;
     const found = {
-      ground: this.clicked.ground.length === 0 && this.proposal ? "using the ground that was found" : `${this.clicked.ground.length} of 3 places`,
+      ground: this.groundText(),
       scale: this.clicked.scale.length < 2 ? `${this.clicked.scale.length} of 2 places` : `${fixed(this.metresPerUnit, 4)} m per unit`,
       path: `${count(path.length)} places, ${fixed(metres, 1)} m`,
     };
@@ -328,6 +362,14 @@ export class PlacePage implements Page {
     this.save.disabled = path.length < 2 || !this.ground;
     for (const [step, places] of Object.entries(this.clicked)) this.element.dataset[step] = String(places.length);
     this.drawOverlay();
+  }
+
+  private groundText(): string {
+    const clicks = this.clicked.ground.length;
+    if (clicks === 3) return "the ground is that of the three places";
+    if (clicks > 0 && this.axis) return "the ground is level at that place; two more give its tilt";
+    if (clicks > 0) return `${clicks} of 3 places`;
+    return this.ground ? "using the ground that was found" : "no ground yet";
   }
 
   /** Where a place is in the picture, in CSS pixels; undefined behind the camera. */
@@ -338,7 +380,7 @@ export class PlacePage implements Page {
     const [x, y, z] = rotate(inverse(RIG_FROM_CAMERA.q), rotate(inverse(pose.q), subtract(at, pose.xyz)));
     if (z <= 1e-6) return undefined;
     const [w, h] = this.size;
-    const box = this.canvas.getBoundingClientRect();
+    const box = this.shownBox();
     const own = this.overlay.getBoundingClientRect();
     const pixels = box.width / w;
     return [box.left - own.left + (w / 2 + (x * this.focal) / z) * pixels, box.top - own.top + (h / 2 + (y * this.focal) / z) * pixels];

@@ -57,8 +57,10 @@ pub enum GroundError {
 const CUBES: f64 = 120.0;
 /// Distance from the plane that counts as on it at first, as a share of the scene's radius.
 const TOLERANCE: f64 = 0.01;
-/// How often the tolerance is halved while the plane is fitted.
-const REFINEMENTS: i32 = 3;
+/// How often the tolerance is halved while the plane is fitted, at most.
+const REFINEMENTS: i32 = 5;
+/// Share of the first round's places that a round must have: below it the tolerance is less than the ground is rough.
+const LEAST_SHARE: f64 = 0.2;
 /// Gaussians with less opacity before the sigmoid do not count: 0.3 after it.
 const LEAST_LOGIT: f32 = -0.85;
 /// A Gaussian is flat if its thinnest axis has at most this share of the middle one: `ln 0.4`.
@@ -214,6 +216,7 @@ fn judge(places: &[Place], plane: GroundPlane, tolerance: f64) -> (f64, GroundPl
 /// Fits the plane with a falling tolerance. Each round first moves the plane to the height that has most of the places
 /// near it: a road beside pavements and lawns is not the mean of the three.
 fn refine(places: &[Place], mut plane: GroundPlane, tolerance: f64) -> GroundPlane {
+    let mut first = 0;
     for round in 0..=REFINEMENTS {
         let tolerance = tolerance * 0.5_f64.powi(round);
         let near = |plane: &GroundPlane, reach: f64| -> Vec<DVec3> {
@@ -227,10 +230,17 @@ fn refine(places: &[Place], mut plane: GroundPlane, tolerance: f64) -> GroundPla
             .iter()
             .map(|at| plane.up.dot(*at - plane.point))
             .collect();
+        let mut moved = plane;
         if let Some(height) = densest(heights, 0.5 * tolerance) {
-            plane.point += height * plane.up;
+            moved.point += height * plane.up;
         }
-        plane = fit(&near(&plane, tolerance)).map_or(plane, |fitted| {
+        let on = near(&moved, tolerance);
+        first = first.max(on.len());
+        let is_rough = (on.len() as f64) < LEAST_SHARE * first as f64;
+        if is_rough {
+            break;
+        }
+        plane = fit(&on).map_or(moved, |fitted| {
             let up = if fitted.up.dot(plane.up) < 0.0 { -fitted.up } else { fitted.up };
             GroundPlane { up, ..fitted }
         });
