@@ -160,7 +160,8 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     };
     let [above, below] = [mean(0), mean(picture.height() / 2)];
     assert!(above > 1e6 && below > 1e6, "{above} {below}");
-    assert!(done(at, &["twin", "log", "street"]).lines().count() < 4);
+    let catalog = Catalog::open(&at.join("wildcity/twins")).unwrap();
+    assert_eq!(catalog.latest("street").unwrap(), 1);
     let said = done(at, &[&align[..], &["--apply"]].concat());
     assert!(said.contains("twin street version 2: the ground is level"), "{said}");
 
@@ -168,7 +169,7 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     let poses = camera_poses(&street_drive);
     write_colmap_text(&at.join("model/sparse/0"), &poses);
     let said = done(at, &["route", "from-colmap", "model", "--twin", "street", "--out", "drive"]);
-    assert!(said.contains("40 keyframes, 19.5 m") && said.contains("cameras front-view"), "{said}");
+    assert!(said.contains("40 keyframes, 19.") && said.contains("cameras front-view"), "{said}");
     let drive: Trajectory = read(&at.join("drive/capture.json"));
     drive.check().unwrap();
     assert!(
@@ -211,7 +212,6 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
         "drive/rig.json",
     ];
     assert!(done(at, &give).contains("version 3: drives capture"));
-    let catalog = Catalog::open(&at.join("wildcity/twins")).unwrap();
     let [second, third] = [2, 3].map(|number| catalog.version("street", Some(number)).unwrap());
     assert_eq!(second.manifest.chunks, third.manifest.chunks);
     assert_eq!(third.manifest.rig.unwrap().name, "capture");
