@@ -41,7 +41,7 @@ fn the_ground_of_a_turned_street_is_found() {
             alignment.point_m(road_m).z.abs()
         };
         let most_m = (0..=20).map(|i| height_m(10.0 * f64::from(i))).fold(0.0, f64::max);
-        println!("{index}: {degrees:.3} degrees, {:.1} mm", 1e3 * most_m);
+        eprintln!("{index}: {degrees:.3} degrees, {:.1} mm", 1e3 * most_m);
         assert!(degrees < 0.5, "{index}: {degrees} degrees");
         assert!(most_m < 0.02, "{index}: {most_m} m");
     }
