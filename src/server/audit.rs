@@ -219,9 +219,7 @@ mod tests {
     #[test]
     fn a_log_that_cannot_be_written_refuses_what_would_begin() {
         let full = Path::new("/dev/full");
-        if !full.exists() {
-            panic!("this test needs /dev/full");
-        }
+        assert!(full.exists(), "this test needs /dev/full");
         let file = OpenOptions::new().append(true).open(full).unwrap();
         let log = Log { path: full.to_owned(), file, bytes: 0, limit_bytes: 1 << 20 };
         let audit = Audit(Some(Mutex::new(log)));
