@@ -326,6 +326,67 @@ pub struct Rollback {
     pub version: u64,
 }
 
+/// `POST /v1/twins/{twin}/edits`: makes a new version with the same Gaussians on level ground, in metres, with a drive
+/// and a rig. All points are in the axes and the unit of the base version.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct NewEdit {
+    /// The version that is edited. If absent, the latest.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub base: Option<u64>,
+    /// The ground: it becomes z = 0. If absent, the axes stay.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ground: Option<EditGround>,
+    /// A known distance, which makes the unit a metre. If absent, the unit stays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scale: Option<EditScale>,
+    /// A drive through points. If absent, there is no new one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drive: Option<EditDrive>,
+    /// Name of a preset that becomes the twin's rig. If absent, the rig stays.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rig: Option<String>,
+}
+
+/// The ground of a twin.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct EditGround {
+    /// Three points of it, not on one line.
+    pub points: [[f64; 3]; 3],
+    /// A point above it.
+    pub above: [f64; 3],
+}
+
+/// A known distance.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct EditScale {
+    /// Two points.
+    pub points: [[f64; 3]; 2],
+    /// Their distance, in metres.
+    pub distance_m: f64,
+}
+
+/// A drive through points.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct EditDrive {
+    /// Its name. A drive of this name is replaced.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = crate::message::NAME_PATTERN)))]
+    pub name: String,
+    /// The points, on the ground.
+    #[cfg_attr(feature = "schema", schemars(length(min = 2, max = 1_000)))]
+    pub points: Vec<[f64; 3]>,
+    /// Its speed, in m/s.
+    #[serde(default = "five")]
+    pub speed: f64,
+}
+
 /// A session: an entry of `GET /v1/sessions`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -365,6 +426,10 @@ pub struct Refusal {
 
 fn yes() -> bool {
     true
+}
+
+fn five() -> f64 {
+    5.0
 }
 
 fn one() -> f64 {

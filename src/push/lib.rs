@@ -10,6 +10,7 @@
 //! report    what the files hold, and which cells would change
 //! preview   compares small images before and after
 //! commit    writes the version
+//! edit      the same Gaussians on level ground, with a drive and a rig
 //! publish   the pipeline: read, check, preview, commit, preload
 //! ```
 //!
@@ -19,6 +20,7 @@
 mod base;
 mod blocking;
 mod commit;
+mod edit;
 mod error;
 pub mod limits;
 mod preview;
@@ -31,6 +33,7 @@ mod source;
 mod status;
 
 pub use base::{check_base, default_id};
+pub use edit::{DriveRequest, EditRequest, Survey, publish_edit, survey};
 pub use error::PushError;
 pub use preview::PsnrPreview;
 pub use publish::{Viewpoints, publish};

@@ -53,6 +53,10 @@ pub const PREVIEW_SIDE_PX: u32 = 320;
 /// each at SH degree 1, 1.8 GB.
 pub const PREVIEW_GAUSSIANS: usize = 20_000_000;
 
+/// Most Gaussians in which the ground is searched: 236 B each at SH degree 3 are 240 MB, less than the smallest push may
+/// take.
+pub const SURVEYED_GAUSSIANS: u64 = 1_000_000;
+
 /// Characters of a push's note.
 pub const NOTE_CHARS: usize = 1000;
 

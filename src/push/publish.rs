@@ -202,7 +202,7 @@ fn commit_held(
 }
 
 /// Pins the version that is the latest now; `None` if the twin is new.
-fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, PushError> {
+pub(crate) fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, PushError> {
     let versions = match engine.catalog().versions(twin) {
         Ok(versions) => versions,
         Err(StoreError::NoTwin { .. }) => return Ok(None),
@@ -213,7 +213,12 @@ fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<LatestPin>, Pus
 
 /// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they
 /// switch. The version is already committed: what cannot be loaded now is loaded when it is opened.
-async fn preload(engine: &Arc<Engine>, twin: &str, version: u64, frames: Vec<Vec<Viewpoint>>) {
+pub(crate) async fn preload(
+    engine: &Arc<Engine>,
+    twin: &str,
+    version: u64,
+    frames: Vec<Vec<Viewpoint>>,
+) {
     let prepared = engine.preload(twin, version, frames);
     match timeout(wildcity_session::limits::PRELOAD_TIMEOUT, prepared).await {
         Ok(Ok(())) => {}

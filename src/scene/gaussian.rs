@@ -127,6 +127,20 @@ impl Gaussians {
         }
     }
 
+    /// Scales all Gaussians about the origin. A factor of 1 changes no bit.
+    pub fn scale(&mut self, factor: f64) {
+        if factor == 1.0 {
+            return;
+        }
+        let ln = factor.ln();
+        for mean in &mut self.means_m {
+            *mean = mean.map(|m| m * factor);
+        }
+        for scale in &mut self.ln_scales {
+            *scale = scale.map(|s| (f64::from(s) + ln) as f32);
+        }
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means_m.len()

@@ -11,6 +11,7 @@
 //! subtracts the camera in f64 once per chunk and frame.
 
 pub mod actor;
+pub mod align;
 pub mod appearance;
 pub mod chunk;
 pub mod gaussian;

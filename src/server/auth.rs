@@ -2,7 +2,7 @@
 //!
 //! A server without tokens listens on a loopback address only, and every client may do everything.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use blake3::Hash;
@@ -31,6 +31,19 @@ pub(crate) struct Grant {
     role: Role,
     /// Names of the twins that it may use; all twins if there is no list.
     twins: Option<BTreeSet<String>>,
+    pub(crate) limits: TokenLimits,
+}
+
+/// What a token may have at once; without a value, as much as the server allows to all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct TokenLimits {
+    /// Sessions, connected or waiting to be resumed.
+    pub(crate) sessions: Option<usize>,
+    /// Pushes and edits that wait or run.
+    pub(crate) pushes: Option<usize>,
+    /// Bytes of uploads.
+    pub(crate) upload_bytes: Option<u64>,
 }
 
 /// The tokens that a server accepts.
@@ -77,13 +90,15 @@ struct Entry {
     token: Option<String>,
     hash: Option<String>,
     twins: Option<BTreeSet<String>>,
+    #[serde(default)]
+    limits: TokenLimits,
 }
 
 /// Bytes of the shortest token that is accepted: 16 characters of base64 have 96 bits, too many to guess.
 const MIN_TOKEN_BYTES: usize = 16;
 
 impl Tokens {
-    /// Reads a file of tokens: `{"tokens": [{"name", "role", "token" or "hash", "twins"}]}`, where
+    /// Reads a file of tokens: `{"tokens": [{"name", "role", "token" or "hash", "twins", "limits"}]}`, where
     /// `hash` is `blake3:` or `sha-256:` and the hash of the token in hex.
     ///
     /// # Errors
@@ -100,8 +115,8 @@ impl Tokens {
             return Err(wrong("tokens".to_owned(), "there is none: no client could connect"));
         }
         let mut tokens: Vec<Token> = Vec::with_capacity(file.tokens.len());
-        for (index, Entry { name, role, token, hash, twins }) in file.tokens.into_iter().enumerate()
-        {
+        for (index, entry) in file.tokens.into_iter().enumerate() {
+            let Entry { name, role, token, hash, twins, limits } = entry;
             // A session belongs to the name of a token, so that names are unique.
             if name.is_empty() || tokens.iter().any(|other| other.grant.name == name) {
                 let reason = "a name is not empty, and belongs to one token only";
@@ -124,7 +139,7 @@ impl Tokens {
                     return Err(wrong(format!("tokens[{index}]"), reason));
                 }
             };
-            tokens.push(Token { grant: Arc::new(Grant { name, role, twins }), secret });
+            tokens.push(Token { grant: Arc::new(Grant { name, role, twins, limits }), secret });
         }
         Ok(Self(tokens))
     }
@@ -132,6 +147,15 @@ impl Tokens {
     /// Number of tokens that may upload.
     pub(crate) fn uploaders(&self) -> usize {
         self.0.iter().filter(|token| token.grant.require(Role::Push).is_ok()).count()
+    }
+
+    /// Bytes that the uploads of a token may take, by name, for tokens with a limit of their own.
+    pub(crate) fn upload_bytes(&self) -> BTreeMap<String, u64> {
+        let limited = |token: &Token| {
+            let bytes = token.grant.limits.upload_bytes?;
+            Some((token.grant.name.clone(), bytes))
+        };
+        self.0.iter().filter_map(limited).collect()
     }
 
     /// What the token in the value of an `Authorization` header allows.
@@ -172,7 +196,8 @@ impl Secret {
 impl Grant {
     /// The grant of every client of a server without tokens.
     pub(crate) fn everything() -> Arc<Self> {
-        Arc::new(Self { name: String::new(), role: Role::Admin, twins: None })
+        let limits = TokenLimits::default();
+        Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
     }
 
     /// Requires a role, which [`Role::Admin`] includes.

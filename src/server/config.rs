@@ -46,6 +46,8 @@ pub struct Config {
     pub origins: Origins,
     /// Certificate and key; without them the server speaks plain HTTP.
     pub tls: Option<TlsFiles>,
+    /// File of the audit log; without it there is none.
+    pub audit: Option<PathBuf>,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// The models that can repair images, by name. Each is loaded when a session asks for it.
@@ -67,6 +69,7 @@ impl Config {
             tokens: None,
             origins: Origins::default(),
             tls: None,
+            audit: None,
             backend,
             repairs: Arc::default(),
             profile: ProfileOverrides::default(),
@@ -177,6 +180,7 @@ impl std::fmt::Debug for Config {
             tokens,
             origins,
             tls,
+            audit,
             backend,
             repairs,
             profile,
@@ -189,6 +193,7 @@ impl std::fmt::Debug for Config {
             .field("tokens", &tokens.is_some())
             .field("origins", origins)
             .field("tls", tls)
+            .field("audit", audit)
             .field("backend", &backend.name())
             .field("repairs", &repairs.names().collect::<Vec<_>>())
             .field("profile", profile)

@@ -2,6 +2,7 @@
 //! HTTP status.
 
 use std::io;
+use std::path::PathBuf;
 
 use wildcity_push::PushError;
 use wildcity_scene::appearance::AppearanceError;
@@ -313,6 +314,17 @@ pub(crate) enum Fault {
     Spool {
         /// What was tried.
         action: &'static str,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// The audit log cannot be written.
+    #[error(
+        "the audit log {} cannot be written, so nothing is changed: {cause}",
+        path.display()
+    )]
+    Audit {
+        /// The log.
+        path: PathBuf,
         /// What the operating system says.
         cause: io::Error,
     },

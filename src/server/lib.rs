@@ -11,7 +11,9 @@
 //! newcomers      the slots of connections, before and after authentication
 //! idle_deadline  closes HTTP connections that make no progress
 //! routes         HTTP routes, and the upgrade to WebSocket
-//! auth           tokens, their roles and twins
+//! auth           tokens, their roles, twins and limits
+//! audit          the log of which token changed which twin
+//! open_pushes    how many pushes of each token wait or run
 //! tickets        one-time tickets, which stand for a token in the address of a WebSocket
 //! origins        which web pages and which host names are served
 //! spool          uploads on disk
@@ -27,6 +29,7 @@
 //!
 //! The pipeline of pushes is the package `wildcity-push`; the routes only carry requests to it.
 
+mod audit;
 mod auth;
 mod blocking;
 mod config;
@@ -39,6 +42,7 @@ pub mod limits;
 mod listen;
 mod metrics;
 mod newcomers;
+mod open_pushes;
 mod origins;
 mod routes;
 mod sessions;

@@ -2,6 +2,9 @@
 
 use std::time::Duration;
 
+/// Size at which the audit log is rotated, in bytes: 300,000 lines of 200 B.
+pub const AUDIT_BYTES: u64 = 64 << 20;
+
 /// The address that `serve` listens on by default.
 pub const LISTEN: &str = "127.0.0.1:8080";
 

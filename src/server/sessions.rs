@@ -139,17 +139,27 @@ impl SessionRegistry {
         Arc::new(Self { limit, resume_grace, entries: Mutex::default(), closed: Mutex::default() })
     }
 
-    /// Adds an empty slot under a new name; `owner` is the name of the client's token.
+    /// Adds an empty slot under a new name, for the client's token.
     ///
     /// # Errors
-    /// The name is in use, or there are too many sessions.
-    pub(crate) fn reserve(self: &Arc<Self>, name: String, owner: &str) -> Result<SlotGuard, Fault> {
+    /// The name is in use, or there are too many sessions, of all tokens or of this one.
+    pub(crate) fn reserve(
+        self: &Arc<Self>,
+        name: String,
+        grant: &Grant,
+    ) -> Result<SlotGuard, Fault> {
         let mut entries = self.entries.lock();
         if entries.contains_key(&name) {
             return Err(Fault::SessionExists { name });
         }
         if entries.len() >= self.limit {
             return Err(Fault::Busy { what: "sessions", limit: self.limit });
+        }
+        let own = || entries.values().filter(|entry| entry.owner == grant.name).count();
+        if let Some(limit) = grant.limits.sessions
+            && own() >= limit
+        {
+            return Err(Fault::Busy { what: "sessions of this token", limit });
         }
         let slot = Arc::new(AsyncMutex::new(SessionSlot::default()));
         let release = Arc::new(Notify::new());
@@ -158,7 +168,7 @@ impl SessionRegistry {
         let newest = Newest::new();
         let entry = Entry {
             slot,
-            owner: owner.to_owned(),
+            owner: grant.name.clone(),
             snapshots: Snapshots::default(),
             view: None,
             newest: newest.clone(),

@@ -13,9 +13,11 @@ use wildcity_session::{Engine, EngineSettings, Scenarios, SessionError};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
+use crate::audit::Audit;
 use crate::auth::Tokens;
 use crate::config::{Config, Directories};
 use crate::metrics::Metrics;
+use crate::open_pushes::OpenPushes;
 use crate::sessions::SessionRegistry;
 use crate::shutdown::Running;
 use crate::spool::Spool;
@@ -52,6 +54,14 @@ pub enum ServerError {
         /// What the operating system says.
         cause: io::Error,
     },
+    /// The audit log cannot be opened.
+    #[error("cannot write the audit log {}: {cause}", path.display())]
+    Audit {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system says.
+        cause: io::Error,
+    },
     /// The certificate or the key cannot be used.
     #[error(transparent)]
     Tls(#[from] TlsError),
@@ -77,6 +87,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         tokens,
         origins,
         tls,
+        audit,
         backend,
         repairs,
         profile,
@@ -91,6 +102,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         .map_err(|cause| ServerError::Episodes { path: episodes.clone(), cause })?;
     let catalog = Catalog::open_cached(&twins, cache.as_ref())?;
     let tls = tls.map(Tls::load).transpose()?;
+    let audit_error = |cause| ServerError::Audit { path: audit.clone().unwrap_or_default(), cause };
+    let audit = Audit::open(audit.as_deref()).map_err(audit_error)?;
     let cache = Cache::limited(catalog, limits.resident_bytes);
     let engine = Engine::start(EngineSettings {
         cache,
@@ -108,7 +121,9 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
 
     // Uploads. Agents can drive without them.
     let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
-    let spool = Spool::open(&uploads, limits.spool, uploaders).map(Arc::new).map_err(|error| {
+    let own_bytes = tokens.as_ref().map(Tokens::upload_bytes).unwrap_or_default();
+    let spool = Spool::open(&uploads, limits.spool, uploaders, own_bytes);
+    let spool = spool.map(Arc::new).map_err(|error| {
         let reason = format!("{}: {error}", uploads.display());
         tracing::warn!("uploads are refused: {reason}");
         reason
@@ -125,6 +140,8 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         profile,
         tokens,
         tickets: Tickets::default(),
+        audit,
+        open_pushes: OpenPushes::default(),
         origins,
         episodes,
         spool,

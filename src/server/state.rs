@@ -9,10 +9,12 @@ use wildcity_push::PushQueue;
 use wildcity_scene::ProfileOverrides;
 use wildcity_session::Engine;
 
+use crate::audit::Audit;
 use crate::auth::Tokens;
 use crate::config::Limits;
 use crate::fault::Fault;
 use crate::metrics::Metrics;
+use crate::open_pushes::OpenPushes;
 use crate::origins::Origins;
 use crate::sessions::SessionRegistry;
 use crate::spool::Spool;
@@ -31,6 +33,8 @@ pub(crate) struct ServerState {
     pub(crate) profile: ProfileOverrides,
     pub(crate) tokens: Option<Tokens>,
     pub(crate) tickets: Tickets,
+    pub(crate) audit: Audit,
+    pub(crate) open_pushes: OpenPushes,
     pub(crate) origins: Origins,
     /// Directory where episodes are recorded.
     pub(crate) episodes: PathBuf,

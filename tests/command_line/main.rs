@@ -41,6 +41,7 @@ mod bench_drive;
 mod bench_gpu;
 mod bisect;
 mod bombs;
+mod capture;
 mod crash;
 mod demo;
 mod devices;

@@ -3,6 +3,7 @@
 #[path = "../support/root.rs"]
 mod root;
 
+mod align;
 mod city;
 mod drive;
 mod pictures;

@@ -14,6 +14,7 @@ fn schemas_are_up_to_date() {
     check_closed::<http::NewUpload>("new_upload");
     check_closed::<http::NewPush>("new_push");
     check_closed::<http::Rollback>("rollback");
+    check_closed::<http::NewEdit>("new_edit");
     check::<message::Answer>("answer");
     check::<message::Drive>("drive");
     check::<observation::ObservationMetadata>("observation");

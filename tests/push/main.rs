@@ -10,6 +10,7 @@ mod scene_files;
 #[path = "../support/server.rs"]
 mod support;
 
+mod edits;
 mod hostile;
 mod metrics;
 mod pushes;

@@ -65,6 +65,8 @@ async fn every_route_needs_its_role() {
         ("POST /v1/twins/test/pushes", push, &[PUSHER, ADMIN]),
         ("GET /v1/twins/test/pushes/x", "", &[PUSHER, ADMIN]),
         ("POST /v1/twins/test/rollback", r#"{"version": 9}"#, &[ADMIN]),
+        ("POST /v1/twins/test/edits", "{}", &[PUSHER, ADMIN]),
+        ("GET /v1/twins/test/ground", "", &[PUSHER, ADMIN]),
         ("GET /v1/sessions", "", &[ADMIN]),
         ("GET /metrics", "", &[ADMIN]),
     ] {
@@ -252,4 +254,91 @@ async fn a_token_has_a_quota() {
     // All tokens together have a limit, too.
     begin(ADMIN, 5, 200).await.refused(507, "storage_full");
     assert_eq!(begin(ADMIN, 6, 100).await.status, 201);
+}
+
+/// A server with one token that has limits, and perhaps an audit log.
+async fn limited(limits: serde_json::Value, audit: Option<&std::path::Path>) -> TestServer {
+    let text = json!({ "tokens": [
+        { "name": "admin", "role": "admin", "token": ADMIN, "limits": limits },
+        { "name": "rival", "role": "admin", "token": RIVAL },
+    ]});
+    let tokens = Tokens::parse(text.to_string().as_bytes()).unwrap();
+    TestServer::configured(|config| {
+        config.tokens = Some(tokens);
+        config.audit = audit.map(std::path::Path::to_owned);
+    })
+    .await
+}
+
+#[tokio::test]
+async fn a_token_has_limits_of_its_own() {
+    let limits = json!({ "sessions": 1, "pushes": 0, "upload_bytes": 100 });
+    let server = limited(limits, None).await;
+    let mut agents = Vec::new();
+    for token in [ADMIN, RIVAL, RIVAL] {
+        let mut agent = upgrade(&server, Some(token)).await.ok().unwrap();
+        agent.hello().await;
+        agent.open(json!({})).await;
+        agents.push(agent);
+    }
+    let mut second = upgrade(&server, Some(ADMIN)).await.ok().unwrap();
+    second.hello().await;
+    let refused = second.try_open(json!({})).await;
+    crate::support::refused(&refused, "busy");
+    assert!(refused["message"].as_str().unwrap().contains("1 sessions of this token"), "{refused}");
+    // A session that ends makes room.
+    agents[0].ask(json!({ "type": "close" })).await;
+    second.open(json!({})).await;
+
+    let large = announcement(b"large", 101);
+    ask(&server, "POST /v1/uploads", Some(ADMIN), &large).await.refused(507, "storage_full");
+    assert_eq!(ask(&server, "POST /v1/uploads", Some(RIVAL), &large).await.status, 201);
+    let edit = r#"{"rig": "surround6"}"#;
+    let refused = ask(&server, "POST /v1/twins/test/edits", Some(ADMIN), edit).await;
+    refused.refused(503, "busy");
+    let edited = ask(&server, "POST /v1/twins/test/edits", Some(RIVAL), edit).await;
+    assert_eq!(edited.status, 200, "{edited:?}");
+}
+
+#[tokio::test]
+async fn the_audit_log_says_which_token_changed_what() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("audit.jsonl");
+    let server = limited(json!({}), Some(&path)).await;
+    let url = format!("http://127.0.0.1:{}", server.address().port());
+    let scene = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
+    let rival = HttpClient::new(&url, &with_token(RIVAL)).unwrap();
+    let upload = rival.upload(&scene, &mut |_, _| {}).await.unwrap();
+    let begun = rival.push("test", &push_of(&[&upload.id])).await.unwrap();
+    rival.wait_for_push(begun, &mut |_| {}).await.unwrap();
+    let edit = |body: &'static str| ask(&server, "POST /v1/twins/test/edits", Some(ADMIN), body);
+    assert_eq!(edit(r#"{"rig": "surround6"}"#).await.status, 200);
+    edit(r#"{"rig": "surround6", "base": 77}"#).await.refused(404, "unknown_version");
+    let admin = HttpClient::new(&url, &with_token(ADMIN)).unwrap();
+    admin.rollback("test", 1).await.unwrap();
+
+    let text = std::fs::read_to_string(&path).unwrap();
+    let lines: Vec<serde_json::Value> =
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let told: Vec<_> = lines
+        .iter()
+        .map(|line| {
+            let text = |field: &str| line[field].as_str().unwrap_or_default();
+            (text("token"), text("what"), text("state"), line["version"].as_u64())
+        })
+        .collect();
+    assert_eq!(
+        told,
+        [
+            ("rival", "push", "begun", None),
+            ("rival", "push", "done", Some(2)),
+            ("admin", "edit", "begun", None),
+            ("admin", "edit", "done", Some(3)),
+            ("admin", "edit", "begun", None),
+            ("admin", "edit", "refused", None),
+            ("admin", "rollback", "begun", None),
+            ("admin", "rollback", "done", Some(4)),
+        ]
+    );
+    assert!(lines.iter().all(|line| line["twin"] == "test"), "{text}");
 }

@@ -1,5 +1,6 @@
 // The first page: twins, running sessions, recorded episodes.
 
+import { Adder } from "./add";
 import { count, el, fixed, place, say } from "./dom";
 import type { Page } from "./page";
 import type { Pose } from "./pose";
@@ -32,6 +33,7 @@ const REFRESH_MS = 3000;
 
 export class HomePage implements Page {
   readonly element = el("div.home");
+  private readonly adder = new Adder(() => void this.load());
   private readonly twins = el("section");
   private readonly sessions = el("section");
   private readonly episodes = el("section");
@@ -41,7 +43,7 @@ export class HomePage implements Page {
 
   constructor() {
     place();
-    this.element.append(this.twins, this.sessions, this.episodes);
+    this.element.append(this.twins, this.adder.element, this.sessions, this.episodes);
     void this.load();
   }
 
@@ -83,7 +85,8 @@ export class HomePage implements Page {
       return el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
         el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, drives || "no recorded drive"),
         el("td.actions", {}, el("a.action", { href: `#/drive/${twin.name}` }, "Drive"),
-          el("a.action", { href: `#/fly/${twin.name}` }, "Free camera")));
+          el("a.action", { href: `#/fly/${twin.name}` }, "Free camera"),
+          el("a.action", { href: `#/place/${twin.name}` }, "Place a drive")));
     });
     const broken = damaged.map(({ name, reason }) => el("p.bad", {}, `${name} is damaged: ${reason}`));
     const head = ["twin", "version", "Gaussians", "recorded drives", ""].map((text) => el("th", {}, text));

@@ -1,4 +1,4 @@
-// The page of the address: #/, #/drive/TWIN, #/fly/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME.
+// The page of the address: #/, #/drive/TWIN, #/fly/TWIN, #/place/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME.
 
 import { byId } from "./dom";
 import { DrivePage } from "./drive";
@@ -6,6 +6,7 @@ import { EpisodePage } from "./episode";
 import { FlyPage } from "./fly";
 import { HomePage } from "./home";
 import type { Page } from "./page";
+import { PlacePage } from "./place";
 import { WatchPage } from "./watch";
 
 const THEME = "wildcity-theme";
@@ -18,6 +19,7 @@ function pageOf(address: string): Page {
   const name = names[0] ?? "";
   if (kind === "drive" && name) return new DrivePage(name);
   if (kind === "fly" && name) return new FlyPage(name);
+  if (kind === "place" && name) return new PlacePage(name);
   if (kind === "watch" && name) return new WatchPage(name);
   if (kind === "episode" && name) return new EpisodePage(names.slice(0, 2));
   return new HomePage();

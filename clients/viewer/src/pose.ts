@@ -45,6 +45,19 @@ export function looking(yaw: number, pitch: number): Quaternion {
   return multiply(turn, tilt);
 }
 
+export const add = (a: Vector, b: Vector): Vector => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+
+export const subtract = (a: Vector, b: Vector): Vector => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+
+export const scaled = (v: Vector, factor: number): Vector => [v[0] * factor, v[1] * factor, v[2] * factor];
+
+export const dot = (a: Vector, b: Vector): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+export const cross = (a: Vector, b: Vector): Vector =>
+  [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+
+export const normalize = (v: Vector): Vector => scaled(v, 1 / (Math.hypot(...v) || 1));
+
 export const length = (v: Vector): number => Math.hypot(...v);
 
 export const clamp = (value: number, low: number, high: number): number => Math.min(high, Math.max(low, value));

@@ -23,11 +23,16 @@ export function useToken(token: string): void {
 
 const token = (): string | null => sessionStorage.getItem(TOKEN);
 
-async function request(method: string, path: string): Promise<Response> {
-  const headers: Record<string, string> = {};
+interface Sent {
+  body?: BodyInit;
+  headers?: Record<string, string>;
+}
+
+async function request(method: string, path: string, { body, headers: own }: Sent = {}): Promise<Response> {
+  const headers: Record<string, string> = { ...own };
   const bearer = token();
   if (bearer) headers.authorization = `Bearer ${bearer}`;
-  const response = await fetch(path, { method, headers });
+  const response = await fetch(path, { method, headers, ...(body !== undefined && { body }) });
   if (response.ok) return response;
   throw new Refused(await response.json().catch(() => ({ message: `HTTP ${response.status}` })));
 }
@@ -38,6 +43,16 @@ export async function get<T>(path: string): Promise<T> {
 
 export async function getText(path: string): Promise<string> {
   return (await request("GET", path)).text();
+}
+
+/** Sends JSON. */
+export async function post<T>(path: string, value: unknown): Promise<T> {
+  return (await request("POST", path, { body: JSON.stringify(value) })).json();
+}
+
+/** Appends a part of a file to its upload. */
+export async function append(path: string, part: Blob, offset: number): Promise<void> {
+  await request("PATCH", path, { body: part, headers: { "upload-offset": String(offset) } });
 }
 
 /** Opens a WebSocket. Browsers cannot send a token with it: on a server with tokens a ticket stands for it. */

@@ -24,7 +24,7 @@ use std::sync::LazyLock;
 
 use serde::de::DeserializeOwned;
 
-use crate::http::{NewPush, NewUpload, Rollback};
+use crate::http::{NewEdit, NewPush, NewUpload, Rollback};
 use crate::message::Request;
 
 use shape::Shapes;
@@ -54,6 +54,7 @@ inbound!(Request, "request");
 inbound!(NewUpload, "new_upload");
 inbound!(NewPush, "new_push");
 inbound!(Rollback, "rollback");
+inbound!(NewEdit, "new_edit");
 
 /// Why a message was refused.
 #[derive(Clone, Debug, PartialEq, Eq)]

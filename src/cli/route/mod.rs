@@ -1,13 +1,14 @@
 //! `wildcity route`.
 
 mod associate;
+mod capture;
 mod cut;
 mod files;
 mod interpolate;
 mod measure;
 mod subsample;
 
-/// Measure a recorded drive, cut it, and match its clock with another clock.
+/// Measure a recorded drive, cut it, match its clock with another clock, or make one of camera poses.
 ///
 /// Drives are JSON files as `wildcity import --trajectory` reads them. The results are such files too, in
 /// the same world.
@@ -29,6 +30,8 @@ enum Subcommand {
     Cut(cut::Cut),
     Associate(associate::Associate),
     Interpolate(interpolate::Interpolate),
+    FromColmap(capture::FromColmap),
+    FromNerfstudio(capture::FromNerfstudio),
 }
 
 impl Route {
@@ -39,6 +42,8 @@ impl Route {
             Subcommand::Cut(cut) => cut.run(),
             Subcommand::Associate(associate) => associate.run(),
             Subcommand::Interpolate(interpolate) => interpolate.run(),
+            Subcommand::FromColmap(from) => from.run(),
+            Subcommand::FromNerfstudio(from) => from.run(),
         }
     }
 }

@@ -65,6 +65,11 @@ pub(super) struct Serve {
     #[arg(long, value_name = "ORIGINS", value_parser = origins)]
     origin: Option<Origins>,
 
+    /// File of the audit log: which token pushed, edited or rolled back which twin, a JSON object a line. What cannot
+    /// be logged is refused. At 64 MiB the file is renamed to FILE.1.
+    #[arg(long, value_name = "FILE")]
+    audit_log: Option<PathBuf>,
+
     /// Address and port to listen on; port 0 takes a free one. An address that is not loopback needs
     /// --tokens.
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
@@ -119,7 +124,8 @@ Examples:
 
 Tokens file: role is drive (sessions), push (uploads and pushes) or admin (everything). Give the token
 itself, of at least 16 characters, or hash: blake3: or sha-256: and its hash in hex. twins lists the
-twins that it may use; without the list it may use all.
+twins that it may use; without the list it may use all. limits are what it may have at once: sessions,
+pushes, upload_bytes.
   {\"tokens\": [
     {\"name\": \"fleet\", \"role\": \"drive\", \"token\": \"u3mR8qkV0aXn2wLc\", \"twins\": [\"street\"]},
     {\"name\": \"trainer\", \"role\": \"push\", \"hash\": \"sha-256:9f86d081884c7d659a2feaa0c55ad015...\"}]}";
@@ -197,6 +203,7 @@ impl Serve {
             tokens,
             origins: self.origin.unwrap_or_default(),
             tls,
+            audit: self.audit_log,
             backend: Arc::from(self.backend.backend()?),
             repairs: self.repair.models()?,
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),

@@ -1,7 +1,9 @@
 //! `wildcity twin`.
 
+mod align;
 mod change;
 mod diff;
+mod drive;
 mod fsck;
 mod gc;
 mod generate;
@@ -34,6 +36,8 @@ enum Subcommand {
     Fsck(fsck::Fsck),
     Sky(sky::Sky),
     Geo(geo::Geo),
+    Align(align::Align),
+    Drive(drive::Drive),
 }
 
 impl Twin {
@@ -48,6 +52,8 @@ impl Twin {
             Subcommand::Fsck(fsck) => fsck.run(),
             Subcommand::Sky(sky) => sky.run(),
             Subcommand::Geo(geo) => geo.run(),
+            Subcommand::Align(align) => align.run(),
+            Subcommand::Drive(drive) => drive.run(),
         }
     }
 }

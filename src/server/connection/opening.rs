@@ -40,7 +40,7 @@ impl Connection {
         opening.profile = opening.profile.or(&self.state.profile);
         self.grant.require_twin(&opening.twin)?;
         let name = name.unwrap_or_else(new_session_name);
-        let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+        let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
         let opened = Session::open(self.state.engine.clone(), name, opening);
         self.fill(seq, slot, drive, opened).await
     }
@@ -59,13 +59,13 @@ impl Connection {
                 let snapshots = self.state.sessions.snapshots(&session, &self.grant.name)?;
                 let from = snapshots.find("from.snapshot", &snapshot)?;
                 self.grant.require_twin(from.twin())?;
-                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+                let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
                 self.fill(seq, slot, None, Session::branch(engine, name, &from)).await
             }
             BranchPoint::Recorded { episode, step } => {
                 let from = Session::recorded(&engine, &episode, step).await?;
                 self.grant.require_twin(from.twin())?;
-                let slot = self.state.sessions.reserve(name.clone(), &self.grant.name)?;
+                let slot = self.state.sessions.reserve(name.clone(), &self.grant)?;
                 self.fill(seq, slot, None, Session::continued(engine, name, from)).await
             }
         }

@@ -232,7 +232,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::UploadDigest { .. } => plain(Code::UploadDigest),
         Fault::StorageFull { .. } => plain(Code::StorageFull),
         Fault::OutOfRange { field, .. } => at(Code::OutOfRange, field),
-        Fault::Spool { .. } | Fault::Internal(_) => plain(Code::Internal),
+        Fault::Audit { cause, .. } if is_full(cause) => plain(Code::StorageFull),
+        Fault::Audit { .. } | Fault::Spool { .. } | Fault::Internal(_) => plain(Code::Internal),
         Fault::Session(error) => of_session(error),
         Fault::Push(error) => of_push(error),
     }

@@ -4,6 +4,7 @@ use std::fmt::Display;
 use std::str::FromStr;
 use std::time::UNIX_EPOCH;
 
+use glam::DVec3;
 use serde_json::{Value, json};
 
 use crate::fault::Fault;
@@ -13,9 +14,12 @@ use crate::spool::{Announced, Upload};
 use wildcity_episode::{EpisodeFile, Listed};
 use wildcity_protocol::http;
 use wildcity_push::{
-    CellChange, CellSelection, FileReport, PushError, PushReport, PushRequest, PushedVersion,
-    RequestedFile, SourceAxes, State, Status,
+    CellChange, CellSelection, DriveRequest, EditRequest, FileReport, PushError, PushReport,
+    PushRequest, PushedVersion, RequestedFile, SourceAxes, State, Status, Survey,
 };
+use wildcity_scene::Rig;
+use wildcity_scene::align::GroundPlane;
+use wildcity_session::SessionError;
 use wildcity_twin::ingest::{BadGaussian, IngestError};
 use wildcity_twin::store::{LogEntry, Version};
 
@@ -184,6 +188,53 @@ fn file(file: &FileReport) -> http::FileReport {
 /// The body of `POST /v1/twins/{twin}/rollback`: the number of the old version.
 pub(crate) fn rollback(body: &[u8]) -> Result<u64, Fault> {
     read_body::<http::Rollback>(body).map(|rollback| rollback.version)
+}
+
+/// The body of `POST /v1/twins/{twin}/edits`.
+pub(crate) fn new_edit(twin: String, body: &[u8]) -> Result<EditRequest, Fault> {
+    let http::NewEdit { base, ground, scale, drive, rig } = read_body(body)?;
+    let unknown = |name| SessionError::UnknownRig { name, known: Rig::preset_names().collect() };
+    let rig = rig.map(|name| Rig::preset(&name).ok_or_else(|| unknown(name)));
+    let drive = drive.map(|http::EditDrive { name, points, speed }| {
+        let points = points.into_iter().map(DVec3::from_array).collect();
+        DriveRequest { name, points, speed_m_s: speed }
+    });
+    Ok(EditRequest {
+        twin,
+        base,
+        ground: ground.map(|http::EditGround { points, above }| {
+            (points.map(DVec3::from_array), DVec3::from_array(above))
+        }),
+        scale: scale.map(|http::EditScale { points, distance_m }| {
+            (points.map(DVec3::from_array), distance_m)
+        }),
+        drive,
+        rig: rig.transpose()?,
+    })
+}
+
+/// Where a twin is, and its ground as the field `ground` of an edit.
+pub(crate) fn survey(survey: &Survey) -> Value {
+    let ground = survey.ground.map(|GroundPlane { point, up }| {
+        let (across, along) = up.any_orthonormal_pair();
+        let radius = survey.extent.radius;
+        let points = [point, point + radius * across, point + radius * along];
+        http::EditGround {
+            points: points.map(|point| point.to_array()),
+            above: (point + radius * up).to_array(),
+        }
+    });
+    json!({
+        "version": survey.version,
+        "middle": survey.extent.middle.to_array(),
+        "radius": survey.extent.radius,
+        "ground": ground,
+    })
+}
+
+/// The version of an edit.
+pub(crate) fn edited(version: &PushedVersion) -> Value {
+    json!({ "version": version.number, "version_hash": version.hash })
 }
 
 /// The versions of a twin, the latest last. Versions after `held` are not ready.

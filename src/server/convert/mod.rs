@@ -29,8 +29,8 @@ pub(crate) use answer::{AlsoResumed, closed, ok, opened, resumed, switched, twin
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{
-    ListedEpisode, episodes, new_push, new_upload, push, rollback, sessions, ticket, upload,
-    version, versions,
+    ListedEpisode, edited, episodes, new_edit, new_push, new_upload, push, rollback, sessions,
+    survey, ticket, upload, version, versions,
 };
 pub(crate) use many::{Stepped, many};
 pub(crate) use observation::observation;

@@ -10,10 +10,12 @@ use axum::{Extension, Json};
 
 use wildcity_push::{Begun, Push, PushError, PushRequest, SourceFile, State};
 
+use crate::audit::{Change, Ended};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
 use crate::fault::Fault;
+use crate::open_pushes::OpenPush;
 use crate::state::ServerState;
 
 use super::refusal::HttpResult;
@@ -36,14 +38,21 @@ pub(super) async fn begin(
     };
     let id = request.id.clone().unwrap_or_else(|| wildcity_push::default_id(&request, latest));
     let twin = request.twin.clone();
-    let push =
-        match state.pushes.begin(&request, &id, || find_uploads(&state, &grant.name, &request))? {
-            Begun::Known(push) => push,
-            Begun::New { push, files } => {
-                tokio::spawn(run(state.clone(), push.clone(), request, files));
-                push
-            }
-        };
+    let mut open = None;
+    let files = || {
+        open = Some(state.open_pushes.begin(&grant)?);
+        let files = find_uploads(&state, &grant.name, &request)?;
+        state.audit.begin(&grant, &Change { what: "push", twin: &twin, id: Some(&id) })?;
+        Ok::<_, Fault>(files)
+    };
+    let push = match state.pushes.begin(&request, &id, files)? {
+        Begun::Known(push) => push,
+        Begun::New { push, files } => {
+            let owned = OwnedPush { grant, id: id.clone(), _open: open };
+            tokio::spawn(run(state.clone(), push.clone(), owned, request, files));
+            push
+        }
+    };
     Ok(answer(StatusCode::ACCEPTED, &id, &twin, &push))
 }
 
@@ -72,13 +81,23 @@ pub(super) async fn cancel(
     Ok(answer(StatusCode::OK, &id, &twin, &push))
 }
 
+/// Whose push it is.
+struct OwnedPush {
+    grant: Arc<Grant>,
+    id: String,
+    /// Counts among the token's pushes.
+    _open: Option<OpenPush>,
+}
+
 /// Runs a push to its end and records the result.
 async fn run(
     state: Arc<ServerState>,
     push: Arc<Push>,
+    owned: OwnedPush,
     request: PushRequest,
     files: Vec<SourceFile>,
 ) {
+    let twin = request.twin.clone();
     let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
     let published =
         wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints);
@@ -88,6 +107,10 @@ async fn run(
         () = state.stopped() => Err(PushError::ShuttingDown),
     };
     let reason = result.as_ref().err().map(ToString::to_string);
+    let change = Change { what: "push", twin: &twin, id: Some(&owned.id) };
+    let made = result.as_ref().map(|version| Ended::Version(version.number));
+    let made = made.unwrap_or(Ended::Not(reason.as_deref().unwrap_or_default()));
+    state.audit.end(&owned.grant, &change, made);
     let ended = push.end(result);
     if let Some(reason) = reason {
         tracing::warn!(state = ?ended, "a push ended: {reason}");

@@ -245,6 +245,23 @@ pub(super) fn guarded() -> Vec<Row> {
         .takes(Json("rollback"))
         .answers(200, Object)
         .does(twins::rollback),
+        op(
+            Get,
+            "/v1/twins/{twin}/ground",
+            PUSH,
+            "Where a twin is, and the ground it seems to stand on.",
+        )
+        .answers(200, Object)
+        .does(twins::ground),
+        op(
+            Post,
+            "/v1/twins/{twin}/edits",
+            PUSH,
+            "Makes a version on level ground, in metres, with a drive and a rig.",
+        )
+        .takes(Json("new_edit"))
+        .answers(200, Object)
+        .does(twins::edit),
         op(Post, "/v1/twins/{twin}/pushes", PUSH, "Makes a new version from uploads.")
             .takes(Json("new_push"))
             .answers(202, Json("push"))

@@ -7,8 +7,10 @@ use axum::extract::{Path, RawQuery, State};
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
+use wildcity_push::PushError;
 use wildcity_twin::store::StoreError;
 
+use crate::audit::{Change, Ended};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
@@ -84,6 +86,48 @@ pub(super) async fn trajectory(
     Ok(Json(body.await?).into_response())
 }
 
+/// `GET /v1/twins/{twin}/ground`: where the latest version is, and the ground that it seems to stand on.
+pub(super) async fn ground(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&name)?;
+    let version = state.engine.pinned_latest(&name);
+    let survey = wildcity_push::survey(&state.engine, &state.pushes, name, version).await?;
+    Ok(Json(convert::survey(&survey)).into_response())
+}
+
+/// `POST /v1/twins/{twin}/edits`: a version on level ground, with a drive and a rig.
+pub(super) async fn edit(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+    body: Bytes,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_twin(&name)?;
+    let request = convert::new_edit(name, &body)?;
+    let open = state.open_pushes.begin(&grant)?;
+    // A client that goes away leaves a whole version, or none.
+    let edited = tokio::spawn(async move {
+        let _open = open;
+        let twin = request.twin.clone();
+        let change = Change { what: "edit", twin: &twin, id: None };
+        state.audit.begin(&grant, &change)?;
+        let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
+        let edited =
+            wildcity_push::publish_edit(&state.engine, &state.pushes, request, &viewpoints).await;
+        let reason = edited.as_ref().err().map(ToString::to_string).unwrap_or_default();
+        let ended = edited.as_ref().map(|version| Ended::Version(version.number));
+        state.audit.end(&grant, &change, ended.unwrap_or(Ended::Not(&reason)));
+        Ok::<_, Fault>(edited?)
+    });
+    let edited = edited.await.map_err(|_| PushError::Crashed)?;
+    Ok(Json(convert::edited(&edited?)).into_response())
+}
+
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again.
 pub(super) async fn rollback(
     State(state): State<Arc<ServerState>>,
@@ -94,14 +138,20 @@ pub(super) async fn rollback(
     grant.require(Role::Admin)?;
     grant.require_twin(&name)?;
     let number = convert::rollback(&body)?;
-    let engine = state.engine.clone();
     let version = blocking(move || {
-        let version = engine.catalog().rollback(&name, number)?;
+        let engine = &state.engine;
+        let change = Change { what: "rollback", twin: &name, id: None };
+        state.audit.begin(&grant, &change)?;
+        let rolled_back = engine.catalog().rollback(&name, number);
+        let reason = rolled_back.as_ref().err().map(ToString::to_string).unwrap_or_default();
+        let ended = rolled_back.as_ref().map(|version| Ended::Version(version.number));
+        state.audit.end(&grant, &change, ended.unwrap_or(Ended::Not(&reason)));
+        let version = rolled_back?;
         // A push that is still loading its version has pinned the one before; move that pin, so that
         // the rollback becomes the latest at once.
         engine.move_latest_pin(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
-        Ok::<_, StoreError>(version)
+        Ok::<_, Fault>(version)
     });
     Ok(Json(convert::version(&version.await?)).into_response())
 }

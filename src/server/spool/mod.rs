@@ -62,8 +62,13 @@ pub(crate) struct SpoolUsage {
 
 impl Spool {
     /// Opens a directory for one server, with the uploads that an earlier server left there. `tokens` is the number
-    /// of tokens that may upload.
-    pub(crate) fn open(dir: &Path, limits: SpoolLimits, tokens: usize) -> io::Result<Self> {
+    /// of tokens that may upload, and `own_bytes` the bytes of those with a limit of their own, by name.
+    pub(crate) fn open(
+        dir: &Path,
+        limits: SpoolLimits,
+        tokens: usize,
+        own_bytes: BTreeMap<String, u64>,
+    ) -> io::Result<Self> {
         fs::create_dir_all(dir)?;
         let lock = OpenOptions::new().create(true).append(true).open(dir.join("lock"))?;
         lock.try_lock().map_err(|error| match error {
@@ -75,7 +80,7 @@ impl Spool {
         let spool = Self {
             dir: dir.to_owned(),
             limits,
-            quota: Quota::new(limits, tokens),
+            quota: Quota::new(limits, tokens, own_bytes),
             uploads: Mutex::default(),
             _lock: lock,
         };

@@ -4,6 +4,7 @@
 //! uploads that were accepted seldom meet a full spool. An announcement whose bytes do not come loses this room after
 //! minutes: otherwise a token could keep all others from uploading without sending anything.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::config::SpoolLimits;
@@ -14,10 +15,12 @@ use super::upload::{RemovedFiles, Upload};
 use super::{SpoolUsage, Uploads};
 
 /// The limits of uploads, in all and per token.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Quota {
     all: SpoolUsage,
     token: SpoolUsage,
+    /// Bytes of tokens with a limit of their own, by name.
+    own_bytes: BTreeMap<String, u64>,
 }
 
 /// What a new state of an upload would take.
@@ -28,14 +31,24 @@ struct Demand<'a> {
 }
 
 impl Quota {
-    /// The limits of a spool that so many tokens may use.
-    pub(super) fn new(limits: SpoolLimits, tokens: usize) -> Self {
+    /// The limits of a spool that so many tokens may use, some with a limit of their own in bytes.
+    pub(super) fn new(
+        limits: SpoolLimits,
+        tokens: usize,
+        own_bytes: BTreeMap<String, u64>,
+    ) -> Self {
         let all = SpoolUsage { uploads: limits.uploads, bytes: limits.bytes };
         // One token alone may have all.
         let share = if tokens > 1 { limits::TOKEN_SHARE } else { 1 };
         let bytes = limits.token_bytes.unwrap_or(all.bytes / share).min(all.bytes);
         let uploads = all.uploads.div_ceil(share as usize);
-        Self { all, token: SpoolUsage { uploads, bytes } }
+        Self { all, token: SpoolUsage { uploads, bytes }, own_bytes }
+    }
+
+    /// What the uploads of a token may take.
+    fn of_token(&self, owner: &str) -> SpoolUsage {
+        let own = self.own_bytes.get(owner).copied();
+        SpoolUsage { bytes: own.unwrap_or(self.token.bytes).min(self.all.bytes), ..self.token }
     }
 
     /// Removes uploads until a new one fits.
@@ -50,8 +63,8 @@ impl Quota {
     ) -> Result<(), Fault> {
         // One that can never fit is refused before it is sent.
         let size = upload.announced().size;
-        if size > self.token.bytes {
-            let most = self.token.bytes;
+        let most = self.of_token(upload.owner()).bytes;
+        if size > most {
             let reason = format!("{size} bytes, and a token may keep {most}; send it in parts");
             return Err(Fault::StorageFull { reason });
         }
@@ -81,11 +94,12 @@ impl Quota {
         removed: &mut Vec<RemovedFiles>,
     ) -> Result<(), Fault> {
         let owner = demand.upload.owner();
+        let token = self.of_token(owner);
         loop {
             let others = || uploads.values().filter(|known| known.stem() != demand.upload.stem());
             let own = usage(others().filter(|known| known.owner() == owner));
             let all = usage(others());
-            let is_own_full = !self.token.fits(own, demand.bytes);
+            let is_own_full = !token.fits(own, demand.bytes);
             if !is_own_full && self.all.fits(all, demand.bytes) {
                 return Ok(());
             }
@@ -98,7 +112,7 @@ impl Quota {
                 .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used()));
             let Some(stem) = first.map(|known| known.stem().to_owned()) else {
                 let (whose, kept, most) = match is_own_full {
-                    true => ("this token keeps", own, self.token),
+                    true => ("this token keeps", own, token),
                     false => ("the server keeps", all, self.all),
                 };
                 let reason = format!(

@@ -7,6 +7,8 @@ use std::str::FromStr;
 
 use glam::{DMat3, DQuat, DVec3};
 
+use wildcity_scene::align::Alignment;
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::{Gaussians, sh};
 
 use super::IngestError;
@@ -89,6 +91,15 @@ impl Axes {
         self.twin_from_file.transpose()
     }
 
+    /// The same change of axes and unit for poses; `None` for axes with a reflection, in which no camera has a pose.
+    pub fn alignment(&self) -> Option<Alignment> {
+        let is_mirrored = self.twin_from_file.determinant() < 0.0;
+        let rotation = DQuat::from_mat3(&self.twin_from_file).normalize();
+        let new_from_old = Pose { rotation, ..Pose::IDENTITY };
+        let metres_per_unit = self.metres_per_unit;
+        (!is_mirrored).then_some(Alignment { new_from_old, metres_per_unit })
+    }
+
     /// Rotates and then scales Gaussians in place. The identity changes no bit.
     ///
     /// A reflection `M` moves each ellipsoid as the rotation `-M` does, because an ellipsoid equals
@@ -97,15 +108,7 @@ impl Axes {
         if self.twin_from_file != DMat3::IDENTITY {
             self.rotate(gaussians);
         }
-        if self.metres_per_unit != 1.0 {
-            let ln = self.metres_per_unit.ln();
-            for mean in &mut gaussians.means_m {
-                *mean = mean.map(|m| m * self.metres_per_unit);
-            }
-            for scale in &mut gaussians.ln_scales {
-                *scale = scale.map(|s| (f64::from(s) + ln) as f32);
-            }
-        }
+        gaussians.scale(self.metres_per_unit);
     }
 
     fn rotate(&self, gaussians: &mut Gaussians) {

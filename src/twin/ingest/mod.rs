@@ -14,6 +14,7 @@ mod activation;
 mod archive;
 pub mod axes;
 pub mod cameras;
+pub mod capture;
 mod error;
 mod file;
 mod gltf;

@@ -1,0 +1,186 @@
+//! `wildcity twin align`.
+
+mod picture;
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use anyhow::Context;
+use glam::DVec3;
+
+use wildcity_scene::Gaussians;
+use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, scale_of};
+use wildcity_twin::store::{CommitKind, Edit};
+
+use super::change;
+use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::{output, progress};
+
+/// Put a capture on the ground: find the plane that the scene stands on, and make it level, at height 0, in metres.
+///
+/// Without --apply nothing changes: the command prints the ground that it found, and draws the twin before and after,
+/// with the ground as a grid. Look at the picture, then run the command again with --apply: that makes a new version,
+/// with the drives and the sky of the old one in the new axes. The twin's place on the earth is dropped, because it
+/// was that of the old axes. Open sessions keep the version that they have.
+///
+/// The ground is the plane with most of the scene on it and little of it below. The same twin gives the same plane.
+/// All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH degree 3, and as much for the picture.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(in crate::cli) struct Align {
+    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    /// What is up in the twin now, within 45 degrees: x, -x, y, -y, z, -z; auto tries all directions.
+    #[arg(long, value_name = "AXIS", default_value = "auto", allow_hyphen_values = true)]
+    up: Up,
+
+    /// A point of known distance to the one of --to, in the twin's axes and unit.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, requires_all = ["to", "distance_m"])]
+    from: Option<Point>,
+
+    /// The other point.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "from")]
+    to: Option<Point>,
+
+    /// Their distance, in metres.
+    #[arg(long, value_name = "M", requires = "from")]
+    distance_m: Option<f64>,
+
+    /// Metres per unit of the twin, in place of two points [default: 1]
+    #[arg(long, value_name = "M", conflicts_with = "from")]
+    scale: Option<f64>,
+
+    /// PNG file to write: above before, below after; the left is a slice from the side, the right is from above
+    /// [default: TWIN-align.png]
+    #[arg(long, value_name = "FILE")]
+    picture: Option<PathBuf>,
+
+    /// Make the new version.
+    #[arg(long)]
+    apply: bool,
+
+    /// Seed of the search.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity twin align street                                  (look at street-align.png)
+  wildcity twin align street --apply
+  wildcity twin align capture --up -y --from 0.1,0,2 --to 0.1,0,2.7 --distance-m 1.2 --apply";
+
+/// A direction that is up, or any.
+#[derive(Clone, Copy, Debug)]
+struct Up(Option<DVec3>);
+
+impl FromStr for Up {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Ok(Self(match text {
+            "auto" => None,
+            "x" => Some(DVec3::X),
+            "-x" => Some(DVec3::NEG_X),
+            "y" => Some(DVec3::Y),
+            "-y" => Some(DVec3::NEG_Y),
+            "z" => Some(DVec3::Z),
+            "-z" => Some(DVec3::NEG_Z),
+            _ => return Err("expected auto, x, -x, y, -y, z or -z".to_owned()),
+        }))
+    }
+}
+
+/// A point.
+#[derive(Clone, Copy, Debug)]
+struct Point(DVec3);
+
+impl FromStr for Point {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers: Result<Vec<f64>, _> = text.split(',').map(|n| n.trim().parse()).collect();
+        match numbers.as_deref() {
+            Ok(&[x, y, z]) if [x, y, z].iter().all(|n| n.is_finite()) => {
+                Ok(Self(DVec3::new(x, y, z)))
+            }
+            _ => Err("expected three numbers, such as 1.5,-2,0".to_owned()),
+        }
+    }
+}
+
+impl Align {
+    pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
+        let metres_per_unit = self.metres_per_unit()?;
+        let catalog = self.twins.catalog()?;
+        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        let sh_degree = base.manifest.sh_degree;
+        let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
+        catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
+
+        let search = GroundSearch { up: self.up.0, seed: self.seed, ..GroundSearch::default() };
+        let ground =
+            find_ground(&gaussians, &search).with_context(|| format!("twin {}", self.twin.name))?;
+        let alignment = Alignment::onto(&ground).scaled(metres_per_unit)?;
+        print_proposal(&ground, &alignment)?;
+
+        let picture = self.picture.clone();
+        let picture = picture.unwrap_or_else(|| format!("{}-align.png", self.twin.name).into());
+        let png = picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
+        output::write(&picture, &png)?;
+        writeln!(io::stdout().lock(), "picture {}", picture.display())?;
+        if !self.apply {
+            writeln!(io::stdout().lock(), "nothing is changed: look at it, then give --apply")?;
+            return Ok(());
+        }
+
+        let bar = progress::count("writing");
+        let edit =
+            Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
+        let version = catalog.edit(&base, edit, &mut progress::show(&bar))?;
+        bar.finish_and_clear();
+        if base.manifest.geo.is_some() {
+            let name = &self.twin.name;
+            writeln!(
+                io::stderr(),
+                "note: the version has no place on the earth, because it was that of the old axes: \
+                 `wildcity twin geo {name}` says it again"
+            )?;
+        }
+        change::print(&version, "the ground is level, at height 0")
+    }
+
+    /// The scale of the options.
+    fn metres_per_unit(&self) -> anyhow::Result<f64> {
+        match (self.from, self.to, self.distance_m) {
+            (Some(from), Some(to), Some(distance_m)) => {
+                Ok(scale_of([from.0, to.0], distance_m).context("--from, --to, --distance-m")?)
+            }
+            _ => {
+                let scale = self.scale.unwrap_or(1.0);
+                Alignment::IDENTITY.scaled(scale).context("--scale")?;
+                Ok(scale)
+            }
+        }
+    }
+}
+
+fn print_proposal(ground: &GroundPlane, alignment: &Alignment) -> anyhow::Result<()> {
+    let mut out = io::stdout().lock();
+    let DVec3 { x, y, z } = ground.up;
+    let tilt_degrees = ground.up.angle_between(DVec3::Z).to_degrees();
+    let height = -ground.up.dot(ground.point);
+    writeln!(
+        out,
+        "ground: up is ({x:.4}, {y:.4}, {z:.4}), {tilt_degrees:.2} degrees from z; the origin is {height:.3} above it"
+    )?;
+    writeln!(out, "scale: {} m per unit", alignment.metres_per_unit)?;
+    writeln!(out, "alignment {alignment}")?;
+    Ok(())
+}

@@ -1,0 +1,51 @@
+//! `wildcity twin drive`.
+
+use std::path::PathBuf;
+
+use wildcity_scene::align::Alignment;
+use wildcity_twin::store::{CommitKind, Edit};
+
+use super::change;
+use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::input_files::{read_rig, read_trajectories};
+
+/// Give a twin recorded drives and a rig: makes a new version with the same Gaussians.
+///
+/// A drive replaces the one of its name; other drives stay. Open sessions keep the version that they have.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity twin drive street --trajectory log.json
+  wildcity twin drive street --trajectory capture/capture.json --rig capture/rig.json")]
+#[command(group = clap::ArgGroup::new("what").args(["trajectory", "rig"]).required(true).multiple(true))]
+pub(in crate::cli) struct Drive {
+    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    /// JSON file of a drive, in the twin's axes and metres, as `wildcity import --help` shows it. May be given again.
+    #[arg(long, value_name = "FILE")]
+    trajectory: Vec<PathBuf>,
+
+    /// JSON file of the vehicle's cameras.
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+impl Drive {
+    pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
+        let trajectories = read_trajectories(&self.trajectory)?;
+        let rig = self.rig.as_deref().map(read_rig).transpose()?;
+        let catalog = self.twins.catalog()?;
+        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        let alignment = Alignment::IDENTITY;
+        let edit = Edit { alignment, trajectories, rig, kind: CommitKind::Import };
+        let version = catalog.edit(&base, edit, &mut |_, _| {})?;
+        let names: Vec<&str> =
+            version.manifest.trajectories.iter().map(|drive| drive.name.as_str()).collect();
+        change::print(&version, &format!("drives {}", names.join(", ")))
+    }
+}

@@ -1,0 +1,232 @@
+//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig. What a person places with the
+//! mouse.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use wildcity_scene::align::{
+    Alignment, AlignmentError, GroundPlane, GroundSearch, PathError, SceneExtent, drive_through,
+    find_ground, plane_through, scale_of, scene_extent,
+};
+use wildcity_scene::{Gaussians, Rig};
+use wildcity_session::Engine;
+use wildcity_twin::store::{CommitKind, Edit};
+
+use crate::blocking::run_blocking;
+use crate::error::PushError;
+use crate::limits;
+use crate::publish::{Viewpoints, pin_latest, preload};
+use crate::queue::PushQueue;
+use crate::status::PushedVersion;
+
+/// What an edit asks for. Points are in the axes and the unit of the base.
+#[derive(Clone, Debug)]
+pub struct EditRequest {
+    /// Name of the twin.
+    pub twin: String,
+    /// The version that is edited; the latest if there is none.
+    pub base: Option<u64>,
+    /// Three points of the ground, and one above it.
+    pub ground: Option<([DVec3; 3], DVec3)>,
+    /// Two points, and their distance in metres.
+    pub scale: Option<([DVec3; 2], f64)>,
+    /// A drive through points.
+    pub drive: Option<DriveRequest>,
+    /// The rig of the new version.
+    pub rig: Option<Rig>,
+}
+
+/// A drive through points.
+#[derive(Clone, Debug)]
+pub struct DriveRequest {
+    /// Its name.
+    pub name: String,
+    /// The points.
+    pub points: Vec<DVec3>,
+    /// Its speed, in m/s.
+    pub speed_m_s: f64,
+}
+
+impl EditRequest {
+    /// The edit of the store.
+    ///
+    /// # Errors
+    /// Names the field that cannot be used, and what must hold instead.
+    pub fn edit(&self) -> Result<Edit, PushError> {
+        let Self { ground, scale, drive, rig, .. } = self;
+        let is_empty = ground.is_none() && scale.is_none() && drive.is_none() && rig.is_none();
+        if is_empty {
+            return Err(PushError::InvalidField {
+                field: "ground".to_owned(),
+                reason: "nothing is edited: give ground, scale, drive or rig".to_owned(),
+            });
+        }
+        let mut alignment = Alignment::IDENTITY;
+        if let Some((points, above)) = *ground {
+            let plane = plane_through(points, above).map_err(of_alignment("ground.points"))?;
+            alignment = Alignment::onto(&plane);
+        }
+        if let Some((points, distance_m)) = *scale {
+            let metres = scale_of(points, distance_m).map_err(of_alignment("scale"))?;
+            alignment = alignment.scaled(metres).map_err(of_alignment("scale"))?;
+        }
+        let trajectories = match drive {
+            None => Vec::new(),
+            Some(DriveRequest { name, points, speed_m_s }) => {
+                let points_m: Vec<DVec3> = points.iter().map(|&p| alignment.point_m(p)).collect();
+                vec![drive_through(name, &points_m, *speed_m_s).map_err(of_path)?]
+            }
+        };
+        Ok(Edit { alignment, trajectories, rig: rig.clone(), kind: CommitKind::Push })
+    }
+}
+
+fn of_alignment(field: &'static str) -> impl Fn(AlignmentError) -> PushError {
+    move |error| PushError::InvalidField { field: field.to_owned(), reason: error.to_string() }
+}
+
+fn of_path(error: PathError) -> PushError {
+    let field = match error {
+        PathError::Points { .. } | PathError::Length { .. } => "drive.points".to_owned(),
+        PathError::Place { index } => format!("drive.points[{index}]"),
+        PathError::Speed(_) => "drive.speed".to_owned(),
+        PathError::Name(name) => return PushError::InvalidName { field: "drive.name", name },
+    };
+    PushError::InvalidField { field, reason: error.to_string() }
+}
+
+/// Makes the version in the twin's turn among its pushes, and loads what sessions see before it is the latest.
+///
+/// # Errors
+/// The request cannot be used; [`wildcity_twin::store::StoreError::Overlap`]; or as a commit.
+pub async fn publish_edit(
+    engine: &Arc<Engine>,
+    queue: &PushQueue,
+    request: EditRequest,
+    viewpoints: Viewpoints<'_>,
+) -> Result<PushedVersion, PushError> {
+    let edit = request.edit()?;
+    let twin = request.twin;
+    let catalog = engine.catalog().clone();
+    let base = {
+        let twin = twin.clone();
+        run_blocking(move || Ok(catalog.version(&twin, request.base)?)).await?
+    };
+    let needed =
+        if edit.alignment == Alignment::IDENTITY { 0 } else { base.manifest.stored_bytes() };
+    let turn = queue.turn(&twin, needed).await?;
+    let (version, held) = {
+        let engine = engine.clone();
+        let twin = twin.clone();
+        run_blocking(move || {
+            let _turn = turn;
+            let held = pin_latest(&engine, &twin)?;
+            let version = engine.catalog().edit(&base, edit, &mut |_, _| {})?;
+            Ok((version, held))
+        })
+        .await?
+    };
+    tracing::info!(twin, version = version.number, "edited");
+    preload(engine, &twin, version.number, viewpoints(&twin)).await;
+    drop(held);
+    Ok(PushedVersion { number: version.number, hash: version.hash })
+}
+
+/// What is known of a version before it is edited.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Survey {
+    /// Number of the version.
+    pub version: u64,
+    /// Where most of the scene is.
+    pub extent: SceneExtent,
+    /// The ground that [`find_ground`] proposes, if it finds one.
+    pub ground: Option<GroundPlane>,
+}
+
+/// Looks for the ground of a version: of all its Gaussians, or of [`limits::SURVEYED_GAUSSIANS`] of them.
+///
+/// # Errors
+/// The version cannot be read.
+pub async fn survey(
+    engine: &Arc<Engine>,
+    queue: &PushQueue,
+    twin: String,
+    version: Option<u64>,
+) -> Result<Survey, PushError> {
+    // One at a time for each twin, as its pushes.
+    let turn = queue.turn(&twin, 0).await?;
+    let catalog = engine.catalog().clone();
+    run_blocking(move || {
+        let _turn = turn;
+        let version = catalog.version(&twin, version)?;
+        let stride =
+            version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;
+        let sh_degree = version.manifest.sh_degree;
+        let mut some = Gaussians { sh_degree, ..Gaussians::default() };
+        catalog.visit_full_detail(&version, &|_| true, &mut |section| {
+            some.append(&section.select((0..section.len()).step_by(stride)));
+        })?;
+        let ground = find_ground(&some, &GroundSearch::default()).ok();
+        Ok(Survey { version: version.number, extent: scene_extent(&some), ground })
+    })
+    .await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn request() -> EditRequest {
+        let triangle = [DVec3::ZERO, DVec3::X, DVec3::Y];
+        EditRequest {
+            twin: "street".to_owned(),
+            base: None,
+            ground: Some((triangle.map(|p| p - 2.0 * DVec3::Z), DVec3::NEG_Z * 9.0)),
+            scale: Some(([DVec3::ZERO, 2.0 * DVec3::X], 8.0)),
+            drive: Some(DriveRequest {
+                name: "path".to_owned(),
+                points: vec![DVec3::new(0.0, 0.0, -2.0), DVec3::new(5.0, 0.0, -2.0)],
+                speed_m_s: 5.0,
+            }),
+            rig: None,
+        }
+    }
+
+    #[test]
+    fn the_drive_is_on_the_new_ground_in_metres() {
+        let edit = request().edit().unwrap();
+        let keyframes = &edit.trajectories[0].keyframes;
+        let last = keyframes[keyframes.len() - 1].world_from_rig.position_m;
+        assert!(last.z.abs() < 1e-9 && (last.length() - 20.0).abs() < 1e-9, "{last}");
+        assert!((edit.alignment.point_m(DVec3::new(0.0, 0.0, -3.0)).z - 4.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn what_cannot_be_used_is_named() {
+        let refused = |change: &dyn Fn(&mut EditRequest)| {
+            let mut changed = request();
+            change(&mut changed);
+            changed.edit().unwrap_err().to_string()
+        };
+        let line = [DVec3::ZERO, DVec3::X, 2.0 * DVec3::X];
+        let on_line = refused(&|request| request.ground = Some((line, DVec3::Z)));
+        assert!(on_line.starts_with("ground.points: "), "{on_line}");
+        let distance = refused(&|request| request.scale = Some(([DVec3::ZERO, DVec3::X], 0.0)));
+        assert!(distance.starts_with("scale: "), "{distance}");
+        let speed = refused(&|request| request.drive.as_mut().unwrap().speed_m_s = 0.0);
+        assert!(speed.starts_with("drive.speed: "), "{speed}");
+        let name = refused(&|request| request.drive.as_mut().unwrap().name = "../x".to_owned());
+        assert!(name.contains("\"../x\""), "{name}");
+        let nothing = refused(&|request| {
+            *request = EditRequest {
+                ground: None,
+                scale: None,
+                drive: None,
+                rig: None,
+                ..request.clone()
+            };
+        });
+        assert!(nothing.contains("nothing is edited"), "{nothing}");
+    }
+}

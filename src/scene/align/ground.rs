@@ -1,0 +1,356 @@
+//! The ground of a scene whose axes are unknown: the plane that most of the scene lies on and little lies below.
+//!
+//! RANSAC (Fischler and Bolles 1981) over one Gaussian for each occupied cube of a grid, so that a plane counts by its
+//! area and not by how densely it was captured. All lengths are relative to the size of the scene: a capture has no
+//! metres yet. The random numbers have a fixed seed: the same Gaussians give the same plane.
+
+use std::collections::HashSet;
+
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::Gaussians;
+use crate::random::Random;
+
+/// A plane, and which of its sides is up.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroundPlane {
+    /// A point of it, in the unit of the scene.
+    pub point: DVec3,
+    /// Its unit normal.
+    pub up: DVec3,
+}
+
+/// How the ground is searched.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroundSearch {
+    /// Up, as far as it is known: the normal of the ground is within 45 degrees of it.
+    pub up: Option<DVec3>,
+    /// Number of planes that are tried.
+    pub hypotheses: usize,
+    /// Seed of the random numbers.
+    pub seed: u64,
+}
+
+/// Why there is no ground.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum GroundError {
+    /// Too little of the scene is visible.
+    #[error("{count} places of the scene are opaque; at least {least} are needed to find a plane")]
+    TooFew {
+        /// Occupied cubes.
+        count: usize,
+        /// The least number.
+        least: usize,
+    },
+    /// No plane has enough of the scene on it.
+    #[error(
+        "no plane has {least_percent} % of the scene on it and little of it below; give the direction of up, or \
+         three points of the ground"
+    )]
+    NoPlane {
+        /// Least share of the scene, in percent.
+        least_percent: u32,
+    },
+}
+
+/// Cubes along the scene's radius.
+const CUBES: f64 = 120.0;
+/// Distance from the plane that counts as on it at first, as a share of the scene's radius.
+const TOLERANCE: f64 = 0.01;
+/// How often the tolerance is halved while the plane is fitted, at most.
+const REFINEMENTS: i32 = 5;
+/// Share of the first round's places that a round must have: below it the tolerance is less than the ground is rough.
+const LEAST_SHARE: f64 = 0.2;
+/// Gaussians with less opacity before the sigmoid do not count: 0.3 after it.
+const LEAST_LOGIT: f32 = -0.85;
+/// A Gaussian is flat if its thinnest axis has at most this share of the middle one: `ln 0.4`.
+const FLAT_LN: f32 = -0.92;
+/// Least cosine between the normals of the plane and of a flat Gaussian on it.
+const LEAST_COSINE: f64 = 0.8;
+/// Most places that hypotheses are compared with.
+const COMPARED: usize = 12_000;
+const LEAST_PLACES: usize = 50;
+const LEAST_PERCENT: u32 = 4;
+
+impl Default for GroundSearch {
+    fn default() -> Self {
+        Self { up: None, hypotheses: 3_000, seed: 1 }
+    }
+}
+
+/// A visible place of the scene.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    at: DVec3,
+    /// Unit normal of its Gaussian, if that is flat.
+    normal: Option<DVec3>,
+}
+
+/// Where most of a scene is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SceneExtent {
+    /// Median of the opaque Gaussians' means, by axis.
+    pub middle: DVec3,
+    /// Median distance of them from the middle: half of the scene is nearer.
+    pub radius: f64,
+}
+
+/// Where most of a scene is; at the origin, with a radius of 0, if nothing is opaque.
+pub fn scene_extent(gaussians: &Gaussians) -> SceneExtent {
+    extent(gaussians, &opaque(gaussians))
+}
+
+fn opaque(gaussians: &Gaussians) -> Vec<usize> {
+    (0..gaussians.len()).filter(|&i| gaussians.logit_opacities[i] >= LEAST_LOGIT).collect()
+}
+
+/// Finds the ground.
+///
+/// # Errors
+/// There are too few opaque Gaussians, or no plane has enough of them on it.
+pub fn find_ground(
+    gaussians: &Gaussians,
+    search: &GroundSearch,
+) -> Result<GroundPlane, GroundError> {
+    let opaque = opaque(gaussians);
+    let radius = extent(gaussians, &opaque).radius;
+    let places = places(gaussians, &opaque, radius / CUBES);
+    if places.len() < LEAST_PLACES || radius <= 0.0 {
+        return Err(GroundError::TooFew { count: places.len(), least: LEAST_PLACES });
+    }
+    let tolerance = TOLERANCE * radius;
+    let stride = places.len().div_ceil(COMPARED);
+    let compared: Vec<Place> = places.iter().copied().step_by(stride).collect();
+    let mut random = Random::new(search.seed, "ground", 0);
+    let mut best: Option<(f64, GroundPlane)> = None;
+    for at in 0..search.hypotheses {
+        let Some(plane) = hypothesis(&compared, at, &mut random) else { continue };
+        let (score, plane) = judge(&compared, plane, tolerance);
+        let is_wanted = search.up.is_none_or(|up| plane.up.dot(up.normalize_or_zero()) > 0.7);
+        if is_wanted && best.is_none_or(|(most, _)| score > most) {
+            best = Some((score, plane));
+        }
+    }
+    let least = f64::from(LEAST_PERCENT) / 100.0 * compared.len() as f64;
+    match best {
+        Some((score, plane)) if score >= least => Ok(refine(&places, plane, tolerance)),
+        _ => Err(GroundError::NoPlane { least_percent: LEAST_PERCENT }),
+    }
+}
+
+fn extent(gaussians: &Gaussians, opaque: &[usize]) -> SceneExtent {
+    if opaque.is_empty() {
+        return SceneExtent { middle: DVec3::ZERO, radius: 0.0 };
+    }
+    let axis = |axis: usize| median(opaque.iter().map(|&i| gaussians.means_m[i][axis]).collect());
+    let middle = DVec3::new(axis(0), axis(1), axis(2));
+    let distance = |&i: &usize| DVec3::from_array(gaussians.means_m[i]).distance(middle);
+    SceneExtent { middle, radius: median(opaque.iter().map(distance).collect()) }
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
+/// The first Gaussian of each occupied cube, in the order of the Gaussians.
+fn places(gaussians: &Gaussians, opaque: &[usize], cube: f64) -> Vec<Place> {
+    let mut taken = HashSet::new();
+    let mut places = Vec::new();
+    for &i in opaque {
+        let at = DVec3::from_array(gaussians.means_m[i]);
+        let key = (at / cube.max(f64::MIN_POSITIVE)).floor().as_i64vec3();
+        if taken.insert(key) {
+            places.push(Place { at, normal: normal(gaussians, i) });
+        }
+    }
+    places
+}
+
+/// The thinnest axis of a flat Gaussian.
+fn normal(gaussians: &Gaussians, i: usize) -> Option<DVec3> {
+    let scales = gaussians.ln_scales[i];
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| scales[a].total_cmp(&scales[b]));
+    let is_flat = scales[order[0]] - scales[order[1]] <= FLAT_LN;
+    let [w, x, y, z] = gaussians.quats_wxyz[i].map(f64::from);
+    let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
+    is_flat.then(|| rotation * DVec3::AXES[order[0]])
+}
+
+/// A plane through three random places, or through one along its Gaussian.
+fn hypothesis(places: &[Place], at: usize, random: &mut Random) -> Option<GroundPlane> {
+    let mut pick = || places[random.below(places.len())];
+    let [a, b, c] = [pick(), pick(), pick()];
+    if at % 2 == 0 {
+        return a.normal.map(|up| GroundPlane { point: a.at, up });
+    }
+    let up = (b.at - a.at).cross(c.at - a.at).try_normalize()?;
+    Some(GroundPlane { point: a.at, up })
+}
+
+/// Counts places on the plane, less those below it; up is the side with more of the scene.
+fn judge(places: &[Place], plane: GroundPlane, tolerance: f64) -> (f64, GroundPlane) {
+    let mut on = 0.0;
+    let mut above = 0.0_f64;
+    let mut below = 0.0_f64;
+    for place in places {
+        let height = plane.up.dot(place.at - plane.point);
+        if height.abs() <= tolerance {
+            on += match place.normal {
+                Some(normal) if normal.dot(plane.up).abs() >= LEAST_COSINE => 1.0,
+                Some(_) => 0.0,
+                // A round Gaussian says nothing about the direction of its surface.
+                None => 0.5,
+            };
+        } else if height > 3.0 * tolerance {
+            above += 1.0;
+        } else if height < -3.0 * tolerance {
+            below += 1.0;
+        }
+    }
+    let up = if below > above { -plane.up } else { plane.up };
+    (on - above.min(below), GroundPlane { up, ..plane })
+}
+
+/// Fits the plane with a falling tolerance. Each round first moves the plane to the height that has most of the places
+/// near it: a road beside pavements and lawns is not the mean of the three.
+fn refine(places: &[Place], mut plane: GroundPlane, tolerance: f64) -> GroundPlane {
+    let mut first = 0;
+    for round in 0..=REFINEMENTS {
+        let tolerance = tolerance * 0.5_f64.powi(round);
+        let near = |plane: &GroundPlane, reach: f64| -> Vec<DVec3> {
+            let is_near = |place: &&Place| {
+                let is_level = place.normal.is_none_or(|n| n.dot(plane.up).abs() >= LEAST_COSINE);
+                is_level && plane.up.dot(place.at - plane.point).abs() <= reach
+            };
+            places.iter().filter(is_near).map(|place| place.at).collect()
+        };
+        let heights: Vec<f64> = near(&plane, 2.0 * tolerance)
+            .iter()
+            .map(|at| plane.up.dot(*at - plane.point))
+            .collect();
+        let mut moved = plane;
+        if let Some(height) = densest(heights, 0.5 * tolerance) {
+            moved.point += height * plane.up;
+        }
+        let on = near(&moved, tolerance);
+        first = first.max(on.len());
+        let is_rough = (on.len() as f64) < LEAST_SHARE * first as f64;
+        if is_rough {
+            break;
+        }
+        plane = fit(&on).map_or(moved, |fitted| {
+            let up = if fitted.up.dot(plane.up) < 0.0 { -fitted.up } else { fitted.up };
+            GroundPlane { up, ..fitted }
+        });
+    }
+    plane
+}
+
+/// Middle of the window of this width with the most values.
+fn densest(mut heights: Vec<f64>, width: f64) -> Option<f64> {
+    heights.sort_by(f64::total_cmp);
+    let mut best = (0, 0);
+    let mut from = 0;
+    for to in 0..heights.len() {
+        while heights[to] - heights[from] > width {
+            from += 1;
+        }
+        if to + 1 - from > best.1 - best.0 {
+            best = (from, to + 1);
+        }
+    }
+    let window = &heights[best.0..best.1];
+    (!window.is_empty()).then(|| window[window.len() / 2])
+}
+
+/// The plane with the least squares of distances: through the mean, normal to the two main axes of the points.
+fn fit(points: &[DVec3]) -> Option<GroundPlane> {
+    if points.len() < 3 {
+        return None;
+    }
+    let mean = points.iter().sum::<DVec3>() / points.len() as f64;
+    let covariance = points.iter().fold(DMat3::ZERO, |sum, &point| {
+        let d = point - mean;
+        sum + DMat3::from_cols(d * d.x, d * d.y, d * d.z)
+    });
+    // The eigenvector of the smallest eigenvalue: power iteration on the adjugate, whose largest eigenvalue belongs
+    // to it. The adjugate of a symmetric matrix with columns a, b, c has the columns b x c, c x a, a x b.
+    let scale = covariance.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
+    let [a, b, c] = [covariance.x_axis, covariance.y_axis, covariance.z_axis].map(|v| v / scale);
+    let mut adjugate = DMat3::from_cols(b.cross(c), c.cross(a), a.cross(b));
+    for _ in 0..12 {
+        let norm = adjugate.to_cols_array().iter().fold(0.0_f64, |most, e| most.max(e.abs()));
+        if !(norm > 0.0 && norm.is_finite()) {
+            return None;
+        }
+        adjugate *= 1.0 / norm;
+        adjugate = adjugate * adjugate;
+    }
+    let columns = [adjugate.x_axis, adjugate.y_axis, adjugate.z_axis];
+    let longest = columns.into_iter().max_by(|a, b| a.length().total_cmp(&b.length()))?;
+    longest.try_normalize().map(|up| GroundPlane { point: mean, up })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A tilted floor with a wall behind it, and round noise above.
+    fn room(count: usize) -> (Gaussians, GroundPlane) {
+        let rotation = DQuat::from_xyzw(0.4, -0.2, 0.6, 0.5).normalize();
+        let mut random = Random::new(7, "room", 0);
+        let mut gaussians = Gaussians::with_capacity(0, count);
+        for i in 0..count {
+            let (x, y) = (random.range(-5.0, 5.0), random.range(-5.0, 5.0));
+            let (at, turn) = match i % 10 {
+                0..=5 => (DVec3::new(x, y, random.range(-0.01, 0.01)), DQuat::IDENTITY),
+                6..=7 => (DVec3::new(5.0, y, 0.3 * (x + 5.0)), DQuat::from_rotation_y(1.57)),
+                _ => (DVec3::new(x, y, random.range(0.0, 3.0)), DQuat::IDENTITY),
+            };
+            let thin = if i % 10 < 8 { -6.0 } else { -3.0 };
+            let q = rotation * turn;
+            gaussians.means_m.push((rotation * at + DVec3::new(20.0, 3.0, -7.0)).to_array());
+            gaussians.quats_wxyz.push([q.w, q.x, q.y, q.z].map(|q| q as f32));
+            gaussians.ln_scales.push([-3.0, -3.0, thin]);
+            gaussians.logit_opacities.push(3.0);
+            gaussians.sh.extend([0.0; 3]);
+        }
+        (gaussians, GroundPlane { point: DVec3::new(20.0, 3.0, -7.0), up: rotation * DVec3::Z })
+    }
+
+    #[test]
+    fn a_tilted_floor_is_found_and_always_the_same() {
+        let (gaussians, wanted) = room(20_000);
+        let found = find_ground(&gaussians, &GroundSearch::default()).unwrap();
+        assert!(found.up.angle_between(wanted.up).to_degrees() < 0.1, "{found:?}");
+        // The floor is rough by 1 cm.
+        assert!(found.up.dot(wanted.point - found.point).abs() < 0.01, "{found:?}");
+        assert_eq!(find_ground(&gaussians, &GroundSearch::default()).unwrap(), found);
+    }
+
+    #[test]
+    fn a_known_up_keeps_the_wall_from_being_the_ground() {
+        let (gaussians, floor) = room(20_000);
+        let across = floor.up.any_orthonormal_vector();
+        let found =
+            find_ground(&gaussians, &GroundSearch { up: Some(across), ..GroundSearch::default() });
+        assert!(found.is_err() || found.unwrap().up.dot(across) > 0.7);
+    }
+
+    #[test]
+    fn an_empty_scene_and_a_ball_have_no_ground() {
+        let none = find_ground(&Gaussians::default(), &GroundSearch::default());
+        assert!(matches!(none, Err(GroundError::TooFew { count: 0, .. })), "{none:?}");
+        let (mut ball, _) = room(5_000);
+        let mut random = Random::new(3, "ball", 0);
+        for (mean, quat) in ball.means_m.iter_mut().zip(&mut ball.quats_wxyz) {
+            let mut next = || random.range(-1.0, 1.0);
+            *mean = (DVec3::new(next(), next(), next()).normalize() * 4.0).to_array();
+            *quat = [next(), next(), next(), next()].map(|q| q as f32);
+        }
+        let found = find_ground(&ball, &GroundSearch::default());
+        assert!(matches!(found, Err(GroundError::NoPlane { .. })), "{found:?}");
+    }
+}

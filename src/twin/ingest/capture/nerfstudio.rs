@@ -1,0 +1,172 @@
+//! transforms.json of nerfstudio and instant-ngp.
+//!
+//! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards. Intrinsics are of the file or of a
+//! frame, which overrides the file's (nerfstudio's data conventions; instant-ngp's docs/nerf_dataset_tips.md).
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use glam::{DMat3, DVec3};
+use serde::Deserialize;
+use serde_json::Value;
+
+use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
+use wildcity_scene::geometry::{Camera, Pose};
+
+use super::{CaptureError, Place, PosedImage, rotation_of};
+use crate::ingest::file::read_whole;
+use crate::limits;
+
+/// The file; fields that are not listed are ignored.
+#[derive(Deserialize)]
+struct Transforms {
+    frames: Vec<Frame>,
+    #[serde(flatten)]
+    intrinsics: Intrinsics,
+}
+
+#[derive(Deserialize)]
+struct Frame {
+    file_path: String,
+    transform_matrix: Vec<Vec<f64>>,
+    #[serde(flatten)]
+    intrinsics: Intrinsics,
+}
+
+/// Numbers of a camera, by their names in the file.
+#[derive(Clone, Default, Deserialize)]
+#[serde(transparent)]
+struct Intrinsics(BTreeMap<String, Value>);
+
+/// Reads the file, or the one in a folder.
+///
+/// # Errors
+/// The error names the file, the line or the field, and what to do.
+pub fn read(path: &Path) -> Result<Vec<PosedImage>, CaptureError> {
+    let inside = path.join("transforms.json");
+    let path = if path.is_dir() { inside.as_path() } else { path };
+    let text = read_whole(path, limits::CAPTURE_BYTES)
+        .map_err(|cause| CaptureError::File { path: path.to_owned(), cause })?;
+    let file: Transforms = serde_json::from_slice(&text).map_err(|error| {
+        let reason = format!(
+            "{error}; expected {{\"fl_x\", \"cx\", .., \"frames\": [{{\"file_path\", \"transform_matrix\"}}]}}"
+        );
+        CaptureError::at(path, Place::Line(error.line().max(1)), reason)
+    })?;
+    if file.frames.is_empty() {
+        let place = Place::Field("frames".to_owned());
+        return Err(CaptureError::at(path, place, "there is no frame: give a file with frames"));
+    }
+    let frames = file.frames.into_iter().enumerate();
+    frames.map(|(index, frame)| posed(path, index, frame, &file.intrinsics)).collect()
+}
+
+fn posed(
+    path: &Path,
+    index: usize,
+    frame: Frame,
+    shared: &Intrinsics,
+) -> Result<PosedImage, CaptureError> {
+    let at = |field: &str| Place::Field(format!("frames[{index}].{field}"));
+    let wrong = |field: &str, reason: String| CaptureError::at(path, at(field), reason);
+    let matrix = |reason: &str| wrong("transform_matrix", reason.to_owned());
+    let rows = &frame.transform_matrix;
+    let is_matrix = (3..=4).contains(&rows.len()) && rows.iter().all(|row| row.len() == 4);
+    if !is_matrix {
+        return Err(matrix("expected 4 rows of 4 numbers: world_from_camera"));
+    }
+    let row = |at: usize| DVec3::new(rows[at][0], rows[at][1], rows[at][2]);
+    let world_from_opengl = DMat3::from_cols(row(0), row(1), row(2)).transpose();
+    let rotation =
+        rotation_of(world_from_opengl * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
+    let Some(rotation) = rotation else {
+        return Err(matrix(
+            "the left 3 x 3 numbers are not a rotation: rows must have length 1, at right angles, without a \
+             mirror; write the poses without a scale",
+        ));
+    };
+    let q_wxyz = [rotation.w, rotation.x, rotation.y, rotation.z];
+    let position = [rows[0][3], rows[1][3], rows[2][3]];
+    let world_from_camera =
+        Pose::checked(position, q_wxyz).map_err(|cause| matrix(&cause.to_string()))?;
+    let mut intrinsics = shared.clone();
+    intrinsics.0.extend(frame.intrinsics.0);
+    let camera = intrinsics.camera();
+    let camera = camera.map_err(|Wrong { field, reason }| wrong(field, reason))?;
+    Ok(PosedImage { name: frame.file_path, camera, world_from_camera })
+}
+
+/// A field that cannot be used.
+struct Wrong {
+    field: &'static str,
+    reason: String,
+}
+
+impl Intrinsics {
+    fn camera(&self) -> Result<Camera, Wrong> {
+        let width = self.side("w")?;
+        let height = self.side("h")?;
+        let fx = match self.number("fl_x")? {
+            Some(fx) => fx,
+            None => match self.number("camera_angle_x")? {
+                Some(angle_rad) => 0.5 * f64::from(width) / (0.5 * angle_rad).tan(),
+                None => {
+                    let reason = "is missing, and camera_angle_x too: add it to the frame or to the file, in pixels";
+                    return Err(Wrong { field: "fl_x", reason: reason.to_owned() });
+                }
+            },
+        };
+        let fy = self.number("fl_y")?.unwrap_or(fx);
+        let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
+        let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
+        let or_zero = |name| self.number(name).map(Option::unwrap_or_default);
+        let k = [or_zero("k1")?, or_zero("k2")?, or_zero("k3")?, or_zero("k4")?];
+        let p = [or_zero("p1")?, or_zero("p2")?];
+        let lens = match self.0.get("camera_model").and_then(Value::as_str) {
+            Some("OPENCV_FISHEYE") => Lens::Fisheye(Fisheye::new(k, None)),
+            None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "perspective") => {
+                let [k1, k2, k3, k4] = k;
+                Lens::opencv(OpenCv::new([k1, k2, k3, k4, 0.0, 0.0], p, [0.0; 4]))
+            }
+            Some(other) => {
+                let reason = format!(
+                    "is {other:?}; OPENCV, PINHOLE and OPENCV_FISHEYE can be read: undistort the images"
+                );
+                return Err(Wrong { field: "camera_model", reason });
+            }
+        };
+        let camera = Camera {
+            width_px: width,
+            height_px: height,
+            pinhole: Pinhole { fx, fy, cx, cy },
+            lens,
+            windshield: None,
+            native_size_px: None,
+        };
+        let checked = camera.check();
+        checked.map_err(|cause| Wrong { field: "intrinsics", reason: cause.to_string() })?;
+        Ok(camera)
+    }
+
+    fn number(&self, field: &'static str) -> Result<Option<f64>, Wrong> {
+        match self.0.get(field) {
+            None | Some(Value::Null) => Ok(None),
+            Some(value) => match value.as_f64() {
+                Some(number) => Ok(Some(number)),
+                None => Err(Wrong { field, reason: format!("is {value}, not a number") }),
+            },
+        }
+    }
+
+    fn side(&self, field: &'static str) -> Result<u32, Wrong> {
+        let side = self.number(field)?;
+        let usable = side.filter(|side| side.fract() == 0.0 && (1.0..=1e6).contains(side));
+        usable.map(|side| side as u32).ok_or_else(|| {
+            let given = side.map_or("is missing".to_owned(), |side| format!("is {side:?}"));
+            let reason = format!(
+                "{given}: add the size of the images to the frame or to the file, in pixels"
+            );
+            Wrong { field, reason }
+        })
+    }
+}

@@ -1,0 +1,86 @@
+//! Editing a version: other axes and unit, other drives, another rig. The Gaussians are otherwise the same.
+
+use glam::DMat3;
+
+use wildcity_scene::align::Alignment;
+use wildcity_scene::manifest::SkyRef;
+use wildcity_scene::{Gaussians, Rig, Trajectory};
+
+use super::log::CommitKind;
+use super::pack::StorageOptions;
+use super::settings::{VersionChange, VersionSettings};
+use super::sky::NewSky;
+use super::{Catalog, StoreError, Version};
+
+/// What an edit changes.
+#[derive(Clone, Debug)]
+pub struct Edit {
+    /// Turns, moves and scales the Gaussians, the drives and the sky; the identity leaves the stored bytes as they are.
+    pub alignment: Alignment,
+    /// Drives in the new axes. A drive replaces the one of its name.
+    pub trajectories: Vec<Trajectory>,
+    /// The rig in metres; the base's stays if there is none.
+    pub rig: Option<Rig>,
+    /// How the version is made, for the log.
+    pub kind: CommitKind,
+}
+
+impl Catalog {
+    /// Makes a version with the Gaussians of another one in other axes and another unit, and with other drives.
+    ///
+    /// The rig stays as it is, since it is in metres of the vehicle, and so does the profile. A place on the earth is
+    /// of the old axes, and is dropped if they change. All Gaussians are in memory at once. `progress` gets the number
+    /// of Gaussians written and in all.
+    ///
+    /// # Errors
+    /// The base cannot be read; what the edit makes is out of a twin's bounds; others changed the twin since the base
+    /// ([`StoreError::Overlap`]); or as a commit.
+    pub fn edit(
+        &self,
+        base: &Version,
+        edit: Edit,
+        progress: &mut dyn FnMut(u64, u64),
+    ) -> Result<Version, StoreError> {
+        let Edit { alignment, trajectories: new, rig, kind } = edit;
+        let manifest = &base.manifest;
+        let mut provenance = manifest.provenance.clone();
+        let is_aligned = alignment != Alignment::IDENTITY;
+        let mut trajectories = manifest.trajectories.clone();
+        if is_aligned {
+            provenance.options.push(format!("align={alignment}"));
+            trajectories = trajectories.iter().map(|drive| alignment.drive(drive)).collect();
+        }
+        let is_kept = |drive: &Trajectory| new.iter().all(|other| other.name != drive.name);
+        trajectories.retain(is_kept);
+        trajectories.extend(new);
+        let levels = manifest.chunks.iter().flat_map(|chunk| &chunk.sections).any(|s| s.level > 0);
+        let storage = StorageOptions { record: manifest.record, levels };
+        let mut commit = self.begin(&manifest.twin, kind, storage)?;
+        if !is_aligned {
+            let trajectories = Some(trajectories);
+            let change = VersionChange { trajectories, rig, ..VersionChange::none(provenance) };
+            return commit.change(base.number, change);
+        }
+
+        let mut gaussians = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
+        self.visit_full_detail(base, &|_| true, &mut |section| gaussians.append(&section))?;
+        alignment.apply(&mut gaussians);
+        commit.put(&gaussians, None, progress)?;
+        let settings = VersionSettings {
+            profile: manifest.profile,
+            rig: rig.or_else(|| manifest.rig.clone()),
+            trajectories,
+            sky: manifest.sky.as_ref().map(|sky| NewSky::Kept(turned(sky, &alignment))),
+            geo: None,
+            provenance,
+        };
+        commit.replace(Some(base.number), settings)
+    }
+}
+
+/// The sky after the world was turned.
+fn turned(sky: &SkyRef, alignment: &Alignment) -> SkyRef {
+    let rows = DMat3::from_cols_array_2d(&sky.sky_from_world).transpose();
+    let turned = rows * alignment.old_from_new();
+    SkyRef { sky_from_world: turned.transpose().to_cols_array_2d(), ..sky.clone() }
+}
