@@ -16,4 +16,5 @@ mod repair_replay;
 pub(crate) mod repairs;
 pub(crate) mod replay;
 pub(crate) mod replay_report;
+mod sensor_replay;
 mod values;
