@@ -198,8 +198,8 @@ impl Episode {
         // of the warm-up, so it keeps all of that.
         let time_us = next.time_us();
         let plan_us = time_us - self.time_us();
-        let reach_us = next.reach_us()
-            + (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
+        let reach_us =
+            next.reach_us() + (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
         while next.track.len() > 2 && next.track[1].time_us <= time_us - reach_us {
             next.track.pop_front();
         }

@@ -56,12 +56,13 @@ pub use options::{
     ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice,
     ScenarioOptions, SessionOptions, Start, StepOptions,
 };
+pub use record::command::RecordedCommand;
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
 pub use record::error::RecordError;
 pub use record::format::{
-    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOrigin, RecordedOutputs,
-    RecordedSettings, RecordedVersion, is_episode_name,
+    EpisodeHeader, FrameRecord, FrameRequest, RecordedOrigin, RecordedOutputs, RecordedSettings,
+    RecordedVersion, is_episode_name,
 };
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::repairs::{RecordedImageRepair, RecordedRepair};

@@ -153,16 +153,22 @@ async fn every_effect_occurs_and_every_image_says_what_was_done_to_it() {
     let mut last: [Option<(i64, String)>; 2] = [None, None];
     for one in &seen {
         let now_us = one.meta["time_us"].as_i64().unwrap();
-        let order: Vec<_> = one.meta["images"].as_array().unwrap().iter().map(|i| i["index"].as_u64()).collect();
+        let order: Vec<_> =
+            one.meta["images"].as_array().unwrap().iter().map(|i| i["index"].as_u64()).collect();
         assert!(order.is_sorted(), "{order:?}");
         for image in images(one) {
             let sensor = &image["sensor"];
-            let told: Vec<&str> =
-                sensor["reasons"].as_array().unwrap().iter().map(|one| one.as_str().unwrap()).collect();
+            let told: Vec<&str> = sensor["reasons"]
+                .as_array()
+                .unwrap()
+                .iter()
+                .map(|one| one.as_str().unwrap())
+                .collect();
             assert_eq!(sensor["status"], "degraded", "there is always noise");
             assert!(sensor["stops"].is_f64() && sensor["clean_hash"] != image["hash"]);
             reasons.extend(told.iter().map(|one| (*one).to_owned()));
-            let [due_us, taken_us] = ["due_us", "taken_us"].map(|name| sensor[name].as_i64().unwrap());
+            let [due_us, taken_us] =
+                ["due_us", "taken_us"].map(|name| sensor[name].as_i64().unwrap());
             let stamp_us = image["shutter_end_us"].as_i64().unwrap();
             assert!(taken_us <= stamp_us && stamp_us <= due_us && due_us <= now_us);
             let is_missing = told.contains(&"dropped") || told.contains(&"late");
@@ -233,11 +239,16 @@ async fn a_seed_decides_everything_and_cameras_are_independent() {
         first.push(seen);
     }
     assert_all_same(&first[0], &first[1]);
-    let hashes = |seen: &[Seen]| -> Vec<String> { seen.iter().map(|one| one.frame_hash().to_owned()).collect() };
+    let hashes = |seen: &[Seen]| -> Vec<String> {
+        seen.iter().map(|one| one.frame_hash().to_owned()).collect()
+    };
     let differ = hashes(&first[0]).iter().zip(hashes(&first[2])).filter(|(a, b)| **a != *b).count();
     assert_eq!(differ, 41, "another seed");
     for (one, other) in first[0].iter().zip(&first[3]) {
-        assert_eq!(one.meta["images"][0], other.meta["images"][0], "the front camera has the same effects");
+        assert_eq!(
+            one.meta["images"][0], other.meta["images"][0],
+            "the front camera has the same effects"
+        );
         assert!(other.tensors().tensor("sensor.imu").is_err());
     }
 }
@@ -246,9 +257,11 @@ async fn a_seed_decides_everything_and_cameras_are_independent() {
 async fn what_is_off_leaves_no_trace() {
     let server = TestServer::start().await;
     let mut sessions = Vec::new();
-    for (name, sensors) in
-        [("none", Value::Null), ("empty", json!({ "cameras": { "front": {} } })), ("zero", json!({ "delay_us": 0 }))]
-    {
+    for (name, sensors) in [
+        ("none", Value::Null),
+        ("empty", json!({ "cameras": { "front": {} } })),
+        ("zero", json!({ "delay_us": 0 })),
+    ] {
         let mut agent = server.agent().await;
         let mut fields = json!({ "session": name, "outputs": outputs() });
         if !sensors.is_null() {
@@ -260,7 +273,9 @@ async fn what_is_off_leaves_no_trace() {
         seen.extend(drive(&mut agent, "teleport", 0, 5).await);
         assert!(seen.iter().flat_map(images).all(|image| image.get("sensor").is_none()));
         agent.ask(json!({ "type": "close" })).await;
-        let record = std::fs::read_to_string(server.episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
+        let record =
+            std::fs::read_to_string(server.episodes.path().join(format!("{name}-1.jsonl")))
+                .unwrap();
         assert!(!record.contains("sensor") && !record.contains("due_us"));
         sessions.push((seen, record.replace(&format!("\"{name}\""), "\"x\"")));
     }
@@ -295,7 +310,8 @@ async fn motion_has_a_sample_for_each_step() {
     let floats = |seen: &Seen, name: &str| -> (Vec<usize>, Vec<f32>) {
         let tensors = seen.tensors();
         let tensor = tensors.tensor(name).unwrap();
-        let values = tensor.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
+        let values =
+            tensor.data().chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap()));
         (tensor.shape().to_vec(), values.collect())
     };
     let start = agent.look(json!({ "type": "reset" })).await;
@@ -332,7 +348,11 @@ async fn a_delayed_plan_must_be_long_enough() {
     let seen = agent.look(json!({ "type": "step", "trajectory": [ahead(300_000)] })).await;
     assert_eq!(seen.meta["step"], 1);
     let wrong = agent.ask(json!({ "type": "step", "pose": pose(1.0) })).await;
-    assert_eq!((&wrong["code"], &wrong["field"]), (&json!("session_state"), &json!("pose")), "refused now, not later");
+    assert_eq!(
+        (&wrong["code"], &wrong["field"]),
+        (&json!("session_state"), &json!("pose")),
+        "refused now, not later"
+    );
     // Actions take effect after two steps: until then the car rolls on.
     let mut agent = server.agent().await;
     open(&mut agent, "acting", "kinematic", json!({ "delay_us": 200_000 })).await;

@@ -20,7 +20,8 @@ pub(super) fn sensors_of(sensors: message::Sensors) -> Sensors {
         gyroscope: axis(gyroscope),
         bias_period_us: bias_period_us.unwrap_or(limits::BIAS_PERIOD_US),
     };
-    let wheels = |message::WheelSpeed { noise, scale }: message::WheelSpeed| WheelSpeed { noise, scale };
+    let wheels =
+        |message::WheelSpeed { noise, scale }: message::WheelSpeed| WheelSpeed { noise, scale };
     Sensors {
         cameras: cameras.into_iter().map(|(name, camera)| (name, camera_of(camera))).collect(),
         imu: imu.map(unit),
@@ -56,8 +57,7 @@ pub(super) fn sensors_to(sensors: &Sensors) -> message::Sensors {
         gyroscope: axis(gyroscope),
         bias_period_us: Some(bias_period_us),
     };
-    let wheels =
-        |&WheelSpeed { noise, scale }: &WheelSpeed| message::WheelSpeed { noise, scale };
+    let wheels = |&WheelSpeed { noise, scale }: &WheelSpeed| message::WheelSpeed { noise, scale };
     message::Sensors {
         cameras: cameras.iter().map(|(name, camera)| (name.clone(), camera_to(*camera))).collect(),
         imu: imu.as_ref().map(unit),

@@ -78,7 +78,6 @@ impl FrameHistory {
     /// Drops the frames that no decision at a time, in microseconds, or after it will show. Those that the
     /// observation of now shows stay: a snapshot of now shows them again.
     pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
-        self.0
-            .retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.due_us, time_us));
+        self.0.retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.due_us, time_us));
     }
 }

@@ -17,12 +17,12 @@ use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
-use wildcity_sim::ego::{Action, TimedPose};
-use wildcity_sim::{Command, Dynamics, Ego};
+use wildcity_sim::{Dynamics, Ego};
 
 use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
 use crate::observe::schedule::Schedule;
+use crate::record::command::RecordedCommand;
 use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::sensors::settings::Sensors;
 
@@ -172,18 +172,6 @@ pub struct FrameRecord {
     pub repairs: Vec<Option<RecordedImageRepair>>,
 }
 
-/// A command to the ego.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RecordedCommand {
-    /// Acceleration and curvature.
-    Action(Action),
-    /// Poses to follow.
-    Trajectory(Vec<TimedPose>),
-    /// A pose that is reached later: only with a delay of the planner.
-    Pose(Pose),
-}
-
 /// Another version of the twin, for the frames that follow.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -286,25 +274,6 @@ impl FrameRecord {
     /// The rendered cameras of a pose, by their index, of a rig with `rig_cameras`.
     pub fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
         self.cameras.get(pose).cloned().unwrap_or_else(|| (0..rig_cameras).collect())
-    }
-}
-
-impl RecordedCommand {
-    /// The record of a command; `None` for a pose, which [`FrameRecord::poses`] has.
-    pub(crate) fn of(command: &Command) -> Option<Self> {
-        match command {
-            Command::Pose(_) => None,
-            Command::Path(_) | Command::Action(_) => Some(Self::of_any(command)),
-        }
-    }
-
-    /// The record of any command, a pose included.
-    pub(crate) fn of_any(command: &Command) -> Self {
-        match command {
-            Command::Pose(pose) => Self::Pose(*pose),
-            Command::Path(path) => Self::Trajectory(path.poses().to_vec()),
-            Command::Action(action) => Self::Action(*action),
-        }
     }
 }
 

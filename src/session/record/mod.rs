@@ -6,6 +6,7 @@
 
 mod actor_replay;
 pub(crate) mod branch_error;
+pub(crate) mod command;
 pub(crate) mod continuation;
 pub(crate) mod ego_replay;
 pub(crate) mod error;

@@ -55,7 +55,9 @@ impl SensorReplay {
         with_effects.find_map(|&camera| {
             let taken_us = self.layout.delivery(camera, self.key, due_us).taken_us;
             let name = &self.layout.cameras()[camera].name;
-            let text = |time_us: i64, end: &str| format!("{name}, due at {due_us} µs: taken at {time_us} µs{end}");
+            let text = |time_us: i64, end: &str| {
+                format!("{name}, due at {due_us} µs: taken at {time_us} µs{end}")
+            };
             match (taken_us == recorded_us, is_there) {
                 (true, true) => None,
                 (false, _) => Some([text(recorded_us, ""), text(taken_us, "")]),

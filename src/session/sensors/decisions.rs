@@ -5,10 +5,10 @@ use std::collections::VecDeque;
 use serde::{Deserialize, Serialize};
 
 use wildcity_scene::geometry::Pose;
-use wildcity_sim::ego::{Action, Path};
+use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Ego, EgoError, EgoModel, Ground};
 
-use crate::record::format::RecordedCommand;
+use crate::record::command::RecordedCommand;
 
 /// The decisions of an episode that are in effect or wait, in the order in which they were made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -72,8 +72,7 @@ impl Decisions {
                 self.made.pop_front();
             }
             let before = egos.last().unwrap_or(ego);
-            let effective =
-                self.made.front().filter(|made| made.made_us + self.delay_us <= now_us);
+            let effective = self.made.front().filter(|made| made.made_us + self.delay_us <= now_us);
             egos.push(match effective {
                 None => before.stepped(&none_yet(before), dt_us, ground)?,
                 Some(Decision { made_us, world_from_rig, command }) => {
@@ -93,19 +92,5 @@ fn none_yet(ego: &Ego) -> Command {
         EgoModel::Kinematic | EgoModel::Dynamic => {
             Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.0 })
         }
-    }
-}
-
-impl RecordedCommand {
-    /// The command.
-    ///
-    /// # Errors
-    /// A recorded path is none.
-    pub(crate) fn command(&self) -> Result<Command, EgoError> {
-        Ok(match self {
-            Self::Pose(pose) => Command::Pose(*pose),
-            Self::Action(action) => Command::Action(*action),
-            Self::Trajectory(poses) => Command::Path(Path::checked(poses.clone())?),
-        })
     }
 }

@@ -93,7 +93,8 @@ mod tests {
 
     fn share(sensor: &CameraSensor, is_counted: impl Fn(i64, &Delivery) -> bool) -> f64 {
         let all = deliveries(sensor);
-        all.iter().filter(|(due_us, one)| is_counted(*due_us, one)).count() as f64 / all.len() as f64
+        all.iter().filter(|(due_us, one)| is_counted(*due_us, one)).count() as f64
+            / all.len() as f64
     }
 
     #[test]

@@ -82,7 +82,8 @@ mod tests {
 
     #[test]
     fn what_wanders_keeps_its_variance_and_forgets() {
-        let of_seed = |time_us: i64| (0..20_000).map(move |seed| wandering(seed, "x", 1000, time_us));
+        let of_seed =
+            |time_us: i64| (0..20_000).map(move |seed| wandering(seed, "x", 1000, time_us));
         for time_us in [0, 250, 500, 999, -700] {
             let mean = of_seed(time_us).sum::<f64>() / 2e4;
             let variance = of_seed(time_us).map(|x| x * x).sum::<f64>() / 2e4;
@@ -90,7 +91,8 @@ mod tests {
             assert!(mean.abs() < 4.0 * 0.0071, "{time_us}: {mean}");
             assert!((variance - 1.0).abs() < 4.0 * 0.01, "{time_us}: {variance}");
         }
-        let covariance = |by_us: i64| of_seed(0).zip(of_seed(by_us)).map(|(a, b)| a * b).sum::<f64>() / 2e4;
+        let covariance =
+            |by_us: i64| of_seed(0).zip(of_seed(by_us)).map(|(a, b)| a * b).sum::<f64>() / 2e4;
         // cos(π/4) after half a period, nothing after one.
         assert!((covariance(500) - 0.7071).abs() < 0.04, "{}", covariance(500));
         assert!(covariance(1000).abs() < 0.04, "{}", covariance(1000));

@@ -9,13 +9,14 @@
 //!
 //! | module | what it computes |
 //! |---|---|
-//! | `settings` | what a session asks for, checked |
+//! | `settings`, `check` | what a session asks for, and its limits |
 //! | `draw` | normal and wandering numbers |
 //! | `delivery` | which frame a camera delivers, and which picture it shows |
 //! | `pixels` | noise, exposure and dirt |
 //! | `motion` | specific force, angular velocity, and speed of the wheels |
 //! | `decisions` | which decision holds |
 
+mod check;
 pub(crate) mod decisions;
 pub(crate) mod delivery;
 pub(crate) mod draw;

@@ -43,7 +43,8 @@ impl MotionSample {
     /// are the same.
     pub(crate) fn new(from: &Ego, to: &Ego, dt_us: i64, time_us: i64) -> Self {
         let rig_from_world = to.world_from_rig().rotation.inverse();
-        let turned = (from.world_from_rig().rotation.inverse() * to.world_from_rig().rotation).normalize();
+        let turned =
+            (from.world_from_rig().rotation.inverse() * to.world_from_rig().rotation).normalize();
         // The shorter of the two ways to turn.
         let turned = if turned.w < 0.0 { -turned } else { turned };
         Self {

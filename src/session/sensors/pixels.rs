@@ -270,7 +270,8 @@ mod tests {
         let black = rgb8.iter().step_by(3).filter(|&&value| value == 0).count() as f64;
         let clean = rgb8.iter().step_by(3).filter(|&&value| value == 200).count() as f64;
         // The black part of a spot has half its radius; E[r²] = 0.05² (1 + 1/12), in widths. Spots overlap and are cut.
-        let area = 6.0 * std::f64::consts::PI * 0.0025 * (1.0 + 1.0 / 12.0) * f64::from(WIDTH * WIDTH);
+        let area =
+            6.0 * std::f64::consts::PI * 0.0025 * (1.0 + 1.0 / 12.0) * f64::from(WIDTH * WIDTH);
         assert!(black > 0.1 * area / 4.0 && black < 2.0 * area / 4.0, "{black} of {area}");
         assert!(clean > pixels - 2.0 * area && clean < pixels - 0.3 * area, "{clean}");
     }

@@ -25,7 +25,8 @@ use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
 use crate::options::{ResetOptions, Start, StepOptions};
 use crate::pin::pin;
-use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
+use crate::record::command::RecordedCommand;
+use crate::record::format::{FrameRequest, Line, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
@@ -70,7 +71,8 @@ impl Session {
         let now = &self.state.episode;
         let (mut next, egos) = now.followed(&command, steps, &ground, options.terminate)?;
         let traffic = self.state.traffic.as_ref();
-        let traffic = traffic.map(|traffic| traffic.followed(now.ego(), &egos, self.settings.dt_us));
+        let traffic =
+            traffic.map(|traffic| traffic.followed(now.ego(), &egos, self.settings.dt_us));
         if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
             next.end(reason);
         }

@@ -381,13 +381,7 @@ impl Ego {
         Ok(self.on_path(&plan, since_us, step_us, ground))
     }
 
-    fn on_path(
-        &self,
-        plan: &Plan<'_>,
-        since_us: i64,
-        step_us: i64,
-        ground: &Ground<'_>,
-    ) -> Self {
+    fn on_path(&self, plan: &Plan<'_>, since_us: i64, step_us: i64, ground: &Ground<'_>) -> Self {
         let Plan { path, reference, world_from_start } = plan;
         let step_s = step_us as f64 * 1e-6;
         match self.dynamics.model {

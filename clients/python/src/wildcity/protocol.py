@@ -868,7 +868,10 @@ def decode(kind: Any, value: Any, path: str) -> Any:
     if origin is tuple:
         return _decode_tuple(arguments, value, path)
     if origin is dict or kind is dict:
-        return value if isinstance(value, dict) else _mismatch(path, value, "an object")
+        if not isinstance(value, dict):
+            return _mismatch(path, value, "an object")
+        of_values = arguments[1] if arguments else Any
+        return {name: decode(of_values, item, f"{path}.{name}") for name, item in value.items()}
     if dataclasses.is_dataclass(kind):
         return _decode_dataclass(kind, value, path)
     if type(value) is not kind:

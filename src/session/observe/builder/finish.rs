@@ -209,7 +209,7 @@ impl ObservationBuilder {
         history: &mut FrameHistory,
         tensors: &mut TensorList,
     ) -> Result<Vec<PastImageInfo>, SessionError> {
-        let Some(now_us) = self.captures.last().map(|capture| capture.time_us) else {
+        let Some(now_us) = self.captures.last().map(|capture| capture.due_us) else {
             return Ok(Vec::new());
         };
         let mut index = 0;

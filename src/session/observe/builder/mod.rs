@@ -195,8 +195,7 @@ impl ObservationBuilder {
             };
             if let Ok(image) = &mut image {
                 image.trust = trust.filter(|_| tells_trust);
-                let rendered_hash =
-                    image.effects.map_or(image.hash, |effects| effects.clean_hash);
+                let rendered_hash = image.effects.map_or(image.hash, |effects| effects.clean_hash);
                 image.repair = repair
                     .is_some()
                     .then_some(ImageRepair { status: RepairStatus::Kept, rendered_hash });

@@ -185,9 +185,10 @@ impl ObservationBuilder {
                     }
                 }
             }
-            let effects = capture.as_ref().filter(|capture| capture.sensed).and_then(|capture| {
-                self.layout.pixel_effects(camera, self.key, capture.time_us)
-            });
+            let effects = capture
+                .as_ref()
+                .filter(|capture| capture.sensed)
+                .and_then(|capture| self.layout.pixel_effects(camera, self.key, capture.time_us));
             let is_later =
                 capture.as_ref().is_some_and(|capture| self.layout.is_shown_later(capture, camera));
             let done = encoded(&self.layout, camera, &pixels, is_later, effects.as_ref())
