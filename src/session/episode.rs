@@ -271,6 +271,9 @@ impl Episode {
             Some(now) if now.world_from_rig != self.world_from_rig() => {
                 Err("a state whose last pose is not the ego's")
             }
+            Some(_) if self.sensors.as_ref().is_some_and(|sensors| !sensors.is_in_range()) => {
+                Err("a state whose sensors are out of range")
+            }
             Some(_) => Ok(()),
         }
     }

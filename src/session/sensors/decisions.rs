@@ -8,6 +8,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Ego, EgoError, EgoModel, Ground};
 
+use crate::limits::BUNDLE_PERIOD_US;
 use crate::record::command::RecordedCommand;
 
 /// The decisions of an episode that are in effect or wait, in the order in which they were made.
@@ -32,6 +33,11 @@ struct Decision {
 impl Decisions {
     pub(crate) fn new(delay_us: i64) -> Self {
         Self { delay_us, made: VecDeque::new() }
+    }
+
+    /// Whether what was read from a file may be.
+    pub(crate) fn is_in_range(&self) -> bool {
+        (0..=BUNDLE_PERIOD_US).contains(&self.delay_us)
     }
 
     /// Whether decisions take effect at once.

@@ -29,6 +29,7 @@ use serde::{Deserialize, Serialize};
 use self::decisions::Decisions;
 use self::motion::MotionSample;
 use self::settings::Sensors;
+use crate::limits::SENSOR_REACH_US;
 
 /// What an episode keeps for its sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -51,6 +52,11 @@ impl EpisodeSensors {
             decisions: Decisions::new(sensors.delay_us),
             motion: sensors.measures_motion().then(Vec::new),
         }
+    }
+
+    /// Whether what was read from a file may be.
+    pub(crate) fn is_in_range(&self) -> bool {
+        (0..=SENSOR_REACH_US).contains(&self.reach_us) && self.decisions.is_in_range()
     }
 }
 
