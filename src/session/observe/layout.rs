@@ -281,7 +281,7 @@ impl ObservationLayout {
                 }
             }
         }
-        let capture = |([due_us, time_us], cameras)| RigCapture {
+        let capture = |([due_us, time_us], cameras): ([i64; 2], Vec<usize>)| RigCapture {
             world_from_rig: episode.pose_at(time_us),
             time_us,
             due_us,

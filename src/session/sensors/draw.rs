@@ -69,13 +69,15 @@ mod tests {
             let place = p * QUANTILES as f64 - 0.5;
             let [low, high] = [place.floor(), place.ceil()].map(|k| f64::from(NORMAL[k as usize]));
             let at = low + (place - place.floor()) * (high - low);
-            assert!((at - z).abs() < 2e-3, "{p}: {at}");
+            // Beyond 3.5 the quantiles are 0.1 apart, and the line between two of them is off.
+            let error = if z > 3.5 { 1e-2 } else { 5e-4 };
+            assert!((at - z).abs() < error, "{p}: {at}");
         }
         let sum: f64 = NORMAL.iter().map(|&z| f64::from(z)).sum();
         let squares: f64 = NORMAL.iter().map(|&z| f64::from(z).powi(2)).sum();
         let fourth: f64 = NORMAL.iter().map(|&z| f64::from(z).powi(4)).sum();
         let count = QUANTILES as f64;
-        assert_eq!(sum, 0.0);
+        assert!(sum.abs() < 1e-6, "{sum}");
         assert!((squares / count - 1.0).abs() < 1e-6);
         assert!((fourth / count - 3.0).abs() < 0.02, "{}", fourth / count);
     }
