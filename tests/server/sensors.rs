@@ -316,7 +316,10 @@ async fn motion_has_a_sample_for_each_step() {
     };
     let start = agent.look(json!({ "type": "reset" })).await;
     let (shape, at_rest) = floats(&start, "sensor.imu");
-    assert_eq!((shape, &at_rest[..3]), (vec![1, 6], &[0.0, 0.0, 9.80665_f32][..]));
+    assert_eq!(shape, [1, 6]);
+    for (measured, expected) in at_rest.iter().zip([0.0, 0.0, 9.80665_f32]) {
+        assert!((measured - expected).abs() < 1e-5, "{at_rest:?}");
+    }
     let action = json!({ "acceleration": 1.0, "curvature": 0.02 });
     let plan = agent.look(json!({ "type": "step", "action": action, "until_us": 400_000 })).await;
     let (shape, imu) = floats(&plan, "sensor.imu");
@@ -364,7 +367,7 @@ async fn a_delayed_plan_must_be_long_enough() {
         speeds.push(seen.meta["ego"]["velocity"][0].as_f64().unwrap());
     }
     for (speed, expected) in speeds.iter().zip([9.0, 9.0, 8.5, 8.0]) {
-        assert!((speed - expected).abs() < 1e-9, "{speeds:?}");
+        assert!((speed - expected).abs() < 1e-6, "{speeds:?}");
     }
 }
 
