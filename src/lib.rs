@@ -35,13 +35,14 @@
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
 //! 5. An image is a function of scene version, render profile, poses, cameras and actors; and, where it says so,
-//!    of the repair model's hash and the episode's history. Caches change latency, never pixels.
+//!    of the repair model's hash and the episode's history; and of the effects of sensors, which a seed, a name and
+//!    a time decide. Caches change latency, never pixels.
 //! 6. Every observation names the scene version and the render profile that it was made with. A new version
 //!    becomes visible only between two steps, and only to a session that asked for it.
 //! 7. Time is integer microseconds; poses are f64 until the renderer makes them camera-relative f32.
 //! 8. Every queue, message, buffer and count has a maximum, in the `limits` module of its package.
-//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses, actors or repair there is
-//!    no buffer, pass, pipeline or library for them.
+//! 9. A scene pays only for what it has: without a sky, spherical harmonics, lenses, actors, repair or effects of
+//!    sensors there is no buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 //!
 //! [`wildcity_score`]: ../wildcity_score/index.html

@@ -7,6 +7,7 @@
 //! The order of the tensors:
 //!
 //! 1. `ego.history_xyz`, f32 `[16, 3]`, and `ego.history_rot`, f32 `[16, 3, 3]`.
+//!    Then, as requested, `sensor.imu`, f32 `[n, 6]`, and `sensor.wheel_speed`, f32 `[n]`.
 //! 2. For each image, as requested, `camera/<name>/depth`, `camera/<name>/opacity` and
 //!    `camera/<name>/normals`, all f32.
 //! 3. If requested, for each image `camera/<name>/instances`, u16.
@@ -294,7 +295,8 @@ pub struct Image {
     pub shutter_start_us: i64,
     /// Time at which the last row is exposed, in simulated microseconds. This is the image's time.
     pub shutter_end_us: i64,
-    /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex.
+    /// BLAKE3 of the image's raw pixel bytes (`[height, width, 3]`, before encoding), in hex: of what is sent, after
+    /// repair and after the effects of the sensors.
     pub hash: String,
     /// Confidence in the image, if the session asked for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -302,6 +304,61 @@ pub struct Image {
     /// What became of the image, if the session asked for repair.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub repair: Option<ImageRepair>,
+    /// What the camera did to the image, if the session asked for effects of this camera.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor: Option<ImageSensor>,
+}
+
+/// What a camera with effects did to an image.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ImageSensor {
+    /// Whether anything was done to it.
+    pub status: SensorStatus,
+    /// What was done.
+    pub reasons: Vec<SensorReason>,
+    /// When the frame was due, in simulated microseconds. The shutter times are those that the camera claims: earlier
+    /// than this for a frame that stands in for a dropped or late one.
+    pub due_us: i64,
+    /// When the picture was taken, in simulated microseconds: before the shutter times if the camera is frozen.
+    pub taken_us: i64,
+    /// Offset of the exposure, in stops. Only with a drift of the exposure.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stops: Option<f64>,
+    /// BLAKE3 of the raw pixel bytes before noise, exposure and dirt, in hex. Absent if the camera has none of them:
+    /// it is the image's `hash` then.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clean_hash: Option<String>,
+}
+
+/// Whether a camera did anything to an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum SensorStatus {
+    /// Nothing: it is the frame that was due, as rendered.
+    Ok,
+    /// Something: the reasons say what.
+    Degraded,
+}
+
+/// What a camera did to an image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum SensorReason {
+    /// The frame was lost; the last one that arrived stands in for it.
+    Dropped,
+    /// The frame has not arrived yet; the last one that arrived stands in for it.
+    Late,
+    /// The picture stands still.
+    Frozen,
+    /// It has noise.
+    Noise,
+    /// Its exposure drifts.
+    Exposure,
+    /// The lens is dirty.
+    Dirt,
 }
 
 /// What became of an image in a session that asked for repair. Depth, opacity, normals and instances stay those of

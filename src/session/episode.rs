@@ -17,6 +17,8 @@ use wildcity_sim::{Command, Ego, Ground};
 
 use crate::error::SessionError;
 use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
+use crate::sensors::EpisodeSensors;
+use crate::sensors::motion::MotionSample;
 
 /// How far back the history reaches: 15 steps of 0.1 s before now.
 const HISTORY_US: i64 = (HISTORY_POSES as i64 - 1) * HISTORY_STEP_US;
@@ -45,6 +47,9 @@ pub struct Episode {
     /// By camera, whether its images are being repaired; empty if none is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     repairing: Vec<bool>,
+    /// What its sensors keep, if the session asked for effects.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    sensors: Option<Box<EpisodeSensors>>,
 }
 
 fn is_false(value: &bool) -> bool {
@@ -124,7 +129,18 @@ impl Episode {
             least_trust: None,
             failed: false,
             repairing: Vec::new(),
+            sensors: None,
         }
+    }
+
+    /// The same, at its start, with sensors that have effects.
+    #[must_use]
+    pub(crate) fn with_sensors(mut self, sensors: Option<EpisodeSensors>) -> Self {
+        self.sensors = sensors.map(Box::new);
+        if let Some(motion) = self.sensors.as_mut().and_then(|sensors| sensors.motion.as_mut()) {
+            motion.push(MotionSample::new(&self.ego, &self.ego, self.dt_us, 0));
+        }
+        self
     }
 
     /// The episode after one more step.
@@ -138,10 +154,11 @@ impl Episode {
         ground: &Ground<'_>,
         terminate: bool,
     ) -> Result<Self, SessionError> {
-        self.followed(command, 1, ground, terminate)
+        Ok(self.followed(command, 1, ground, terminate)?.0)
     }
 
-    /// The episode after one or more steps along a plan: a command that holds for all of them.
+    /// The episode after one or more steps along a plan: a command that holds for all of them. And the ego after each
+    /// step.
     ///
     /// # Errors
     /// As [`Episode::stepped`].
@@ -151,19 +168,29 @@ impl Episode {
         steps: usize,
         ground: &Ground<'_>,
         terminate: bool,
-    ) -> Result<Self, SessionError> {
+    ) -> Result<(Self, Vec<Ego>), SessionError> {
         if self.terminated {
             return Err(SessionError::EpisodeOver { steps: self.step });
         }
         let mut next = self.clone();
-        for ego in self.ego.followed(command, self.dt_us, steps, ground)? {
+        let egos = next.follow_decisions(command, steps, ground)?;
+        if let Some(motion) = next.sensors.as_mut().and_then(|sensors| sensors.motion.as_mut()) {
+            motion.clear();
+            let mut from = &self.ego;
+            for (to, index) in egos.iter().zip(1..) {
+                let time_us = self.time_us() + index * self.dt_us;
+                motion.push(MotionSample::new(from, to, self.dt_us, time_us));
+                from = to;
+            }
+        }
+        for ego in &egos {
             let world_from_rig = ego.world_from_rig();
             let moved_m = world_from_rig.position_m - next.world_from_rig().position_m;
             let time_us = next.time_us() + self.dt_us;
             next.step += 1;
             next.distance_m += moved_m.length();
             next.track.push_back(Keyframe { time_us, world_from_rig });
-            next.ego = ego;
+            next.ego = ego.clone();
         }
         next.terminated = terminate;
         // Keep one pose at or before the history's first, to interpolate from, for every step of the plan: the
@@ -171,11 +198,44 @@ impl Episode {
         // of the warm-up, so it keeps all of that.
         let time_us = next.time_us();
         let plan_us = time_us - self.time_us();
-        let reach_us = (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
+        let reach_us =
+            next.reach_us() + (HISTORY_US + plan_us - self.dt_us).max(plan_us - self.begin_us);
         while next.track.len() > 2 && next.track[1].time_us <= time_us - reach_us {
             next.track.pop_front();
         }
-        Ok(next)
+        Ok((next, egos))
+    }
+
+    /// The ego after each of some steps, along the decision that holds then: with a delay of the planner, not yet that
+    /// of now.
+    fn follow_decisions(
+        &mut self,
+        command: &Command,
+        steps: usize,
+        ground: &Ground<'_>,
+    ) -> Result<Vec<Ego>, SessionError> {
+        let times_us = [self.time_us(), self.dt_us];
+        let delayed = self.sensors.as_mut().map(|sensors| &mut sensors.decisions);
+        Ok(match delayed.filter(|decisions| !decisions.are_immediate()) {
+            Some(decisions) => decisions.follow(command, &self.ego, times_us, steps, ground)?,
+            None => self.ego.followed(command, self.dt_us, steps, ground)?,
+        })
+    }
+
+    /// Whether its decisions take effect later.
+    pub(crate) fn is_delayed(&self) -> bool {
+        self.sensors.as_ref().is_some_and(|sensors| !sensors.decisions.are_immediate())
+    }
+
+    /// How much farther than the history the track reaches back, in microseconds.
+    pub(crate) fn reach_us(&self) -> i64 {
+        self.sensors.as_ref().map_or(0, |sensors| sensors.reach_us)
+    }
+
+    /// The motion of each step since the last observation; empty unless it is measured.
+    pub(crate) fn motion(&self) -> &[MotionSample] {
+        let sensors = self.sensors.as_ref();
+        sensors.and_then(|sensors| sensors.motion.as_deref()).unwrap_or_default()
     }
 
     /// The views of some cameras of a rig, selected by their indices, from a pose of the rig.
@@ -211,6 +271,9 @@ impl Episode {
             Some(now) if now.world_from_rig != self.world_from_rig() => {
                 Err("a state whose last pose is not the ego's")
             }
+            Some(_) if self.sensors.as_ref().is_some_and(|sensors| !sensors.is_in_range()) => {
+                Err("a state whose sensors are out of range")
+            }
             Some(_) => Ok(()),
         }
     }
@@ -221,9 +284,10 @@ impl Episode {
         before.copied().collect()
     }
 
-    /// Whether it has its start alone: no step was made, and there is no warm-up before the start.
+    /// Whether it has its start alone: no step was made, there is no warm-up before the start, and no sensor has
+    /// effects.
     pub(crate) fn is_start_alone(&self) -> bool {
-        self.step == 0 && self.begin_us == 0
+        self.step == 0 && self.begin_us == 0 && self.sensors.is_none()
     }
 
     /// Seed of the episode.

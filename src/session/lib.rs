@@ -16,6 +16,7 @@
 //! | `prefetch` | loads what the next frames of the ego will need |
 //! | `repair` | which images a model repairs, and what is told of each |
 //! | `scenario` | scenarios by name, and the files beside them |
+//! | `sensors` | effects of the sensors, and the delay of the planner |
 //! | `stills` | images from any views, without an episode |
 //! | [`limits`] | limits and defaults |
 
@@ -31,6 +32,7 @@ mod prefetch;
 mod record;
 mod repair;
 mod scenario;
+mod sensors;
 mod session;
 mod snapshot;
 mod start;
@@ -54,12 +56,13 @@ pub use options::{
     ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice,
     ScenarioOptions, SessionOptions, Start, StepOptions,
 };
+pub use record::command::RecordedCommand;
 pub use record::continuation::Continuation;
 pub use record::ego_replay::DivergedStep;
 pub use record::error::RecordError;
 pub use record::format::{
-    EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand, RecordedOrigin, RecordedOutputs,
-    RecordedSettings, RecordedVersion, is_episode_name,
+    EpisodeHeader, FrameRecord, FrameRequest, RecordedOrigin, RecordedOutputs, RecordedSettings,
+    RecordedVersion, is_episode_name,
 };
 pub use record::recorded_episode::RecordedEpisode;
 pub use record::repairs::{RecordedImageRepair, RecordedRepair};
@@ -73,6 +76,11 @@ pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
     asset_info,
 };
+pub use sensors::settings::{
+    AxisNoise, CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, Imu, LateFrames, LensDirt,
+    Sensors, WheelSpeed,
+};
+pub use sensors::{ImageSensor, SensorReason};
 pub use session::Session;
 pub use snapshot::{Snapshot, Snapshots};
 pub use stills::{Still, Stills};

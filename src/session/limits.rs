@@ -81,6 +81,22 @@ pub const BUNDLE_PERIOD_US: i64 = 10_000_000;
 /// Largest lateral jitter of a random start, in metres: the other side of a wide road.
 pub const START_LATERAL_M: f64 = 20.0;
 
+/// How old the picture of a camera with effects may be, in microseconds. The track keeps the poses of that time: at
+/// 1 kHz these are 10,000 poses of 64 bytes.
+pub const SENSOR_REACH_US: i64 = 10_000_000;
+
+/// After so many lost frames in a row the camera delivers the oldest of them: at one in two, every 500th frame.
+pub const SENSOR_DROPS: i64 = 8;
+
+/// Shortest and longest time between two values of an exposure or a bias that wanders, in microseconds: up to an hour.
+pub const WANDER_PERIOD_US: std::ops::RangeInclusive<i64> = 1_000..=3_600_000_000;
+
+/// Time between two biases of an inertial measurement unit unless the session names another, in microseconds.
+pub const BIAS_PERIOD_US: i64 = 60_000_000;
+
+/// Most spots of dirt on a lens. Each is computed for each image.
+pub const DIRT_SPOTS: u64 = 256;
+
 /// Longest warm-up, in microseconds: sixteen frames at 1 Hz, and more than twice what any known agent
 /// reads. At 100 Hz these are 2,000 poses of a recorded drive.
 pub const WARM_UP_US: i64 = 20_000_000;

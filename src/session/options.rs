@@ -12,6 +12,7 @@ use wildcity_sim::Dynamics;
 
 use crate::observe::encode::Encoding;
 use crate::scenario::load::ScenarioSource;
+use crate::sensors::settings::Sensors;
 
 /// How to open a session. For a field that is `None`, the twin or this package's `limits` decide.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,6 +47,8 @@ pub struct SessionOptions {
     pub scenario: Option<ScenarioOptions>,
     /// The repair of its images; none if absent.
     pub repair: Option<RepairOptions>,
+    /// Effects of its sensors; none if absent.
+    pub sensors: Option<Sensors>,
 }
 
 /// A scenario, and what of its ego section holds.
@@ -81,6 +84,7 @@ impl SessionOptions {
             deadline: None,
             scenario: None,
             repair: None,
+            sensors: None,
         }
     }
 }

@@ -4,8 +4,8 @@ use serde_json::{Map, Value, json};
 use wildcity_protocol::camera::{Windshield, WindshieldReference};
 use wildcity_protocol::message::{Encoding, Pose, RigCamera};
 use wildcity_protocol::observation::{
-    Ego, Geo, Image, ImageRepair, ObservationMetadata, RepairFailure, RepairStatus, Residency,
-    Stage, Timings, Trust,
+    Ego, Geo, Image, ImageRepair, ImageSensor, ObservationMetadata, RepairFailure, RepairStatus,
+    Residency, SensorReason, SensorStatus, Stage, Timings, Trust,
 };
 
 use super::messages::{front, rear};
@@ -42,6 +42,9 @@ pub(crate) struct Recipe {
     pub(crate) trust_and_windshield: bool,
     /// Whether the session asked for repair: the first image is repaired, the second failed.
     pub(crate) repair: bool,
+    /// Whether sensors have effects: the first image is late and has noise, the second is as it is; and there are samples
+    /// of the motion.
+    pub(crate) sensors: bool,
 }
 
 impl Recipe {
@@ -56,6 +59,7 @@ impl Recipe {
         instances: false,
         trust_and_windshield: false,
         repair: false,
+        sensors: false,
     };
 }
 
@@ -109,6 +113,10 @@ impl Frame {
             f32_tensor("ego.history_xyz", vec![16, 3], &xyz),
             f32_tensor("ego.history_rot", vec![16, 3, 3], &rot),
         ];
+        if recipe.sensors {
+            tensors.push(f32_tensor("sensor.imu", vec![2, 6], &IMU));
+            tensors.push(f32_tensor("sensor.wheel_speed", vec![2], &WHEEL_SPEED));
+        }
         let mut images = Vec::new();
         let mut hashes = blake3::Hasher::new();
         let mut cameras = [front(), rear()];
@@ -301,6 +309,7 @@ fn image(
         shutter_start_us: 200_000 - exposed_us,
         shutter_end_us: 200_000,
         repair: recipe.repair.then(|| repair(index, &hash)),
+        sensor: recipe.sensors.then(|| sensor(index)),
         hash,
         trust: recipe.trust_and_windshield.then_some(Trust {
             value: 0.5,
@@ -311,6 +320,33 @@ fn image(
         }),
     }
 }
+
+fn sensor(index: u64) -> ImageSensor {
+    let [due_us, taken_us] = [200_000, 200_000 - 100_000 * (1 - index as i64)];
+    match index {
+        0 => ImageSensor {
+            status: SensorStatus::Degraded,
+            reasons: vec![SensorReason::Late, SensorReason::Noise],
+            due_us,
+            taken_us,
+            stops: None,
+            clean_hash: Some(blake3::hash(b"without noise").to_hex().to_string()),
+        },
+        _ => ImageSensor {
+            status: SensorStatus::Ok,
+            reasons: Vec::new(),
+            due_us,
+            taken_us,
+            stops: None,
+            clean_hash: None,
+        },
+    }
+}
+
+/// Samples of the inertial measurement unit and of the wheels, for two steps.
+pub(crate) const IMU: [f32; 12] =
+    [0.25, -0.5, 9.75, 0.0, 0.0, 0.125, 0.5, -0.25, 9.8125, 0.0, 0.015625, 0.25];
+pub(crate) const WHEEL_SPEED: [f32; 2] = [4.5, 5.25];
 
 fn repair(index: u64, hash: &str) -> ImageRepair {
     let before = blake3::hash(b"as rendered").to_hex().to_string();

@@ -147,6 +147,29 @@ pub(crate) fn rear() -> RigCamera {
     }
 }
 
+/// Every effect of sensors.
+fn sensors() -> Sensors {
+    let camera = CameraSensor {
+        drop: Some(0.125),
+        late: Some(LateFrames { chance: 0.25, by_us: 100_000 }),
+        freeze: Some(FrozenFrames { chance: 0.0625, for_us: 1_000_000 }),
+        noise: Some(ImageNoise { full_well: 5000.0, read: 8.0 }),
+        exposure: Some(ExposureDrift { stops: 0.25, period_us: 2_000_000 }),
+        dirt: Some(LensDirt { spots: 12, radius: 0.03125, opacity: 0.75 }),
+    };
+    let axis = |noise, bias| Some(AxisNoise { noise, bias });
+    Sensors {
+        cameras: [("front".to_owned(), camera)].into(),
+        imu: Some(Imu {
+            accelerometer: axis(0.03125, 0.0625),
+            gyroscope: axis(0.0078125, 0.00390625),
+            bias_period_us: Some(60_000_000),
+        }),
+        wheel_speed: Some(WheelSpeed { noise: 0.0625, scale: 0.015625 }),
+        delay_us: Some(200_000),
+    }
+}
+
 fn requests() -> Vec<(&'static str, Request)> {
     let station = Start::Station { trajectory: "log".into(), station_m: 12.5 };
     let seen = RigCamera {
@@ -215,6 +238,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         on_failure: Some(OnFailure::Error),
     };
     let repaired = Open { seq: 1, repair: Some(repair), ..Open::twin("street") };
+    let sensed = Open { seq: 1, sensors: Some(sensors()), ..Open::twin("street") };
     let step = |seq, pose, trajectory, action, terminate| Request::Step {
         seq,
         session: None,
@@ -300,6 +324,7 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("open_dynamics", Request::Open(Box::new(driven))),
         ("open_model", Request::Open(Box::new(model))),
         ("open_repair", Request::Open(Box::new(repaired))),
+        ("open_sensors", Request::Open(Box::new(sensed))),
         ("step", step(3, Some(there), None, None, false)),
         ("step_terminate", step(4, Some(there), None, None, true)),
         ("step_trajectory", step(3, None, Some(planned), None, false)),
@@ -401,9 +426,11 @@ fn answers() -> Vec<(&'static str, Answer)> {
         trajectories: vec![trajectory],
         reserved_bytes: 36_000_000,
         repair: None,
+        sensors: None,
         scenario: None,
         trajectory: Some(drive()),
     };
+    let sensed = Opened { trajectory: None, sensors: Some(sensors()), ..opened.clone() };
     let repaired = Opened {
         trajectory: None,
         repair: Some(OpenedRepair {
@@ -488,6 +515,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("welcome_repairs", offering),
         ("opened", Answer::Opened(Box::new(opened))),
         ("opened_repair", Answer::Opened(Box::new(repaired))),
+        ("opened_sensors", Answer::Opened(Box::new(sensed))),
         ("resumed", resumed),
         ("resumed_also", resumed_also),
         ("ok", Answer::Ok { seq: 6 }),

@@ -22,6 +22,7 @@ fn golden() -> [(&'static str, u64, Recipe); 10] {
         ("instances", 3, Recipe { cameras: 1, depth: false, instances: true, ..raw }),
         ("trust", 3, Recipe { depth: false, trust_and_windshield: true, ..raw }),
         ("repair", 3, Recipe { depth: false, repair: true, ..raw }),
+        ("sensors", 3, Recipe { depth: false, sensors: true, ..raw }),
         // Between two decisions.
         ("no_images", 3, Recipe { cameras: 0, ..raw }),
     ]
@@ -57,6 +58,13 @@ fn golden_frames_decode_to_their_contents() {
         assert_eq!(observation.metadata(), &frame.metadata, "{name}");
         observation.verify().unwrap();
         check_history(&observation);
+        let motion = [observation.imu().to_vec(), observation.wheel_speed().to_vec()];
+        let expected = if recipe.sensors {
+            [frames::IMU.to_vec(), frames::WHEEL_SPEED.to_vec()]
+        } else {
+            [Vec::new(), Vec::new()]
+        };
+        assert_eq!(motion, expected, "{name}");
         assert_eq!(observation.images().count() as u64, recipe.poses * recipe.cameras as u64);
         for (number, image) in observation.images().enumerate() {
             check_image(&image, recipe, number as u64);

@@ -89,7 +89,7 @@ fn assert_same(one: &Seen, other: &Seen) {
     }
 }
 
-fn assert_all_same(some: &[Seen], others: &[Seen]) {
+pub(crate) fn assert_all_same(some: &[Seen], others: &[Seen]) {
     assert_eq!(some.len(), others.len());
     some.iter().zip(others).for_each(|(one, other)| assert_same(one, other));
 }

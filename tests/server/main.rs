@@ -37,6 +37,7 @@ mod repair_failures;
 mod replay;
 mod resume;
 mod scenarios;
+mod sensors;
 mod shutdown;
 mod socket;
 mod starts;

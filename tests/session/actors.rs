@@ -16,9 +16,9 @@ use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat, RenderProfile};
 use wildcity_session::{
-    DType, Encoding, Engine, Observation, Outputs, RecordedEpisode, ReplayUntil, RigChoice,
-    ScenarioError, ScenarioOptions, ScenarioSource, Session, SessionError, SessionOptions, Start,
-    StepOptions, TensorKind,
+    CameraSensor, DType, Encoding, Engine, LateFrames, Observation, Outcome, Outputs,
+    RecordedEpisode, ReplayUntil, RigChoice, ScenarioError, ScenarioOptions, ScenarioSource,
+    Sensors, Session, SessionError, SessionOptions, Start, StepOptions, TensorKind,
 };
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
@@ -183,6 +183,50 @@ async fn every_frame_draws_the_actors_of_its_time() {
                 assert_ne!(seen, expected(&at_rest, shutters), "the shutter must be seen");
             }
             before = now;
+        }
+    }
+}
+
+/// A camera whose frames all arrive 0.3 s late shows what it showed then, actors included.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_late_frame_shows_the_actors_of_when_it_was_taken() {
+    let bench = bench(unlimited());
+    let asset = Value::from(&*car().hash);
+    for shutters in [false, true] {
+        let mut punctual = open(&bench, "a", options(&actors(&asset), shutters)).await;
+        let truth = standing(&mut punctual, 6).await;
+        let late = CameraSensor {
+            late: Some(LateFrames { chance: 1.0, by_us: 300_000 }),
+            ..CameraSensor::default()
+        };
+        let cameras = [("front".to_owned(), late)].into();
+        let sensors = Some(Sensors { cameras, ..Sensors::default() });
+        let opening = SessionOptions { sensors, ..options(&actors(&asset), shutters) };
+        let name = format!("late-{shutters}");
+        let mut session = open(&bench, &name, opening).await;
+        let mut seen = standing(&mut session, 2).await;
+        session.take_snapshot("two".to_owned()).unwrap();
+        for _ in 0..4 {
+            seen.push(hashes(&session.step(demo().at(EGO_M), false).await.unwrap()));
+        }
+        for (step, images) in seen.iter().enumerate() {
+            assert_eq!(images[0], truth[step.saturating_sub(3)][0], "step {step}");
+            assert_eq!(images[1], truth[step][1], "step {step}");
+        }
+        assert_ne!(truth[2][0], truth[5][0], "the car must be seen to move");
+
+        // The same from a snapshot, and in a replay of both records.
+        assert_eq!(hashes(&session.restore("two").await.unwrap()), seen[2]);
+        for step in 3..=6 {
+            let again = hashes(&session.step(demo().at(EGO_M), false).await.unwrap());
+            assert_eq!(again, seen[step], "step {step}");
+        }
+        session.close(Outcome::Completed).await;
+        for number in [1, 2] {
+            let path = bench.episodes.path().join(format!("{name}-{number}.jsonl"));
+            let report = replay(&path, &demo().catalog());
+            assert_eq!((report.difference, report.wrong_value), (None, None), "{}", path.display());
+            assert_eq!(report.images, if number == 1 { 14 } else { 10 });
         }
     }
 }

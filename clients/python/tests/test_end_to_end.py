@@ -24,11 +24,16 @@ import wildcity
 from PIL import Image
 from wildcity import (
     Action,
+    AxisNoise,
     Camera,
+    CameraSensor,
     Disconnected,
     DriveSection,
     Dynamics,
     Exposure,
+    ImageNoise,
+    Imu,
+    LensDirt,
     Observation,
     Outputs,
     Pose,
@@ -36,11 +41,13 @@ from wildcity import (
     RecordedPoint,
     Refused,
     Rig,
+    Sensors,
     SnapshotPoint,
     Station,
     Step,
     TimedPose,
     Trajectory,
+    WheelSpeed,
     png_data_uri,
 )
 
@@ -98,6 +105,44 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         finally:
             process.terminate()
             assert process.wait(timeout=20) == 0, "the server did not stop cleanly"
+
+
+def test_sensors_have_effects(connect: Connect, server: Server) -> None:
+    noisy = CameraSensor(drop=0.3, noise=ImageNoise(1000, 5), dirt=LensDirt(4, 0.1, 1.0))
+    sensors = Sensors(
+        cameras={"front": noisy},
+        imu=Imu(gyroscope=AxisNoise(0.001)),
+        wheel_speed=WheelSpeed(scale=0.01),
+        delay_us=200_000,
+    )
+    outputs = Outputs(encoding="raw")
+    with connect(server.url) as client:
+        seen = []
+        for name, effects in (("sensed", sensors), ("again", sensors), ("plain", Sensors(delay_us=200_000))):
+            dynamics = Dynamics("kinematic", 5.0)
+            opening = {"rig": PAIR, "outputs": outputs, "dynamics": dynamics, "session": name}
+            with client.open("corridor", sensors=effects, start=Station("log", 2.0), **opening) as session:
+                assert session.opened.sensors is not None
+                drive = [session.reset(seed=4)]
+                drive += [session.step(Action(1.0, 0.02)) for _ in range(12)]
+                seen.append(drive)
+        assert session.opened.sensors == Sensors(delay_us=200_000)
+    for one, other, plain in zip(*seen, strict=True):
+        assert one.metadata.frame_hash == other.metadata.frame_hash
+        assert one.metadata.ego == plain.metadata.ego
+        front, rear = one.metadata.images
+        assert rear.sensor is None and front.sensor is not None
+        assert front.sensor.status == "degraded" and front.sensor.due_us == one.metadata.time_us
+        assert rear.hash == plain.metadata.images[1].hash
+        taken = seen[2][front.sensor.taken_us // 100_000].metadata.images[0]
+        assert front.sensor.clean_hash == taken.hash != front.hash
+        assert one.images["front"].std() > 0
+        assert one.imu.shape == (1, 6) and one.wheel_speed.shape == (1,)
+        assert one.imu[0, 2] == pytest.approx(9.80665, abs=1e-3)
+        with pytest.raises(KeyError):
+            _ = plain.imu
+    reasons = {reason for one in seen[0] for reason in one.metadata.images[0].sensor.reasons}
+    assert reasons == {"dropped", "noise", "dirt"}
 
 
 def test_drives_through_the_twin(connect: Connect, server: Server) -> None:

@@ -14,14 +14,22 @@ import pytest
 from conftest import PROTOCOL, frame, vector
 from wildcity import (
     Action,
+    AxisNoise,
     BadFrame,
     Camera,
+    CameraSensor,
     Code,
     DriveSection,
     Dynamics,
     Exposure,
+    ExposureDrift,
+    FrozenFrames,
+    ImageNoise,
     ImagePart,
+    Imu,
+    LateFrames,
     Lens,
+    LensDirt,
     Observation,
     Outputs,
     Pose,
@@ -31,18 +39,35 @@ from wildcity import (
     Refused,
     Repair,
     Rig,
+    Sensors,
     Shutter,
     SnapshotPoint,
     Station,
     Step,
     TimedPose,
     Trajectory,
+    WheelSpeed,
     png_data_uri,
 )
 from wildcity.observation import Many
 from wildcity.protocol import ANSWERS, decode_answer, encode
 from wildcity.session_protocol import SessionProtocol
 
+SENSORS = Sensors(
+    cameras={
+        "front": CameraSensor(
+            drop=0.125,
+            late=LateFrames(0.25, 100_000),
+            freeze=FrozenFrames(0.0625, 1_000_000),
+            noise=ImageNoise(5000.0, 8.0),
+            exposure=ExposureDrift(0.25, 2_000_000),
+            dirt=LensDirt(12, 0.03125, 0.75),
+        )
+    },
+    imu=Imu(AxisNoise(0.03125, 0.0625), AxisNoise(0.0078125, 0.00390625), 60_000_000),
+    wheel_speed=WheelSpeed(0.0625, 0.015625),
+    delay_us=200_000,
+)
 HERE = Pose((12.5, -3.25, 0.125), (0.8, 0.0, 0.0, 0.6))
 ABOVE = Pose((12.5, -3.25, 30.0))
 PLANNED = Trajectory(
@@ -98,6 +123,7 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "open_preset": lambda c: c.open("street", rig="vehicle6", profile={"tau_px": 2.0}),
     "open_dynamics": lambda c: c.open("street", dynamics=Dynamics("dynamic", 8.25, reverse=True)),
     "open_model": lambda c: c.open("street", dynamics="kinematic"),
+    "open_sensors": lambda c: c.open("street", sensors=SENSORS),
     "open_repair": lambda c: c.open("street", repair=Repair("zero-dce", 0.625, 0.875, 0.125, 4, "error")),
     "step_action": lambda c: c.step(Action(-1.5, 0.025), False),
     "step_trajectory": lambda c: c.step(PLANNED, False),
@@ -211,7 +237,7 @@ def with_unknown_fields(value: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    "name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "repair", "no_images"]
+    "name", ["raw", "png", "jpeg", "two_poses", "bundle", "normals", "instances", "trust", "repair", "sensors", "no_images"]
 )
 def test_observations_decode_to_their_contents(name: str) -> None:
     expected = vector(f"observations/{name}.expected.json")
@@ -407,7 +433,7 @@ def test_vectors_obey_the_schemas() -> None:
             del message["type"]
             assert not schema.is_valid(message)
     schema = validator("observation")
-    for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "repair", "no_images"):
+    for name in ("raw", "png", "jpeg", "two_poses", "normals", "instances", "trust", "repair", "sensors", "no_images"):
         metadata = vector(f"observations/{name}.expected.json")["observation"]
         schema.validate(metadata)
         del metadata["frame_hash"]

@@ -15,6 +15,8 @@ use crate::error::FrameError;
 
 const HISTORY_XYZ: &str = "ego.history_xyz";
 const HISTORY_ROT: &str = "ego.history_rot";
+const IMU: &str = "sensor.imu";
+const WHEEL_SPEED: &str = "sensor.wheel_speed";
 
 /// What the ego sees at one time: metadata, images, and the ego's past poses.
 ///
@@ -120,6 +122,18 @@ impl Observation {
         floats(self.tensor_bytes(HISTORY_ROT))
     }
 
+    /// What the inertial measurement unit measured, f32 `[n, 6]`: specific force in m/s² and angular velocity in rad/s,
+    /// in the rig's axes, for each step since the observation before. Empty unless the session asked for it.
+    pub fn imu(&self) -> Cow<'_, [f32]> {
+        floats(self.tensor_bytes(IMU))
+    }
+
+    /// Speed in m/s as the wheels measured it, f32 `[n]`, at the times of [`Self::imu`]. Empty unless the session asked
+    /// for it.
+    pub fn wheel_speed(&self) -> Cow<'_, [f32]> {
+        floats(self.tensor_bytes(WHEEL_SPEED))
+    }
+
     /// Compares the hash of each lossless image, earlier frames included, with its pixels, and the frame
     /// hash with the images' hashes. JPEG images are skipped: they are hashed before encoding, and JPEG
     /// changes their pixels.
@@ -154,6 +168,13 @@ impl Observation {
     fn check_tensors(&self) -> Result<(), FrameError> {
         self.check_tensor(HISTORY_XYZ, Dtype::F32, &[HISTORY_POSES, 3])?;
         self.check_tensor(HISTORY_ROT, Dtype::F32, &[HISTORY_POSES, 3, 3])?;
+        // These are there only if the session asked for them.
+        for (name, columns) in [(IMU, &[6][..]), (WHEEL_SPEED, &[])] {
+            if let Some(info) = self.tensors.info(name) {
+                let samples = info.shape.first().copied().unwrap_or_default();
+                self.check_tensor(name, Dtype::F32, &[&[samples], columns].concat())?;
+            }
+        }
         for metadata in self.metadata.images.iter().chain(&self.metadata.history) {
             let image = self.view(metadata);
             let [width, height] = image.size();

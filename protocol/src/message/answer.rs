@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::drive::Drive;
 use super::open::{Dynamics, OnFailure, Outputs, RigCamera};
 use super::pose::Pose;
+use super::sensors::Sensors;
 use crate::error::Code;
 
 /// A text message from the server.
@@ -199,6 +200,9 @@ pub struct Opened {
     /// The repair of the images.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub repair: Option<OpenedRepair>,
+    /// Effects of the sensors, and the delay of the planner.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensors: Option<Sensors>,
     /// The scenario.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<OpenedScenario>,

@@ -10,6 +10,7 @@ mod drive;
 mod open;
 mod pose;
 mod request;
+mod sensors;
 
 pub use answer::{
     Answer, Limits, Opened, OpenedRepair, OpenedScenario, Outcome, ResumedSession, ServerInfo,
@@ -23,6 +24,10 @@ pub use open::{
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, SessionStep, TimedPose};
+pub use sensors::{
+    AxisNoise, CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, Imu, LateFrames, LensDirt,
+    Sensors, WheelSpeed,
+};
 
 /// What names are, as a regular expression.
 #[cfg(feature = "schema")]

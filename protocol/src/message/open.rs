@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::drive::DriveSection;
 use super::pose::Pose;
+use super::sensors::Sensors;
 use crate::camera::{Exposure, Lens, Shutter, Windshield};
 
 /// How the ego moves.
@@ -89,6 +90,9 @@ pub struct Open {
     /// The repair of images by a model of the server. If absent, images are as rendered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub repair: Option<Repair>,
+    /// Effects of the sensors, and the delay of the planner. If absent, none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensors: Option<Sensors>,
     /// The scenario to drive. If absent, there are no actors and no route.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<ScenarioChoice>,
@@ -131,6 +135,7 @@ impl Open {
             deadline_ms: None,
             decision_us: None,
             repair: None,
+            sensors: None,
             scenario: None,
             warm_up_us: None,
             trajectory: None,

@@ -23,6 +23,7 @@ use wildcity_twin::store::Version;
 
 use super::camera::{exposure_to, lens_and_windshield_to, shutter_to};
 use super::drive::{DriveRequest, drive};
+use super::sensors::sensors_to;
 
 /// Name of the server in `welcome`.
 const SERVER_NAME: &str = "wildcity";
@@ -116,6 +117,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
             .collect(),
         reserved_bytes: session.reserved_bytes(),
         repair: session.repair().map(opened_repair),
+        sensors: session.sensors().map(sensors_to),
         scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
     })

@@ -24,6 +24,7 @@ mod mistake;
 mod observation;
 mod request;
 mod rig;
+mod sensors;
 
 pub(crate) use answer::{AlsoResumed, closed, ok, opened, resumed, switched, twin, twins, welcome};
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};

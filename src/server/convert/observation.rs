@@ -21,6 +21,7 @@ use wildcity_session::{
 use wildcity_sim::scenario;
 
 use super::answer::{camera, encoding, pose, text};
+use super::sensors::image_sensor;
 
 /// Completes an observation: writes the header, which has the names of the tensors and the metadata, into
 /// the space that is reserved for it in the buffer.
@@ -35,6 +36,8 @@ pub(crate) fn observation(
         let name = match tensor.kind {
             TensorKind::HistoryXyz => "ego.history_xyz".to_owned(),
             TensorKind::HistoryRotation => "ego.history_rot".to_owned(),
+            TensorKind::Imu => "sensor.imu".to_owned(),
+            TensorKind::WheelSpeed => "sensor.wheel_speed".to_owned(),
             TensorKind::Depth(image) => format!("{}/depth", image_names[image]),
             TensorKind::Opacity(image) => format!("{}/opacity", image_names[image]),
             TensorKind::Normals(image) => format!("{}/normals", image_names[image]),
@@ -140,18 +143,21 @@ fn metadata(
             hash: hash.to_hex().to_string(),
             trust: None,
             repair: None,
+            sensor: None,
         }
     };
     let drawn = |(drawn, name): (&wildcity_session::ImageInfo, &String)| Image {
         pose: drawn.pose as u64,
         trust: drawn.trust.map(trust),
         repair: drawn.repair.map(repair),
+        sensor: drawn.sensor.map(image_sensor),
         ..image(drawn.camera, format!("{name}/rgb"), drawn.time_us, &drawn.hash)
     };
     let past = |past: &PastImageInfo| Image {
         back: past.back as u64,
         trust: past.trust.map(trust),
         repair: past.repair.map(repair),
+        sensor: past.sensor.map(image_sensor),
         ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash)
     };
     let timings = &frame.timings;

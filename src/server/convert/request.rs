@@ -23,6 +23,7 @@ use wildcity_sim::{Dynamics, EgoModel};
 use super::drive::DriveRequest;
 use super::field::{name_of, pose_of, poses_of};
 use super::rig::rig_of;
+use super::sensors::sensors_of;
 
 /// A text frame, checked as far as it can be without a session.
 #[derive(Debug)]
@@ -334,6 +335,7 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         deadline: open.deadline_ms.map(Duration::from_millis),
         decision_us: open.decision_us,
         repair: open.repair.map(repair_of),
+        sensors: open.sensors.map(sensors_of),
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
     Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })

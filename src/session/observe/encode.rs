@@ -31,8 +31,36 @@ pub(crate) struct EncodedImage {
     pub(crate) trust: Option<Trust>,
     /// What became of it, if the session asked for repair.
     pub(crate) repair: Option<ImageRepair>,
+    /// What its camera's effects changed, if there are any.
+    pub(crate) effects: Option<AppliedEffects>,
+    /// The pixels after these effects, of raw images.
+    pub(crate) changed: Vec<u8>,
     /// How long hashing and encoding took on its thread.
     pub(crate) took: Duration,
+}
+
+/// What the effects of a camera changed of an image.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct AppliedEffects {
+    /// BLAKE3 of the pixels before.
+    pub(crate) clean_hash: blake3::Hash,
+    /// Offset of the exposure, in stops; only with a drift.
+    pub(crate) stops: Option<f64>,
+}
+
+impl EncodedImage {
+    /// An image with nothing but a hash.
+    fn of(hash: blake3::Hash) -> Self {
+        Self {
+            hash,
+            file: Vec::new(),
+            trust: None,
+            repair: None,
+            effects: None,
+            changed: Vec::new(),
+            took: Duration::ZERO,
+        }
+    }
 }
 
 /// Hashes and encodes the pixels of an image. Runs on a render thread while other images are still
@@ -50,14 +78,14 @@ pub(crate) fn encode(
         Encoding::Jpeg(quality) => jpeg(rgb8, width, height, quality)?,
         Encoding::Png => png(rgb8, width, height)?,
     };
-    Ok(EncodedImage { hash, file, trust: None, repair: None, took: started.elapsed() })
+    Ok(EncodedImage { file, took: started.elapsed(), ..EncodedImage::of(hash) })
 }
 
 /// An image that is hashed and not encoded yet.
 pub(crate) fn hashed(rgb8: &[u8]) -> EncodedImage {
     let started = Instant::now();
     let hash = blake3::hash(rgb8);
-    EncodedImage { hash, file: Vec::new(), trust: None, repair: None, took: started.elapsed() }
+    EncodedImage { took: started.elapsed(), ..EncodedImage::of(hash) }
 }
 
 /// A JPEG file, 4:2:0, of `[height, width, 3]` pixels.

@@ -7,6 +7,7 @@ use super::trust::Trust;
 use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 use crate::repair::status::ImageRepair;
+use crate::sensors::ImageSensor;
 
 /// The frames that coming decisions will show, in the order in which they were taken. Copies share the
 /// frames' bytes.
@@ -18,7 +19,9 @@ pub(crate) struct FrameHistory(Vec<Arc<KeptFrame>>);
 pub(crate) struct PastFrame {
     /// Index of the camera.
     pub(crate) camera: usize,
-    /// When it was taken, in microseconds since the episode's start.
+    /// When it was due, in microseconds since the episode's start.
+    pub(crate) due_us: i64,
+    /// When it was taken, by the camera's clock.
     pub(crate) time_us: i64,
     /// BLAKE3 of its pixels.
     pub(crate) hash: blake3::Hash,
@@ -26,6 +29,8 @@ pub(crate) struct PastFrame {
     pub(crate) trust: Option<Trust>,
     /// What became of it, if the session asked for repair.
     pub(crate) repair: Option<ImageRepair>,
+    /// What the camera's effects did to it, if it has any.
+    pub(crate) sensor: Option<ImageSensor>,
     /// As it travels: a JPEG or PNG file, or raw pixels.
     pub(crate) bytes: Vec<u8>,
 }
@@ -48,22 +53,22 @@ impl FrameHistory {
         Ok(())
     }
 
-    /// The frame of a camera that was taken at a time, in microseconds.
-    pub(crate) fn find(&self, camera: usize, time_us: i64) -> Option<&PastFrame> {
+    /// The frame of a camera that was due at a time, in microseconds.
+    pub(crate) fn find(&self, camera: usize, due_us: i64) -> Option<&PastFrame> {
         let frames = self.0.iter().map(|kept| &kept.frame);
-        frames.into_iter().find(|frame| frame.camera == camera && frame.time_us == time_us)
+        frames.into_iter().find(|frame| frame.camera == camera && frame.due_us == due_us)
     }
 
-    /// The frames that were taken before a time, in microseconds.
+    /// The frames that were due before a time, in microseconds.
     pub(crate) fn before(&self, time_us: i64) -> Self {
-        Self(self.0.iter().filter(|kept| kept.frame.time_us < time_us).cloned().collect())
+        Self(self.0.iter().filter(|kept| kept.frame.due_us < time_us).cloned().collect())
     }
 
     /// These frames, and those of another history that this one lacks.
     #[must_use]
     pub(crate) fn or(mut self, other: &Self) -> Self {
         for kept in &other.0 {
-            if self.find(kept.frame.camera, kept.frame.time_us).is_none() {
+            if self.find(kept.frame.camera, kept.frame.due_us).is_none() {
                 self.0.push(kept.clone());
             }
         }
@@ -73,7 +78,6 @@ impl FrameHistory {
     /// Drops the frames that no decision at a time, in microseconds, or after it will show. Those that the
     /// observation of now shows stay: a snapshot of now shows them again.
     pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
-        self.0
-            .retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.time_us, time_us));
+        self.0.retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.due_us, time_us));
     }
 }

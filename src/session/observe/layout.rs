@@ -15,6 +15,10 @@ use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
 use crate::options::PixelMaps;
+use crate::sensors::EpisodeSensors;
+use crate::sensors::delivery::{Delivery, FrameSource};
+use crate::sensors::pixels::PixelEffects;
+use crate::sensors::settings::{CameraSensor, Sensors};
 
 /// The header's length, little-endian, comes before the header.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -30,6 +34,9 @@ const HEADER_IMAGE_BYTES: usize = 3584;
 
 /// Room in the header per image for what is told of its repair: three texts, one of them a hash.
 const REPAIR_IMAGE_BYTES: usize = 256;
+
+/// Room in the header per image for what is told of its camera's effects: five reasons, three numbers and a hash.
+const SENSOR_IMAGE_BYTES: usize = 512;
 
 /// Most images of one answer, whether of several poses or of several times.
 const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
@@ -55,6 +62,16 @@ pub(crate) struct ObservationLayout {
     scenario_bytes: usize,
     /// Room in the header per image.
     image_bytes: usize,
+    /// Effects of the sensors, if there are any.
+    sensors: Option<SensorLayout>,
+}
+
+/// The effects of a session's sensors.
+#[derive(Debug)]
+pub(crate) struct SensorLayout {
+    pub(crate) settings: Sensors,
+    /// Those of each camera, by its index.
+    cameras: Vec<CameraSensor>,
 }
 
 /// What is rendered at once: some cameras of the rig, at one pose and time.
@@ -62,12 +79,30 @@ pub(crate) struct ObservationLayout {
 pub(crate) struct RigCapture {
     /// Where the rig is.
     pub(crate) world_from_rig: Pose,
-    /// When, in microseconds since the episode's start.
+    /// When the pictures are taken, in microseconds since the episode's start.
     pub(crate) time_us: i64,
+    /// When the frames are due. Only a camera with effects shows a picture of an earlier time.
+    pub(crate) due_us: i64,
+    /// Whether sensors take them: not for `observe`, which shows the scene.
+    pub(crate) sensed: bool,
     /// Indices of the cameras; there may be none.
     pub(crate) cameras: Vec<usize>,
     /// Whether the observation shows the images now. Otherwise they are rendered for the frame history.
     pub(crate) shown: bool,
+}
+
+/// What the effects of an episode's sensors depend on, beside the time.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct EpisodeKey {
+    pub(crate) seed: u64,
+    /// Where the episode or its warm-up begins, in microseconds.
+    pub(crate) begin_us: i64,
+}
+
+impl EpisodeKey {
+    pub(crate) fn of(episode: &Episode) -> Self {
+        Self { seed: episode.seed(), begin_us: episode.begin_us() }
+    }
 }
 
 /// Bytes that the renderer writes straight into the observation's buffer.
@@ -115,6 +150,7 @@ impl ObservationLayout {
             schedule,
             scenario_bytes: 0,
             image_bytes: HEADER_IMAGE_BYTES,
+            sensors: None,
         };
         layout.check_size("outputs", layout.schedule.frames())?;
         Ok(layout)
@@ -122,7 +158,81 @@ impl ObservationLayout {
 
     /// Reserves room in the headers for what is told of repaired images. Comes before [`Self::reserve_header`].
     pub(crate) fn reserve_repair(&mut self) {
-        self.image_bytes = HEADER_IMAGE_BYTES + REPAIR_IMAGE_BYTES;
+        self.image_bytes += REPAIR_IMAGE_BYTES;
+    }
+
+    /// Adds effects of the sensors.
+    ///
+    /// # Errors
+    /// Names the first setting that is out of range, or `sensors` if the largest header would be longer than clients
+    /// accept.
+    pub(crate) fn add_sensors(
+        &mut self,
+        settings: Sensors,
+        dt_us: i64,
+    ) -> Result<(), SessionError> {
+        let cameras = settings.check(&self.cameras, &self.schedule, dt_us)?;
+        if !settings.cameras.is_empty() {
+            self.image_bytes += SENSOR_IMAGE_BYTES;
+        }
+        let images = self.schedule.frames() * self.cameras.len();
+        let most = limits::OBSERVATION_HEADER_BYTES as usize;
+        let needed = HEADER_BASE_BYTES + images * self.image_bytes;
+        if needed > most {
+            let must = format!(
+                "set for {images} images, whose header would have {needed} bytes; at most {most} are accepted: request \
+                 fewer images"
+            );
+            return Err(SessionError::OutOfRange { field: "sensors", must });
+        }
+        self.sensors = Some(SensorLayout { settings, cameras });
+        Ok(())
+    }
+
+    /// The settings of the sensors, if they have effects.
+    pub(crate) fn sensors(&self) -> Option<&Sensors> {
+        self.sensors.as_ref().map(|sensors| &sensors.settings)
+    }
+
+    /// The effects on a camera's images, if it has any.
+    pub(crate) fn sensor(&self, camera: usize) -> Option<&CameraSensor> {
+        let sensor = self.sensors.as_ref().map(|sensors| &sensors.cameras[camera]);
+        sensor.filter(|sensor| **sensor != CameraSensor::default())
+    }
+
+    /// What an episode keeps for its sensors; `None` without effects.
+    pub(crate) fn episode_sensors(&self) -> Option<EpisodeSensors> {
+        let SensorLayout { settings, cameras } = self.sensors.as_ref()?;
+        let reach_us = |(camera, sensor): (usize, &CameraSensor)| {
+            sensor.reach_us(self.schedule.period_us(camera))
+        };
+        let reach_us = cameras.iter().enumerate().map(reach_us).max().unwrap_or(0);
+        Some(EpisodeSensors::at_start(settings, reach_us))
+    }
+
+    /// What a camera delivers in an episode when a frame is due, in microseconds.
+    pub(crate) fn delivery(&self, camera: usize, of: EpisodeKey, due_us: i64) -> Delivery {
+        let changed = self.sensor(camera).filter(|sensor| sensor.changes_times());
+        let Some(sensor) = changed else {
+            return Delivery { stamp_us: due_us, taken_us: due_us, missing: None };
+        };
+        let name = &self.cameras[camera].name;
+        let period_us = self.schedule.period_us(camera);
+        let EpisodeKey { seed, begin_us } = of;
+        FrameSource { sensor, name, seed, period_us, begin_us }.at(due_us)
+    }
+
+    /// The effects on the pixels of a camera's picture of a time, in microseconds, if there are any.
+    pub(crate) fn pixel_effects(
+        &self,
+        camera: usize,
+        of: EpisodeKey,
+        taken_us: i64,
+    ) -> Option<PixelEffects> {
+        let sensor = self.sensor(camera)?;
+        let mounted = &self.cameras[camera];
+        let size_px = [mounted.camera.width_px, mounted.camera.height_px];
+        PixelEffects::of(sensor, of.seed, &mounted.name, taken_us, size_px)
     }
 
     pub(crate) fn cameras(&self) -> &[RigCamera] {
@@ -148,7 +258,7 @@ impl ObservationLayout {
 
     /// What to render for an observation of the present time of an episode: the frames that this observation
     /// or a later one contains and that are not in the history. One capture per time; the last one is that of
-    /// the present time, and may have no cameras.
+    /// the present time, and may have no cameras. Cameras whose picture is of another time have captures of their own.
     pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
         self.captures_beside(episode, &|camera, time_us| history.find(camera, time_us).is_some())
     }
@@ -161,19 +271,23 @@ impl ObservationLayout {
         is_kept: &dyn Fn(usize, i64) -> bool,
     ) -> Vec<RigCapture> {
         let now_us = episode.time_us();
-        let mut cameras_by_time = BTreeMap::from([(now_us, Vec::new())]);
+        // By the time when they are due, and that when their pictures are taken, which is not later.
+        let mut cameras_by_time = BTreeMap::from([([now_us, now_us], Vec::new())]);
         for camera in 0..self.cameras.len() {
-            for time_us in self.schedule.due(camera, now_us) {
-                if time_us >= episode.begin_us() && !is_kept(camera, time_us) {
-                    cameras_by_time.entry(time_us).or_default().push(camera);
+            for due_us in self.schedule.due(camera, now_us) {
+                if due_us >= episode.begin_us() && !is_kept(camera, due_us) {
+                    let taken_us = self.delivery(camera, EpisodeKey::of(episode), due_us).taken_us;
+                    cameras_by_time.entry([due_us, taken_us]).or_default().push(camera);
                 }
             }
         }
-        let capture = |(time_us, cameras)| RigCapture {
+        let capture = |([due_us, time_us], cameras): ([i64; 2], Vec<usize>)| RigCapture {
             world_from_rig: episode.pose_at(time_us),
             time_us,
+            due_us,
+            sensed: true,
             cameras,
-            shown: time_us == now_us && self.schedule.is_decision(now_us),
+            shown: due_us == now_us && self.schedule.is_decision(now_us),
         };
         cameras_by_time.into_iter().map(capture).collect()
     }
@@ -184,6 +298,8 @@ impl ObservationLayout {
         let capture = |world_from_rig| RigCapture {
             world_from_rig,
             time_us: episode.time_us(),
+            due_us: episode.time_us(),
+            sensed: false,
             cameras: cameras.clone(),
             shown: true,
         };
@@ -270,7 +386,7 @@ impl ObservationLayout {
 
     /// Whether a later observation shows a camera's image of a capture.
     pub(crate) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
-        !capture.shown || self.schedule.is_shown_after(camera, capture.time_us, capture.time_us)
+        !capture.shown || self.schedule.is_shown_after(camera, capture.due_us, capture.due_us)
     }
 
     /// The frames of the history that a decision shows beside those of its own time: camera by camera,

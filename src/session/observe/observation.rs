@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::buffer::ObservationBuffer;
 use super::trust::Trust;
 use crate::repair::status::ImageRepair;
+use crate::sensors::ImageSensor;
 
 /// A finished observation.
 #[derive(Debug)]
@@ -48,7 +49,7 @@ pub struct ImageInfo {
     pub camera: usize,
     /// Index of the pose among those of the request.
     pub pose: usize,
-    /// When it was taken, in microseconds since the episode's start.
+    /// When it was taken by the camera's clock, in microseconds since the episode's start.
     pub time_us: i64,
     /// BLAKE3 of the pixels, `[height, width, 3]`.
     pub hash: blake3::Hash,
@@ -56,6 +57,8 @@ pub struct ImageInfo {
     pub trust: Option<Trust>,
     /// What became of it, if the session asked for repair.
     pub repair: Option<ImageRepair>,
+    /// What its camera did to it, if the session asked for effects of this camera.
+    pub sensor: Option<ImageSensor>,
 }
 
 /// One earlier image of an [`Observation`].
@@ -65,7 +68,7 @@ pub struct PastImageInfo {
     pub camera: usize,
     /// Age in frames of this camera: 1 is the frame before the newest.
     pub back: usize,
-    /// When it was taken, in microseconds since the episode's start.
+    /// When it was taken by the camera's clock, in microseconds since the episode's start.
     pub time_us: i64,
     /// BLAKE3 of the pixels, `[height, width, 3]`.
     pub hash: blake3::Hash,
@@ -73,6 +76,8 @@ pub struct PastImageInfo {
     pub trust: Option<Trust>,
     /// What became of it, if the session asked for repair.
     pub repair: Option<ImageRepair>,
+    /// What its camera did to it, if the session asked for effects of this camera.
+    pub sensor: Option<ImageSensor>,
 }
 
 /// One tensor of an [`Observation`].
@@ -95,6 +100,10 @@ pub enum TensorKind {
     HistoryXyz,
     /// Rotations of the ego history: `[16, 3, 3]`.
     HistoryRotation,
+    /// Specific force and angular velocity of each step: `[n, 6]`.
+    Imu,
+    /// Speed of the wheels of each step: `[n]`.
+    WheelSpeed,
     /// Expected camera z in metres: `[height, width]`.
     Depth(usize),
     /// Accumulated opacity: `[height, width]`.

@@ -169,7 +169,7 @@ fn frames_taken(
 ) -> Result<Vec<KeptFrame>, BranchError> {
     let is_kept = |camera: usize, time_us: i64| {
         let mut all = kept.iter().flat_map(|frames| &frames.frames);
-        all.any(|one| one.capture.time_us == time_us && one.camera == camera)
+        all.any(|one| one.capture.due_us == time_us && one.camera == camera)
     };
     let mut hashes = frame.images.iter();
     let mut taken = Vec::new();
@@ -203,7 +203,7 @@ fn drop_unneeded(layout: &ObservationLayout, kept: &mut Vec<KeptFrames>, time_us
     let schedule = layout.schedule();
     for frames in kept.iter_mut() {
         let is_needed =
-            |one: &KeptFrame| schedule.is_shown_from(one.camera, one.capture.time_us, time_us);
+            |one: &KeptFrame| schedule.is_shown_from(one.camera, one.capture.due_us, time_us);
         frames.frames.retain(is_needed);
     }
     kept.retain(|frames| !frames.frames.is_empty());

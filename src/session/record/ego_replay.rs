@@ -1,10 +1,9 @@
 //! Drives a recorded episode again, command by command, and compares the poses with the recorded ones.
 
 use wildcity_scene::geometry::Pose;
-use wildcity_sim::ego::Path;
 use wildcity_sim::{Command, Ground};
 
-use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedCommand};
+use super::format::{EpisodeHeader, FrameRecord, FrameRequest};
 use crate::episode::Episode;
 use crate::error::SessionError;
 
@@ -57,12 +56,9 @@ impl EgoReplay {
         };
         let command = match &frame.command {
             None => Command::Pose(recorded),
-            Some(RecordedCommand::Action(action)) => Command::Action(*action),
-            Some(RecordedCommand::Trajectory(poses)) => {
-                Command::Path(Path::checked(poses.clone()).map_err(SessionError::Ego)?)
-            }
+            Some(recorded) => recorded.command().map_err(SessionError::Ego)?,
         };
-        self.episode = self.episode.followed(&command, frame.steps as usize, ground, false)?;
+        self.episode = self.episode.followed(&command, frame.steps as usize, ground, false)?.0;
         let now = self.episode.world_from_rig();
         Ok((now != recorded).then_some(DivergedStep { line, step: frame.step, recorded, now }))
     }

@@ -17,13 +17,14 @@ use wildcity_episode::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
-use wildcity_sim::ego::{Action, TimedPose};
-use wildcity_sim::{Command, Dynamics, Ego};
+use wildcity_sim::{Dynamics, Ego};
 
 use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
 use crate::observe::schedule::Schedule;
+use crate::record::command::RecordedCommand;
 use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
+use crate::sensors::settings::Sensors;
 
 /// This build, as it is named in records.
 pub(crate) const BUILD: &str = concat!("wildcity ", env!("CARGO_PKG_VERSION"));
@@ -95,6 +96,9 @@ pub struct RecordedSettings {
     pub trust: bool,
     /// Length of the warm-up, in microseconds.
     pub warm_up_us: i64,
+    /// Effects of the sensors; absent without.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensors: Option<Sensors>,
 }
 
 /// Where a branch begins.
@@ -150,6 +154,10 @@ pub struct FrameRecord {
     /// `time_us`, and those before it are in the warm-up.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub times_us: Vec<i64>,
+    /// When the frames at the poses were due, in microseconds; only if a camera delivered others than those that were
+    /// due. `times_us` says when their pictures were taken.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub due_us: Vec<i64>,
     /// What the agent noted, as it was sent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub notes: Option<Value>,
@@ -162,16 +170,6 @@ pub struct FrameRecord {
     /// What the repair model did, in the order of `images`; absent if it was used on none of them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub repairs: Vec<Option<RecordedImageRepair>>,
-}
-
-/// A command to the ego other than a pose.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RecordedCommand {
-    /// Acceleration and curvature.
-    Action(Action),
-    /// Poses to follow.
-    Trajectory(Vec<TimedPose>),
 }
 
 /// Another version of the twin, for the frames that follow.
@@ -234,6 +232,7 @@ impl RecordedSettings {
             schedule: Schedule::every_step(cameras, dt_us),
             trust: false,
             warm_up_us: 0,
+            sensors: None,
         }
     }
 }
@@ -267,20 +266,14 @@ impl FrameRecord {
         self.times_us.get(pose).copied().unwrap_or(otherwise)
     }
 
+    /// When the frames at a pose were due, in microseconds.
+    pub(crate) fn due_us(&self, pose: usize) -> i64 {
+        self.due_us.get(pose).copied().unwrap_or_else(|| self.taken_us(pose))
+    }
+
     /// The rendered cameras of a pose, by their index, of a rig with `rig_cameras`.
     pub fn cameras_of(&self, pose: usize, rig_cameras: usize) -> Vec<usize> {
         self.cameras.get(pose).cloned().unwrap_or_else(|| (0..rig_cameras).collect())
-    }
-}
-
-impl RecordedCommand {
-    /// The record of a command; `None` for a pose, which [`FrameRecord::poses`] has.
-    pub(crate) fn of(command: &Command) -> Option<Self> {
-        match command {
-            Command::Pose(_) => None,
-            Command::Path(path) => Some(Self::Trajectory(path.poses().to_vec())),
-            Command::Action(action) => Some(Self::Action(*action)),
-        }
     }
 }
 

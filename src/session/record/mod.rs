@@ -6,6 +6,7 @@
 
 mod actor_replay;
 pub(crate) mod branch_error;
+pub(crate) mod command;
 pub(crate) mod continuation;
 pub(crate) mod ego_replay;
 pub(crate) mod error;
@@ -16,4 +17,5 @@ mod repair_replay;
 pub(crate) mod repairs;
 pub(crate) mod replay;
 pub(crate) mod replay_report;
+mod sensor_replay;
 mod values;

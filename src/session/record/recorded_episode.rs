@@ -127,6 +127,9 @@ fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     if !frame.times_us.is_empty() && frame.times_us.len() != poses {
         return Err(format!("times of {} poses, but {poses} poses", frame.times_us.len()));
     }
+    if !frame.due_us.is_empty() && frame.due_us.len() != poses {
+        return Err(format!("due times of {} poses, but {poses} poses", frame.due_us.len()));
+    }
     if !frame.cameras.is_empty() && frame.cameras.len() != poses {
         return Err(format!("cameras for {} poses, but {poses} poses", frame.cameras.len()));
     }

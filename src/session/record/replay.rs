@@ -19,6 +19,7 @@ use super::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
     ReplayedImage, WrongValue,
 };
+use super::sensor_replay::SensorReplay;
 use super::values;
 use crate::repair::session_repair::RenderedImage;
 use crate::scenario::assets::FrameDetail;
@@ -95,6 +96,8 @@ struct Replay<'a> {
     frame_lines: &'a [usize],
     /// Set if images were repaired.
     repair: Option<RepairReplay<'a>>,
+    /// Set if sensors have effects.
+    sensors: Option<SensorReplay>,
     /// The buffers of each camera.
     images: Vec<RenderedImage>,
     report: ReplayReport,
@@ -143,6 +146,7 @@ impl<'a> Replay<'a> {
             actors,
             frame_lines: &episode.frame_lines,
             repair,
+            sensors: SensorReplay::new(header)?,
             images,
             report: ReplayReport {
                 images: 0,
@@ -209,6 +213,7 @@ impl<'a> Replay<'a> {
             }
             let views = self.render_pose(frame, pose, &selected)?;
             self.check_decision(frame, index, &selected, &views, [pose, next_image]);
+            self.check_delivery(frame, index, &selected, pose);
             for &camera in &selected {
                 let recorded = &frame.images[next_image];
                 let repair = frame.repairs.get(next_image).and_then(Option::as_ref);
@@ -221,17 +226,25 @@ impl<'a> Replay<'a> {
                     Some(RecordedImageRepair::Repaired(rendered)) => rendered,
                     Some(RecordedImageRepair::Failed(_)) | None => recorded,
                 };
-                let mut pairs = vec![(recorded_rendered, hash_of(&rendered.rgb8))];
+                let is_repaired = matches!(repair, Some(RecordedImageRepair::Repaired(_)));
+                let mut sensed = None;
+                if let (Some(sensors), false) = (&self.sensors, is_repaired) {
+                    let pixels = sensed.insert(rendered.rgb8.clone());
+                    sensors.apply(frame, pose, camera, pixels);
+                }
+                let rendered_pixels = sensed.as_deref().unwrap_or(&rendered.rgb8);
+                let mut pairs = vec![(recorded_rendered, hash_of(rendered_pixels))];
                 let mut repaired = None;
-                if let (Some(RecordedImageRepair::Repaired(_)), Some(model)) =
-                    (repair, &self.repair)
-                {
+                if let (true, Some(model)) = (is_repaired, &self.repair) {
                     repaired = model.repaired(mounted, rendered).map_err(|cause| {
                         let camera = mounted.name.clone();
                         ReplayError::Repair { step: frame.step, camera, cause: Box::new(cause) }
                     })?;
-                    match &repaired {
+                    match &mut repaired {
                         Some(pixels) => {
+                            if let Some(sensors) = &self.sensors {
+                                sensors.apply(frame, pose, camera, pixels);
+                            }
                             self.report.repaired.compared += 1;
                             pairs.push((recorded, hash_of(pixels)));
                         }
@@ -244,7 +257,7 @@ impl<'a> Replay<'a> {
                     step: frame.step,
                     pose,
                     camera: mounted,
-                    rgb8: repaired.as_deref().unwrap_or(&rendered.rgb8),
+                    rgb8: repaired.as_deref().unwrap_or(rendered_pixels),
                 };
                 visit(&image).map_err(|reason| {
                     let camera = image.camera.name.clone();
@@ -299,6 +312,22 @@ impl<'a> Replay<'a> {
                     now: text(is_chosen),
                 });
             }
+        }
+    }
+
+    /// Decides which picture each camera of a pose shows, and compares that with the record.
+    fn check_delivery(
+        &mut self,
+        frame: &FrameRecord,
+        index: usize,
+        selected: &[usize],
+        pose: usize,
+    ) {
+        let Some(sensors) = &self.sensors else { return };
+        let wrong = sensors.wrong_delivery(frame, pose, selected, self.ego.episode());
+        if let (Some([recorded, now]), None) = (wrong, &self.report.wrong_value) {
+            let line = self.frame_lines[index];
+            self.report.wrong_value = Some(WrongValue { line, field: "sensors", recorded, now });
         }
     }
 

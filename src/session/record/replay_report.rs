@@ -43,7 +43,7 @@ pub struct RepairedImages {
 pub struct WrongValue {
     /// Line of the episode's file, from 1.
     pub line: usize,
-    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, or one of the end: `outcome`, `steps`, `distance_m` ..
+    /// The field: `step`, `time_us`, `frame_hash`, `repairs`, `sensors`, or one of the end: `outcome`, `steps`, `distance_m` ..
     pub field: &'static str,
     /// As recorded.
     pub recorded: String,
@@ -150,6 +150,9 @@ pub enum ReplayError {
         /// Why.
         cause: Box<SessionError>,
     },
+    /// The recorded settings of the sensors are out of range.
+    #[error(transparent)]
+    Sensors(Box<SessionError>),
     /// The backend refused a frame.
     #[error("step {step}: {cause}")]
     Render {

@@ -18,7 +18,7 @@ pub(super) fn wrong_in_frame(
 
 /// The hash of the shown images must be that of their recorded hashes, which the replay compares with the pixels.
 fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Option<WrongValue> {
-    let hash_of = |images: &[String]| {
+    fn hash_of<'a>(images: impl IntoIterator<Item = &'a String>) -> String {
         let mut hasher = blake3::Hasher::new();
         for image in images {
             // A hash that is none differs from that of the pixels.
@@ -26,14 +26,23 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
             hasher.update(&bytes);
         }
         hasher.finalize().to_hex().to_string()
-    };
+    }
     let shown = match frame.request {
         FrameRequest::Observe => hash_of(&frame.images),
         FrameRequest::Reset | FrameRequest::Step | FrameRequest::Restore => {
-            // Those of the last pose; the others are earlier frames of a bundle.
-            let poses = frame.poses.len();
-            let last = poses.checked_sub(1).map_or(0, |k| frame.cameras_of(k, rig_cameras).len());
-            hash_of(&frame.images[frame.images.len().saturating_sub(last)..])
+            // Those of the poses that are due now, camera by camera; the others are earlier frames of a bundle. Without
+            // effects of sensors it is the last pose.
+            let mut images = frame.images.iter();
+            let mut shown: Vec<(usize, &String)> = Vec::new();
+            for pose in 0..frame.poses.len() {
+                let is_last = pose + 1 == frame.poses.len();
+                let of_pose = frame.cameras_of(pose, rig_cameras).into_iter().zip(&mut images);
+                let is_due = frame.due_us.get(pose) == Some(&frame.time_us);
+                let of_pose: Vec<_> = of_pose.collect();
+                shown.extend(of_pose.into_iter().filter(|_| is_last || is_due));
+            }
+            shown.sort_by_key(|(camera, _)| *camera);
+            hash_of(shown.into_iter().map(|(_, image)| image))
         }
     };
     // Between two decisions nothing is shown, even if a later observation shows what was rendered.

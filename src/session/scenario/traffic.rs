@@ -34,7 +34,10 @@ pub struct EpisodeTraffic {
     assets: ActorAssets,
     /// The longest exposure of a camera, in microseconds.
     exposure_us: i64,
-    /// Reaches back to the last observation and an exposure farther: the frames since then are drawn from it.
+    /// How old the pictures may be that sensors show, in microseconds.
+    reach_us: i64,
+    /// Reaches back to the last observation, and an exposure and the sensors' reach farther: the frames since then are
+    /// drawn from it.
     past: ActorPast,
 }
 
@@ -115,6 +118,7 @@ impl EpisodeTraffic {
             meets_twin: false,
             assets,
             exposure_us,
+            reach_us: 0,
             past,
             loaded,
         }
@@ -127,6 +131,11 @@ impl EpisodeTraffic {
         let is_met = |solids: &Arc<Solids>| solids.limit().is_exceeded_by(area_m2(solids));
         let meets_twin = solids.as_ref().is_some_and(is_met);
         Self { solids, meets_twin, ..self }
+    }
+
+    /// The same, and frames show pictures that are up to so many microseconds old.
+    pub(crate) fn with_reach(self, reach_us: i64) -> Self {
+        Self { reach_us, ..self }
     }
 
     /// The traffic after a step of `dt_us` in which the ego went from one state to another.
@@ -199,7 +208,7 @@ impl EpisodeTraffic {
     /// those of all steps.
     pub(crate) fn followed(&self, from: &Ego, egos: &[Ego], dt_us: i64) -> Self {
         let mut next = self.clone();
-        next.past.drop_before(self.world.time_us() - self.exposure_us);
+        next.past.drop_before(self.world.time_us() - self.exposure_us - self.reach_us);
         let mut from = from;
         let mut events = Vec::new();
         for ego in egos {

@@ -176,7 +176,11 @@ impl Session {
             normals: outputs.normals,
             instances: outputs.instances,
         };
-        let layout = ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
+        let mut layout =
+            ObservationLayout::new(cameras, outputs.encoding, maps, recorded.schedule)?;
+        if let Some(sensors) = recorded.sensors {
+            layout.add_sensors(sensors, header.dt_us)?;
+        }
         let layout = Arc::new(layout);
         let settings = SessionSettings {
             profile_overrides: recorded.profile_overrides,

@@ -35,6 +35,7 @@ use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
 use crate::repair::session_repair::SessionRepair;
 use crate::scenario::EpisodeTraffic;
+use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
 use crate::viewpoint::viewpoints;
@@ -136,6 +137,11 @@ impl Session {
     /// The repair of its images, if it asked for it.
     pub fn repair(&self) -> Option<&SessionRepair> {
         self.settings.repair.as_deref()
+    }
+
+    /// Effects of its sensors, if it asked for them.
+    pub fn sensors(&self) -> Option<&Sensors> {
+        self.settings.layout.sensors()
     }
 
     /// How the ego moves.

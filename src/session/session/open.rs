@@ -25,6 +25,7 @@ use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
+use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -124,6 +125,9 @@ impl Session {
         if repair.is_some() {
             layout.reserve_repair();
         }
+        if let Some(sensors) = options.sensors.and_then(Sensors::used) {
+            layout.add_sensors(sensors, dt_us)?;
+        }
         if let Some(found) = &loaded {
             let actors = found.loaded.scenario.traffic.actors.len();
             layout.reserve_header(if tells_actors { actors } else { 0 })?;
@@ -155,7 +159,9 @@ impl Session {
         // The memory for the worst frame anywhere in the twin.
         let reservation = Engine::reserve(resident.clone(), extent, profile).await?;
 
-        let episode = start.episode(options.seed, options.dynamics, dt_us);
+        let episode = start
+            .episode(options.seed, options.dynamics, dt_us)
+            .with_sensors(layout.episode_sensors());
         let settings = SessionSettings {
             profile_overrides: options.profile,
             rig_name: rig.name,
@@ -181,6 +187,7 @@ impl Session {
             let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
                 .with_solids(solids, episode.ego())
+                .with_reach(episode.reach_us())
         });
         let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
         Ok(Self::assembled(engine, name, Arc::new(settings), reservation, version, state))

@@ -60,8 +60,13 @@ impl Session {
     ) -> FrameRecord {
         let RenderedObservation { observation, captures, hashes, repairs, .. } = rendered;
         let all_cameras = self.settings.layout.cameras().len();
-        // Where the actors are in the warm-up depends on the time.
-        let needs_times = self.settings.scenario.is_some() && captures.len() > 1;
+        // Where the actors are in the warm-up depends on the time, and so do the effects of sensors.
+        let layout = &self.settings.layout;
+        let is_timed = self.settings.scenario.is_some()
+            || layout.sensors().is_some_and(|sensors| !sensors.cameras.is_empty());
+        let needs_times = is_timed && captures.len() > 1;
+        let is_other = captures.iter().any(|capture| capture.due_us != capture.time_us);
+        let due_us = captures.iter().map(|capture| capture.due_us);
         let times_us = captures.iter().map(|capture| capture.time_us).collect();
         let mut cameras: Vec<_> = captures.iter().map(|capture| capture.cameras.clone()).collect();
         if cameras.iter().all(|of_pose| of_pose.len() == all_cameras) {
@@ -76,6 +81,7 @@ impl Session {
             command: None,
             steps: 1,
             times_us: if needs_times { times_us } else { Vec::new() },
+            due_us: if is_other { due_us.collect() } else { Vec::new() },
             notes: None,
             terminated: episode.terminated(),
             frame_hash: observation.frame_hash.to_hex().to_string(),
@@ -218,6 +224,7 @@ fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<Recorded
         schedule: settings.layout.schedule().clone(),
         trust,
         warm_up_us: settings.warm_up_us,
+        sensors: settings.layout.sensors().cloned(),
     };
     let cameras = settings.layout.cameras().len();
     (recorded != RecordedSettings::default_of(cameras, settings.dt_us)).then_some(recorded)

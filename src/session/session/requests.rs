@@ -25,7 +25,8 @@ use crate::observe::layout::RigCapture;
 use crate::observe::observation::Observation;
 use crate::options::{ResetOptions, Start, StepOptions};
 use crate::pin::pin;
-use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
+use crate::record::command::RecordedCommand;
+use crate::record::format::{FrameRequest, Line, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
@@ -68,15 +69,10 @@ impl Session {
         check_notes(options.notes.as_ref())?;
         let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
         let now = &self.state.episode;
-        let mut next = now.followed(&command, steps, &ground, options.terminate)?;
-        let traffic = match &self.state.traffic {
-            None => None,
-            Some(traffic) => {
-                let dt_us = self.settings.dt_us;
-                let egos = now.ego().followed(&command, dt_us, steps, &ground)?;
-                Some(traffic.followed(now.ego(), &egos, dt_us))
-            }
-        };
+        let (mut next, egos) = now.followed(&command, steps, &ground, options.terminate)?;
+        let traffic = self.state.traffic.as_ref();
+        let traffic =
+            traffic.map(|traffic| traffic.followed(now.ego(), &egos, self.settings.dt_us));
         if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
             next.end(reason);
         }
@@ -87,7 +83,10 @@ impl Session {
         let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
-        record.command = RecordedCommand::of(&command);
+        record.command = match now.is_delayed() {
+            true => Some(RecordedCommand::of_any(&command)),
+            false => RecordedCommand::of(&command),
+        };
         record.notes = options.notes;
         if steps > 1 {
             record.steps = steps as u64;
@@ -191,12 +190,15 @@ impl Session {
             )
             .map_err(|error| error.of_reset(Some(start)))?,
         };
-        let mut next = start.episode(seed, dynamics, settings.dt_us);
+        let mut next = start
+            .episode(seed, dynamics, settings.dt_us)
+            .with_sensors(settings.layout.episode_sensors());
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
                 .with_solids(solids, next.ego())
+                .with_reach(next.reach_us())
         });
 
         let frame_history = FrameHistory::default();

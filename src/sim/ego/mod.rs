@@ -116,6 +116,14 @@ pub struct Ego {
     moved: bool,
 }
 
+/// A trajectory that is followed for several steps.
+struct Plan<'a> {
+    path: &'a Path,
+    reference: &'a ReferenceTrajectory,
+    /// The rig when it was made.
+    world_from_start: Pose,
+}
+
 /// Why a command or dynamics were refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EgoError {
@@ -342,29 +350,56 @@ impl Ego {
         if path.end_us() < end_us {
             return Err(EgoError::PathShort { end_us: path.end_us(), step_us: end_us });
         }
-        let step_s = step_us as f64 * 1e-6;
         let reference = path.reference();
         for index in 1..steps {
-            let before = &egos[index - 1];
-            let from_us = step_us * index as i64;
-            egos.push(match self.dynamics.model {
-                EgoModel::Teleport => {
-                    before.moved_to(self.world_from_rig * path.at(from_us + step_us), step_s)
-                }
-                EgoModel::Kinematic | EgoModel::Dynamic => {
-                    let start_from_rig = self.world_from_rig.inverse() * before.world_from_rig;
-                    let forward = start_from_rig.rotation * DVec3::X;
-                    let car = SingleTrackState {
-                        position_m: start_from_rig.position_m.truncate(),
-                        yaw_rad: forward.y.atan2(forward.x),
-                        ..before.car
-                    };
-                    let after = before.tracked(&reference, car, from_us, step_us);
-                    before.driven(after.relative_to(&car), step_s, ground)
-                }
-            });
+            let plan = Plan { path, reference: &reference, world_from_start: self.world_from_rig };
+            let since_us = step_us * index as i64;
+            egos.push(egos[index - 1].on_path(&plan, since_us, step_us, ground));
         }
         Ok(egos)
+    }
+
+    /// The ego after a step along a plan that was made `since_us` microseconds before the step, when the rig was at
+    /// `world_from_start`.
+    ///
+    /// # Errors
+    /// As [`Ego::stepped`]; the path must reach to the end of the step.
+    pub fn resumed(
+        &self,
+        command: &Command,
+        world_from_start: Pose,
+        since_us: i64,
+        step_us: i64,
+        ground: &Ground<'_>,
+    ) -> Result<Self, EgoError> {
+        let Command::Path(path) = command else { return self.stepped(command, step_us, ground) };
+        let end_us = since_us + step_us;
+        if path.end_us() < end_us {
+            return Err(EgoError::PathShort { end_us: path.end_us(), step_us: end_us });
+        }
+        let plan = Plan { path, reference: &path.reference(), world_from_start };
+        Ok(self.on_path(&plan, since_us, step_us, ground))
+    }
+
+    fn on_path(&self, plan: &Plan<'_>, since_us: i64, step_us: i64, ground: &Ground<'_>) -> Self {
+        let Plan { path, reference, world_from_start } = plan;
+        let step_s = step_us as f64 * 1e-6;
+        match self.dynamics.model {
+            EgoModel::Teleport => {
+                self.moved_to(*world_from_start * path.at(since_us + step_us), step_s)
+            }
+            EgoModel::Kinematic | EgoModel::Dynamic => {
+                let start_from_rig = world_from_start.inverse() * self.world_from_rig;
+                let forward = start_from_rig.rotation * DVec3::X;
+                let car = SingleTrackState {
+                    position_m: start_from_rig.position_m.truncate(),
+                    yaw_rad: forward.y.atan2(forward.x),
+                    ..self.car
+                };
+                let after = self.tracked(reference, car, since_us, step_us);
+                self.driven(after.relative_to(&car), step_s, ground)
+            }
+        }
     }
 
     /// The dynamics that it was created with.

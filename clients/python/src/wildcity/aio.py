@@ -36,6 +36,7 @@ from .protocol import (
     Repair,
     Resumed,
     Rig,
+    Sensors,
     SnapshotPoint,
     Station,
     Step,
@@ -98,6 +99,7 @@ class Client:
         warm_up_us: int | None = None,
         scenario: str | Mapping[str, Any] | None = None,
         repair: str | Repair | None = None,
+        sensors: Sensors | None = None,
         trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
@@ -105,7 +107,8 @@ class Client:
         A connection can have 64 sessions; while one is open, the next needs a name, `session`.
 
         `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
-        `repair` is the name of a model of the server's that repairs images, or a `Repair`.
+        `repair` is the name of a model of the server's that repairs images, or a `Repair`. `sensors` has effects of
+        cameras and other sensors: lost frames, noise and the like.
 
         Raises `Refused` if the server refuses.
         """
@@ -126,6 +129,7 @@ class Client:
                 warm_up_us=warm_up_us,
                 scenario=scenario,
                 repair=repair,
+                sensors=sensors,
                 trajectory=trajectory,
             )
         )

@@ -68,6 +68,18 @@ class Observation:
         return self.tensor("ego.history_rot")
 
     @property
+    def imu(self) -> NDArray[np.float32]:
+        """float32 [n, 6]: specific force (m/s²) and angular velocity (rad/s) in the rig's axes, for each step since
+        the observation before; the last is at `metadata.time_us`. Raises `KeyError` unless the session asked for it."""
+        return self.tensor("sensor.imu")
+
+    @property
+    def wheel_speed(self) -> NDArray[np.float32]:
+        """float32 [n]: speed in m/s as the wheels measure it, at the times of `imu`. Raises `KeyError` unless the
+        session asked for it."""
+        return self.tensor("sensor.wheel_speed")
+
+    @property
     def images(self) -> Mapping[str, NDArray[np.uint8]]:
         """Colour images by camera, uint8 [height, width, 3]."""
         return self.views[0].images
@@ -129,6 +141,10 @@ class Observation:
     def _check(self) -> None:
         self._expect("ego.history_xyz", "F32", (HISTORY_POSES, 3))
         self._expect("ego.history_rot", "F32", (HISTORY_POSES, 3, 3))
+        for name, per_sample in (("sensor.imu", (6,)), ("sensor.wheel_speed", ())):
+            if name in self._tensors:
+                samples = self._tensors[name].shape[:1] or (0,)
+                self._expect(name, "F32", (*samples, *per_sample))
         for image in (*self.metadata.images, *self.metadata.history):
             size = (image.height, image.width)
             if image.encoding == "raw":

@@ -300,6 +300,98 @@ class Repair:
 
 
 @dataclass(frozen=True)
+class LateFrames:
+    """Frames that arrive `by_us` late with the probability `chance`. `by_us` is a whole number of the camera's frames."""
+
+    chance: float
+    by_us: int
+
+
+@dataclass(frozen=True)
+class FrozenFrames:
+    """Intervals of `for_us` in which the picture stands still with the probability `chance`."""
+
+    chance: float
+    for_us: int
+
+
+@dataclass(frozen=True)
+class ImageNoise:
+    """Shot and read noise in linear light: `full_well` electrons at white, and the deviation `read` in electrons."""
+
+    full_well: float
+    read: float
+
+
+@dataclass(frozen=True)
+class ExposureDrift:
+    """An exposure that wanders with the deviation `stops`; a new value is drawn every `period_us`."""
+
+    stops: float
+    period_us: int
+
+
+@dataclass(frozen=True)
+class LensDirt:
+    """Dark, round spots on the lens. `radius` is a fraction of the width, `opacity` of the light that is taken."""
+
+    spots: int
+    radius: float
+    opacity: float
+
+
+@dataclass(frozen=True)
+class CameraSensor:
+    """Effects on a camera's images. Those that are None are off. `drop` is the probability that a frame is lost."""
+
+    drop: float | None = None
+    late: LateFrames | None = None
+    freeze: FrozenFrames | None = None
+    noise: ImageNoise | None = None
+    exposure: ExposureDrift | None = None
+    dirt: LensDirt | None = None
+
+
+@dataclass(frozen=True)
+class AxisNoise:
+    """Standard deviations of a sample's noise and of the bias of an axis."""
+
+    noise: float = 0.0
+    bias: float = 0.0
+
+
+@dataclass(frozen=True)
+class Imu:
+    """An inertial measurement unit: m/s² and rad/s. Errors that are None are off."""
+
+    accelerometer: AxisNoise | None = None
+    gyroscope: AxisNoise | None = None
+    bias_period_us: int | None = None
+
+
+@dataclass(frozen=True)
+class WheelSpeed:
+    """The measured speed of the wheels: `noise` in m/s, and the deviation `scale` of its scale."""
+
+    noise: float = 0.0
+    scale: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Effects of the sensors, drawn with the episode's seed, and the delay after which a decision takes effect.
+
+    `cameras` has effects by the camera's name. With `imu` and `wheel_speed` observations have `Observation.imu` and
+    `Observation.wheel_speed`.
+    """
+
+    cameras: dict[str, CameraSensor] | None = None
+    imu: Imu | None = None
+    wheel_speed: WheelSpeed | None = None
+    delay_us: int | None = None
+
+
+@dataclass(frozen=True)
 class ServerInfo:
     """Name and version of the server."""
 
@@ -403,6 +495,7 @@ class Opened:
     trajectories: tuple[TrajectoryInfo, ...]
     reserved_bytes: int
     repair: OpenedRepair | None = None
+    sensors: Sensors | None = None
     scenario: OpenedScenario | None = None
     trajectory: Drive | None = None
 
@@ -544,6 +637,22 @@ class ImageRepair:
 
 
 @dataclass(frozen=True)
+class ImageSensor:
+    """What a camera with effects did to an image.
+
+    `due_us` is when the frame was due, and `taken_us` when its picture was taken. `clean_hash` is BLAKE3 of the pixels
+    before noise, exposure and dirt; None if the camera has none of them.
+    """
+
+    status: Literal["ok", "degraded"]
+    reasons: tuple[Literal["dropped", "late", "frozen", "noise", "exposure", "dirt"], ...]
+    due_us: int
+    taken_us: int
+    stops: float | None = None
+    clean_hash: str | None = None
+
+
+@dataclass(frozen=True)
 class ImageInfo:
     """Metadata of one image: its camera, the index of the request's pose, size, intrinsics, times, hash.
 
@@ -573,6 +682,7 @@ class ImageInfo:
     back: int = 0
     trust: Trust | None = None
     repair: ImageRepair | None = None
+    sensor: ImageSensor | None = None
 
 
 @dataclass(frozen=True)
@@ -758,7 +868,10 @@ def decode(kind: Any, value: Any, path: str) -> Any:
     if origin is tuple:
         return _decode_tuple(arguments, value, path)
     if origin is dict or kind is dict:
-        return value if isinstance(value, dict) else _mismatch(path, value, "an object")
+        if not isinstance(value, dict):
+            return _mismatch(path, value, "an object")
+        of_values = arguments[1] if arguments else Any
+        return {name: decode(of_values, item, f"{path}.{name}") for name, item in value.items()}
     if dataclasses.is_dataclass(kind):
         return _decode_dataclass(kind, value, path)
     if type(value) is not kind:

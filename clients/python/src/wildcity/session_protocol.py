@@ -35,6 +35,7 @@ from .protocol import (
     Repair,
     Resumed,
     Rig,
+    Sensors,
     SnapshotPoint,
     Station,
     Step,
@@ -89,6 +90,7 @@ class SessionProtocol:
         warm_up_us: int | None = None,
         scenario: str | Mapping[str, Any] | None = None,
         repair: str | Repair | None = None,
+        sensors: Sensors | None = None,
         trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
@@ -105,6 +107,7 @@ class SessionProtocol:
             "warm_up_us": warm_up_us,
             "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
             "repair": encode(Repair(repair) if isinstance(repair, str) else repair),
+            "sensors": encode(sensors),
             "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}

@@ -15,6 +15,9 @@ use crate::observe::observation::{
 use crate::observe::trust::Trust;
 use crate::options::PixelMaps;
 use crate::repair::status::ImageRepair;
+use crate::sensors::delivery::Delivery;
+use crate::sensors::settings::CameraSensor;
+use crate::sensors::{ImageSensor, SensorReason};
 
 /// A finished observation, and what it leaves for its record and for later observations.
 pub(crate) struct RenderedObservation {
@@ -63,7 +66,8 @@ impl ObservationBuilder {
             past_images = self.append_earlier_frames(&mut frame_history, &mut tensors)?;
         }
 
-        let images: Vec<ImageInfo> = shown.into_iter().map(|image| image.info).collect();
+        let mut images: Vec<ImageInfo> = shown.into_iter().map(|image| image.info).collect();
+        images.sort_by_key(|image| [image.pose, image.camera]);
         let frame_hash = frame_hash(images.iter().map(|image| image.hash));
         Ok(RenderedObservation {
             observation: Observation {
@@ -94,17 +98,51 @@ impl ObservationBuilder {
             for &camera in &capture.cameras {
                 if capture.shown {
                     let EncodedImage { hash, trust, repair, .. } = self.encoded[encoded];
-                    let time_us = capture.time_us;
+                    let (time_us, sensor) = self.delivered(capture, camera, encoded);
                     shown.push(ShownImage {
-                        info: ImageInfo { camera, pose, time_us, hash, trust, repair },
+                        info: ImageInfo { camera, pose, time_us, hash, trust, repair, sensor },
                         encoded,
                     });
                 }
                 encoded += 1;
             }
-            pose += usize::from(capture.shown);
+            // A step has one pose, even if a camera shows a picture that was taken from another.
+            pose += usize::from(capture.shown && !capture.sensed);
         }
         shown
+    }
+
+    /// When an image was taken by its camera's clock, in microseconds, and what the camera did to it.
+    fn delivered(
+        &self,
+        capture: &RigCapture,
+        camera: usize,
+        encoded: usize,
+    ) -> (i64, Option<ImageSensor>) {
+        if !capture.sensed || self.layout.sensor(camera).is_none() {
+            return (capture.time_us, None);
+        }
+        let Delivery { stamp_us, taken_us, missing } =
+            self.layout.delivery(camera, self.key, capture.due_us);
+        let has_effects = |sensor: &CameraSensor| {
+            [
+                missing,
+                (taken_us < stamp_us).then_some(SensorReason::Frozen),
+                sensor.noise.map(|_| SensorReason::Noise),
+                sensor.exposure.map(|_| SensorReason::Exposure),
+                sensor.dirt.map(|_| SensorReason::Dirt),
+            ]
+        };
+        let reasons = self.layout.sensor(camera).map_or([None; 5], has_effects);
+        let effects = self.encoded[encoded].effects;
+        let sensor = ImageSensor {
+            due_us: capture.due_us,
+            taken_us,
+            reasons,
+            stops: effects.and_then(|effects| effects.stops),
+            clean_hash: effects.map(|effects| effects.clean_hash),
+        };
+        (stamp_us, Some(sensor))
     }
 
     /// Appends the files of the shown images. Raw pixels are in the buffer already.
@@ -125,8 +163,22 @@ impl ObservationBuilder {
         let poses = limits::HISTORY_POSES;
         tensors.push(TensorKind::HistoryXyz, DType::F32, vec![poses, 3]);
         tensors.push(TensorKind::HistoryRotation, DType::F32, vec![poses, 3, 3]);
+        let [imu, wheel_speed] = self.motion_samples;
+        if let Some(samples) = imu {
+            tensors.push(TensorKind::Imu, DType::F32, vec![samples, 6]);
+        }
+        if let Some(samples) = wheel_speed {
+            tensors.push(TensorKind::WheelSpeed, DType::F32, vec![samples]);
+        }
         let PixelMaps { depth, opacity, normals, instances } = layout.maps();
-        for (index, image) in shown.iter().enumerate() {
+        // Each with its place among the images.
+        let place = |image: &ShownImage| {
+            let key = |one: &ShownImage| [one.info.pose, one.info.camera];
+            shown.iter().filter(|other| key(other) < key(image)).count()
+        };
+        let placed: Vec<(usize, &ShownImage)> =
+            shown.iter().map(|image| (place(image), image)).collect();
+        for &(index, image) in &placed {
             let [height, width] = layout.size_px(image.info.camera);
             if depth {
                 tensors.push(TensorKind::Depth(index), DType::F32, vec![height, width]);
@@ -138,11 +190,11 @@ impl ObservationBuilder {
                 tensors.push(TensorKind::Normals(index), DType::F32, vec![height, width, 3]);
             }
         }
-        for (index, image) in shown.iter().enumerate().filter(|_| instances) {
+        for &(index, image) in placed.iter().filter(|_| instances) {
             let [height, width] = layout.size_px(image.info.camera);
             tensors.push(TensorKind::Instances(index), DType::U16, vec![height, width]);
         }
-        for (index, image) in shown.iter().enumerate() {
+        for &(index, image) in &placed {
             let file_bytes = self.encoded[image.encoded].file.len();
             let shape = layout.colour_shape(image.info.camera, file_bytes);
             tensors.push(TensorKind::Rgb(index), DType::U8, shape);
@@ -157,22 +209,25 @@ impl ObservationBuilder {
         history: &mut FrameHistory,
         tensors: &mut TensorList,
     ) -> Result<Vec<PastImageInfo>, SessionError> {
-        let Some(now_us) = self.captures.last().map(|capture| capture.time_us) else {
+        let Some(now_us) = self.captures.last().map(|capture| capture.due_us) else {
             return Ok(Vec::new());
         };
-        let layout = &self.layout;
-        let mut encoded = self.encoded.iter_mut();
+        let mut index = 0;
         for capture in &self.captures {
-            for (&camera, image) in capture.cameras.iter().zip(&mut encoded) {
-                if layout.is_shown_later(capture, camera) {
-                    let EncodedImage { hash, trust, repair, .. } = *image;
-                    let bytes = mem::take(&mut image.file);
-                    let time_us = capture.time_us;
-                    let frame = PastFrame { camera, time_us, hash, trust, repair, bytes };
+            for &camera in &capture.cameras {
+                if self.layout.is_shown_later(capture, camera) {
+                    let (time_us, sensor) = self.delivered(capture, camera, index);
+                    let EncodedImage { hash, trust, repair, .. } = self.encoded[index];
+                    let bytes = mem::take(&mut self.encoded[index].file);
+                    let due_us = capture.due_us;
+                    let frame =
+                        PastFrame { camera, due_us, time_us, hash, trust, repair, sensor, bytes };
                     history.add(&self.budget, frame)?;
                 }
+                index += 1;
             }
         }
+        let layout = &self.layout;
 
         let mut past_images = Vec::new();
         if layout.schedule().is_decision(now_us) {
@@ -180,11 +235,20 @@ impl ObservationBuilder {
             let files: Vec<&[u8]> = earlier.iter().map(|one| &one.frame.bytes[..]).collect();
             self.buffer.append(&self.budget, &files)?;
             for (index, one) in earlier.iter().enumerate() {
-                let PastFrame { camera, time_us, hash, trust, repair, ref bytes } = *one.frame;
+                let PastFrame { camera, time_us, hash, trust, repair, sensor, ref bytes, .. } =
+                    *one.frame;
                 let shape = layout.colour_shape(camera, bytes.len());
                 tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
                 let back = one.back;
-                past_images.push(PastImageInfo { camera, back, time_us, hash, trust, repair });
+                past_images.push(PastImageInfo {
+                    camera,
+                    back,
+                    time_us,
+                    hash,
+                    trust,
+                    repair,
+                    sensor,
+                });
             }
         }
         history.drop_unneeded(layout.schedule(), now_us);

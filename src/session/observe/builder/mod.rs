@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 use wildcity_render::{Backend, Frame, FrameStats, Target, View};
 
 use super::buffer::ObservationBuffer;
-use super::encode::{EncodedImage, Encoding, encode, hashed};
-use super::layout::{InPlaceBytes, ObservationLayout, RigCapture};
+use super::encode::{AppliedEffects, EncodedImage, Encoding, encode, hashed};
+use super::layout::{EpisodeKey, InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
@@ -21,6 +21,7 @@ use crate::error::SessionError;
 use crate::options::PixelMaps;
 use crate::repair::session_repair::SessionRepair;
 use crate::repair::status::{ImageRepair, RepairStatus};
+use crate::sensors::pixels::PixelEffects;
 
 use self::repair::{Finished, ObservationRepair};
 
@@ -34,6 +35,10 @@ pub(crate) struct ObservationBuilder {
     repair: Option<ObservationRepair>,
     buffer: ObservationBuffer,
     history_count: usize,
+    /// What the effects of the sensors depend on.
+    key: EpisodeKey,
+    /// Number of samples of the inertial measurement unit and of the wheels; `None` without.
+    motion_samples: [Option<usize>; 2],
     /// Where the next shown image's floats go, in bytes from the buffer's start.
     floats_at: usize,
     /// Where the next shown image's instances go, in bytes from the buffer's start.
@@ -60,9 +65,13 @@ impl ObservationBuilder {
         layout.check_size("poses", captures.iter().filter(|capture| capture.shown).count())?;
         let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
-        let history = history.concat();
+        let mut history = history.concat();
+        let motion_samples = match captures.iter().any(|capture| capture.sensed) {
+            true => add_motion(&mut history, &layout, episode),
+            false => [None; 2],
+        };
 
-        // | header | ego history | floats of all captures | instances of all | raw pixels of all |
+        // | header | ego history, motion | floats of all captures | instances of all | raw pixels of all |
         let header = layout.header_bytes(captures);
         let floats_at = header + history.len();
         let in_place = captures.iter().map(|capture| layout.in_place_bytes(capture));
@@ -84,6 +93,8 @@ impl ObservationBuilder {
             repair: None,
             buffer,
             history_count: count,
+            key: EpisodeKey::of(episode),
+            motion_samples,
             floats_at,
             instances_at,
             raw_at,
@@ -132,13 +143,25 @@ impl ObservationBuilder {
             model_needs(SessionRepair::needs_normals) && !(normals && capture.shown);
         let extra_values =
             u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
-        let _share = self.budget.reserve(4 * pixels * extra_values)?;
+        // Noise and the like are computed on copies.
+        let key = self.key;
+        let effects = |camera: &usize| match capture.sensed {
+            true => layout.pixel_effects(*camera, key, capture.time_us),
+            false => None,
+        };
+        let effects: Vec<Option<PixelEffects>> = capture.cameras.iter().map(effects).collect();
+        let has_effects = effects.iter().any(Option::is_some);
+        let copied = 3 * pixels * u64::from(has_effects);
+        let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
         let mut opacity_maps = zeroed_maps(frame.views, 1, needs_opacity);
         let mut depth_maps_m = zeroed_maps(frame.views, 1, needs_depth);
         let mut normal_maps = zeroed_maps(frame.views, 3, needs_normals);
 
         // Where the renderer writes.
-        let raw_at = gate.as_ref().map_or(Vec::new(), |_| self.raw_places(capture));
+        let raw_at = match gate.is_some() || has_effects {
+            true => self.raw_places(capture),
+            false => Vec::new(),
+        };
         let mut targets = self.targets(capture, scratch);
         for (target, opacity) in targets.iter_mut().zip(&mut opacity_maps) {
             target.opacity = Some(opacity);
@@ -165,11 +188,14 @@ impl ObservationBuilder {
             let repair = repair.map(|(gate, trust)| gate.finished(index, trust.value, target));
             let mut image = match &repair {
                 Some(Finished { candidate: Some(_), .. }) => Ok(hashed(pixels)),
-                _ => encoded(&layout, camera, pixels, layout.is_shown_later(capture, camera)),
+                _ => {
+                    let is_later = layout.is_shown_later(capture, camera);
+                    encoded(&layout, camera, pixels, is_later, effects[index].as_ref())
+                }
             };
             if let Ok(image) = &mut image {
                 image.trust = trust.filter(|_| tells_trust);
-                let rendered_hash = image.hash;
+                let rendered_hash = image.effects.map_or(image.hash, |effects| effects.clean_hash);
                 image.repair = repair
                     .is_some()
                     .then_some(ImageRepair { status: RepairStatus::Kept, rendered_hash });
@@ -184,14 +210,18 @@ impl ObservationBuilder {
 
         let first = self.encoded.len();
         let mut repairs = Vec::new();
-        for (slot, &camera) in slots.into_iter().zip(&capture.cameras) {
+        for (view, (slot, &camera)) in slots.into_iter().zip(&capture.cameras).enumerate() {
             let never = || (Err("it was never finished".to_owned()), None);
             let (image, repair) = slot.into_inner().unwrap_or_else(never);
             repairs.extend(repair);
-            let image = image.map_err(|reason| {
+            let mut image = image.map_err(|reason| {
                 let camera = layout.cameras()[camera].name.clone();
                 SessionError::Encode { camera, reason }
             })?;
+            let changed = mem::take(&mut image.changed);
+            if let (false, Some(&Some(at))) = (changed.is_empty(), raw_at.get(view)) {
+                self.buffer.bytes_mut()[at..at + changed.len()].copy_from_slice(&changed);
+            }
             self.timings.encode += image.took;
             self.encoded.push(image);
         }
@@ -298,19 +328,59 @@ impl ObservationBuilder {
 /// What a render thread leaves of a view: the image, and what the selection needs if there is one.
 type FinishedView = (Result<EncodedImage, String>, Option<Finished>);
 
-/// The hash and the file of a camera's image; of raw pixels a copy if a later observation shows them.
+/// The hash and the file of a camera's image after the effects on its pixels; of raw pixels a copy if there are
+/// effects, and another if a later observation shows them.
 fn encoded(
     layout: &ObservationLayout,
     camera: usize,
     pixels: &[u8],
     is_shown_later: bool,
+    effects: Option<&PixelEffects>,
 ) -> Result<EncodedImage, String> {
     let [height, width] = layout.size_px(camera).map(|side| side as u32);
-    let mut image = encode(pixels, width, height, layout.encoding())?;
-    if layout.encoding() == Encoding::Raw && is_shown_later {
-        image.file = pixels.to_vec();
+    let Some(effects) = effects else {
+        let mut image = encode(pixels, width, height, layout.encoding())?;
+        if layout.encoding() == Encoding::Raw && is_shown_later {
+            image.file = pixels.to_vec();
+        }
+        return Ok(image);
+    };
+    let started = Instant::now();
+    let clean_hash = blake3::hash(pixels);
+    let mut changed = pixels.to_vec();
+    effects.apply(&mut changed, width as usize);
+    let took = started.elapsed();
+    let mut image = encode(&changed, width, height, layout.encoding())?;
+    image.took += took;
+    image.effects = Some(AppliedEffects { clean_hash, stops: effects.stops });
+    if layout.encoding() == Encoding::Raw {
+        if is_shown_later {
+            image.file.clone_from(&changed);
+        }
+        image.changed = changed;
     }
     Ok(image)
+}
+
+/// Appends the samples of an episode's motion as the sensors measure it: those of the inertial measurement unit, then
+/// those of the wheels. Returns how many each has; `None` without.
+fn add_motion(
+    bytes: &mut Vec<u8>,
+    layout: &ObservationLayout,
+    episode: &Episode,
+) -> [Option<usize>; 2] {
+    let Some(sensors) = layout.sensors() else { return [None; 2] };
+    let seed = episode.seed();
+    let samples = episode.motion();
+    if let Some(imu) = &sensors.imu {
+        let measured = samples.iter().flat_map(|sample| sample.imu(imu, seed));
+        bytes.extend(measured.flat_map(f32::to_le_bytes));
+    }
+    if let Some(wheels) = &sensors.wheel_speed {
+        let measured = samples.iter().map(|sample| sample.wheel_speed(wheels, seed));
+        bytes.extend(measured.flat_map(f32::to_le_bytes));
+    }
+    [sensors.imu.map(|_| samples.len()), sensors.wheel_speed.map(|_| samples.len())]
 }
 
 /// A map of zeros, so many per pixel, for each view; none at all unless `needed`.

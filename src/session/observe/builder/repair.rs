@@ -185,18 +185,24 @@ impl ObservationBuilder {
                     }
                 }
             }
-            if let Some(at) = raw_at {
-                self.buffer.bytes_mut()[at..at + pixels.len()].copy_from_slice(&pixels);
-            }
+            let effects = capture
+                .as_ref()
+                .filter(|capture| capture.sensed)
+                .and_then(|capture| self.layout.pixel_effects(camera, self.key, capture.time_us));
             let is_later =
                 capture.as_ref().is_some_and(|capture| self.layout.is_shown_later(capture, camera));
-            let done = encoded(&self.layout, camera, &pixels, is_later)
+            let done = encoded(&self.layout, camera, &pixels, is_later, effects.as_ref())
                 .map_err(|reason| SessionError::Encode { camera: mounted.name.clone(), reason })?;
+            if let Some(at) = raw_at {
+                let sent = if done.changed.is_empty() { &pixels } else { &done.changed };
+                self.buffer.bytes_mut()[at..at + sent.len()].copy_from_slice(sent);
+            }
             let rendered = &mut self.encoded[index];
             let rendered_hash = rendered.hash;
             self.timings.encode += done.took;
             rendered.hash = done.hash;
             rendered.file = done.file;
+            rendered.effects = done.effects;
             rendered.repair = Some(ImageRepair { status, rendered_hash });
         }
         if let Some(repair) = &mut self.repair {

@@ -1,0 +1,50 @@
+//! Commands to the ego, as records and waiting decisions have them.
+
+use serde::{Deserialize, Serialize};
+
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::ego::{Action, Path, TimedPose};
+use wildcity_sim::{Command, EgoError};
+
+/// A command to the ego.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RecordedCommand {
+    /// Acceleration and curvature.
+    Action(Action),
+    /// Poses to follow.
+    Trajectory(Vec<TimedPose>),
+    /// A pose that is reached later: only with a delay of the planner.
+    Pose(Pose),
+}
+
+impl RecordedCommand {
+    /// The record of a command; `None` for a pose, which the poses of its frame have.
+    pub(crate) fn of(command: &Command) -> Option<Self> {
+        match command {
+            Command::Pose(_) => None,
+            Command::Path(_) | Command::Action(_) => Some(Self::of_any(command)),
+        }
+    }
+
+    /// The record of any command, a pose included.
+    pub(crate) fn of_any(command: &Command) -> Self {
+        match command {
+            Command::Pose(pose) => Self::Pose(*pose),
+            Command::Path(path) => Self::Trajectory(path.poses().to_vec()),
+            Command::Action(action) => Self::Action(*action),
+        }
+    }
+
+    /// The command.
+    ///
+    /// # Errors
+    /// A recorded path is none.
+    pub(crate) fn command(&self) -> Result<Command, EgoError> {
+        Ok(match self {
+            Self::Pose(pose) => Command::Pose(*pose),
+            Self::Action(action) => Command::Action(*action),
+            Self::Trajectory(poses) => Command::Path(Path::checked(poses.clone())?),
+        })
+    }
+}

@@ -1,0 +1,126 @@
+//! Checks what a session asks of its sensors.
+
+use std::ops::RangeInclusive;
+
+use wildcity_scene::rig::RigCamera;
+
+use super::settings::{
+    CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, LateFrames, LensDirt, Sensors,
+    WheelSpeed,
+};
+use crate::error::SessionError;
+use crate::limits::{self, SENSOR_REACH_US};
+use crate::observe::schedule::Schedule;
+
+impl Sensors {
+    /// The effects of each camera, by its index.
+    ///
+    /// # Errors
+    /// Names the first value that is out of range, or the first camera that the rig does not have.
+    pub(crate) fn check(
+        &self,
+        cameras: &[RigCamera],
+        schedule: &Schedule,
+        dt_us: i64,
+    ) -> Result<Vec<CameraSensor>, SessionError> {
+        let mut by_index = vec![CameraSensor::default(); cameras.len()];
+        for (name, sensor) in &self.cameras {
+            let field = format!("sensors.cameras.{name}");
+            let Some(index) = cameras.iter().position(|camera| camera.name == *name) else {
+                let known = cameras.iter().map(|camera| camera.name.clone()).collect();
+                return Err(SessionError::UnknownCamera { field, name: name.clone(), known });
+            };
+            sensor.check(&field, schedule.period_us(index))?;
+            by_index[index] = *sensor;
+        }
+        if let Some(imu) = &self.imu {
+            for (name, axis) in [("accelerometer", imu.accelerometer), ("gyroscope", imu.gyroscope)]
+            {
+                let field = |end: &str| format!("sensors.imu.{name}.{end}");
+                number(&field("noise"), axis.noise, 0.0..=100.0)?;
+                number(&field("bias"), axis.bias, 0.0..=100.0)?;
+            }
+            time("sensors.imu.bias_period_us", imu.bias_period_us, limits::WANDER_PERIOD_US)?;
+        }
+        if let Some(WheelSpeed { noise, scale }) = self.wheel_speed {
+            number("sensors.wheel_speed.noise", noise, 0.0..=100.0)?;
+            number("sensors.wheel_speed.scale", scale, 0.0..=0.5)?;
+        }
+        whole("sensors.delay_us", self.delay_us, dt_us, 0..=limits::BUNDLE_PERIOD_US)?;
+        Ok(by_index)
+    }
+}
+
+impl CameraSensor {
+    fn check(&self, field: &str, period_us: i64) -> Result<(), SessionError> {
+        let at = |end: &str| format!("{field}.{end}");
+        let reach_us = 0..=SENSOR_REACH_US;
+        if let Some(drop) = self.drop {
+            number(&at("drop"), drop, 0.0..=0.9)?;
+        }
+        if let Some(LateFrames { chance, by_us }) = self.late {
+            number(&at("late.chance"), chance, 0.0..=1.0)?;
+            whole(&at("late.by_us"), by_us, period_us, period_us..=SENSOR_REACH_US)?;
+        }
+        if let Some(FrozenFrames { chance, for_us }) = self.freeze {
+            number(&at("freeze.chance"), chance, 0.0..=1.0)?;
+            whole(&at("freeze.for_us"), for_us, period_us, period_us..=SENSOR_REACH_US)?;
+        }
+        if !reach_us.contains(&self.reach_us(period_us)) {
+            let must = format!(
+                "such that a picture may be {} µs old; at most {SENSOR_REACH_US} µs are accepted",
+                self.reach_us(period_us)
+            );
+            return Err(SessionError::CameraOption { field: field.to_owned(), must });
+        }
+        if let Some(ImageNoise { full_well, read }) = self.noise {
+            number(&at("noise.full_well"), full_well, 10.0..=1e6)?;
+            number(&at("noise.read"), read, 0.0..=1000.0)?;
+        }
+        if let Some(ExposureDrift { stops, period_us }) = self.exposure {
+            number(&at("exposure.stops"), stops, 0.0..=4.0)?;
+            time(&at("exposure.period_us"), period_us, limits::WANDER_PERIOD_US)?;
+        }
+        if let Some(LensDirt { spots, radius, opacity }) = self.dirt {
+            if !(1..=limits::DIRT_SPOTS).contains(&spots) {
+                let must = format!("{spots}; 1 to {} are accepted", limits::DIRT_SPOTS);
+                return Err(SessionError::CameraOption { field: at("dirt.spots"), must });
+            }
+            number(&at("dirt.radius"), radius, 0.001..=0.5)?;
+            number(&at("dirt.opacity"), opacity, 0.0..=1.0)?;
+        }
+        Ok(())
+    }
+}
+
+fn number(field: &str, value: f64, accepted: RangeInclusive<f64>) -> Result<(), SessionError> {
+    if accepted.contains(&value) {
+        return Ok(());
+    }
+    let must = format!("{value}; {} to {} are accepted", accepted.start(), accepted.end());
+    Err(SessionError::CameraOption { field: field.to_owned(), must })
+}
+
+fn time(field: &str, value_us: i64, accepted_us: RangeInclusive<i64>) -> Result<(), SessionError> {
+    whole(field, value_us, 1, accepted_us)
+}
+
+/// Checks that a time is within its limits and a multiple of another.
+fn whole(
+    field: &str,
+    value_us: i64,
+    of_us: i64,
+    accepted_us: RangeInclusive<i64>,
+) -> Result<(), SessionError> {
+    if accepted_us.contains(&value_us) && value_us % of_us == 0 {
+        return Ok(());
+    }
+    let (least_us, most_us) = (accepted_us.start(), accepted_us.end());
+    let must = match of_us {
+        1 => format!("{value_us} µs; {least_us} to {most_us} µs are accepted"),
+        _ => format!(
+            "{value_us} µs; multiples of {of_us} µs from {least_us} to {most_us} µs are accepted"
+        ),
+    };
+    Err(SessionError::CameraOption { field: field.to_owned(), must })
+}
