@@ -28,7 +28,7 @@ use crate::pin::pin;
 use crate::record::format::{FrameRequest, Line, RecordedCommand, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
@@ -194,9 +194,8 @@ impl Session {
         let mut next = start.episode(seed, dynamics, settings.dt_us);
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
-            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
-                .with_solids(solids, next.ego())
+                .with_solids(self.version.solids.clone(), next.ego())
         });
 
         let frame_history = FrameHistory::default();
