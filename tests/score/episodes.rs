@@ -230,6 +230,41 @@ fn infractions_of_bench2drive_are_counted_once_and_of_a_moving_ego() {
 }
 
 #[test]
+fn the_parts_of_epdms_are_those_of_the_drive() {
+    const NAME: &str = "navsim.epdms@0a380a9";
+    let parts = [
+        "no_at_fault_collisions",
+        "drivable_area_compliance",
+        "driving_direction_compliance",
+        "time_to_collision_within_bound",
+        "lane_keeping",
+    ];
+    let of = |record: &DriveRecord| parts.map(|name| part(record, NAME, name));
+    let road = || Some(map(vec![lane([-10.0, 160.0], [-3.0, 3.0], true)]));
+    let aside = Footprint::new(DVec2::new(50.0, 100.0), 0.0, 4.0, 2.0);
+    let mut clean = drive_with(10.0, aside, 0.0);
+    assert_eq!(of(&clean), [None; 5], "without a map");
+    clean.map = road();
+    assert_eq!(of(&clean), [Some(1.0); 5]);
+    assert_eq!(value(&clean, NAME), None, "without PDM-Closed there is no score");
+    assert_eq!(part(&clean, NAME, "extended_comfort"), None);
+
+    // In the second 4 s the ego runs into a car that stands, on the wrong side of the road's middle.
+    let mut hit = drive_with(10.0, Footprint::new(DVec2::new(60.0, 1.0), 0.0, 4.0, 2.0), 0.0);
+    hit.map = road();
+    for sample in &mut hit.ego {
+        sample.origin_m.y = 0.6;
+    }
+    assert_eq!(of(&hit), [Some(0.0), Some(1.0), Some(1.0), Some(0.0), Some(0.0)]);
+    // What is left of a drive after the last whole 4 s is not looked at.
+    hit.ego.truncate(44);
+    for track in hit.tracks.as_mut().unwrap() {
+        track.samples.truncate(44);
+    }
+    assert_eq!(of(&hit), [Some(1.0), Some(1.0), Some(1.0), Some(1.0), Some(0.0)]);
+}
+
+#[test]
 fn the_ego_of_alpasim_is_smaller_and_rounded_and_is_cut_off_its_way() {
     const NAME: &str = "alpasim.scene@3032e0c";
     let hit = |record: &DriveRecord| part(record, NAME, "collision_at_fault");

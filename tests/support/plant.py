@@ -58,7 +58,7 @@ def run(package: str, faults: list[Fault], copies: list[Copy]) -> int:
         (folder / "mod.rs").write_text(f"#![allow(warnings)]\n{modules}")
         main.write_text(f"{whole}mod planted;\n")
         cargo = os.environ.get("CARGO", "cargo")
-        command = [cargo, "test", "--release", "-p", f"wildcity-{package}", "--test", package, "--", "planted"]
+        command = [cargo, "test", "--release", "-p", f"wildcity-{package}", "--test", package]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     finally:
         main.write_text(whole)
@@ -76,6 +76,10 @@ def report(faults: list[Fault], output: str) -> int:
     if ran != set(range(len(faults))):
         print(output[-4000:], file=sys.stderr)
         print(f"only {len(ran)} of {len(faults)} copies were tested", file=sys.stderr)
+        return 2
+    without = re.findall(r"^test ((?!planted::)\S+) \.\.\. FAILED", output, re.MULTILINE)
+    if without:
+        print(f"these fail without a fault: {', '.join(without)}", file=sys.stderr)
         return 2
     said = dict(re.findall(r"---- planted::(m\d+::tests::\S+) stdout ----\n\n.*?\n(.*?)\n", output))
     for index, fault in enumerate(faults):
