@@ -8,12 +8,13 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_session::{
-    Encoding, EventKind, Outputs, ScenarioOptions, ScenarioSource, Session, SessionOptions, Start,
+    Encoding, EventKind, Outputs, RigChoice, ScenarioOptions, ScenarioSource, Session,
+    SessionOptions, Start,
 };
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, NewVersion};
 
-use crate::driving::{Bench, bench};
+use crate::driving::{Bench, bench, rig};
 use crate::streaming::PROFILE;
 
 /// A twin whose second version has a wall beside the recorded drive, 5 m to its left, from 20 m on.
@@ -70,11 +71,10 @@ async fn open(bench: &Bench, name: &str, version: u64) -> Session {
     let options = SessionOptions {
         version: Some(version),
         start: Some(Start::Pose(at(0.0))),
+        rig: Some(RigChoice::Full(rig())),
         scenario: Some(options),
         ..SessionOptions::twin("walled", Outputs::colour(Encoding::Raw))
     };
-    let outputs = Outputs { cameras: Some(vec!["front".to_owned()]), ..options.outputs };
-    let options = SessionOptions { outputs, ..options };
     let mut session = Session::open(bench.engine.clone(), name.to_owned(), options).await.unwrap();
     session.reset(0, None).await.unwrap();
     session
