@@ -66,6 +66,12 @@ def run(package: str, faults: list[Fault], copies: list[Copy]) -> int:
     return report(faults, done.stdout + done.stderr)
 
 
+def chosen(faults: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Those that the command line chooses: all, or those of the files that it names."""
+    names = sys.argv[1:]
+    return [fault for fault in faults if not names or fault[0] in names]
+
+
 def report(faults: list[Fault], output: str) -> int:
     ran = set()
     failed = defaultdict(list)
