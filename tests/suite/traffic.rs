@@ -50,7 +50,7 @@ async fn every_step_length_finds_the_same_contacts() {
     value["actors"] = json!([
         { "name": "walker", "class": "pedestrian", "collide": {
             "along": "log", "station_m": 34.0, "time_s": 1.5, "angle_rad": 1.57, "speed": 1.34 } },
-        { "name": "from behind", "path": { "along": "log", "station_m": 2.0, "speed": 17.0 } },
+        { "name": "behind", "path": { "along": "log", "station_m": 2.0, "speed": 17.0 } },
     ]);
     bench.write("cross.json", &value);
     let mut seen = Vec::new();
@@ -75,7 +75,8 @@ async fn every_step_length_finds_the_same_contacts() {
             .collect();
         seen.push(contacts);
     }
-    assert_eq!(seen[0].len(), 2, "{seen:?}");
+    let met: std::collections::BTreeSet<u16> = seen[0].iter().map(|contact| contact.1).collect();
+    assert_eq!(met.len(), 2, "{seen:?}");
     assert!(seen[0][0].0 % 100_000 != 0, "within a step: {seen:?}");
     assert_eq!(seen[0], seen[1]);
     assert_eq!(seen[0], seen[2]);
