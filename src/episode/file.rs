@@ -229,14 +229,25 @@ impl EpisodeFile {
                 return Err(format!("more than {} frames", limits::STEPS));
             }
             Line::Scenario(scenario) => self.scenario = Some(*scenario),
-            Line::Actors(actors) => self.actors.push(actors),
-            Line::Event(event) => self.events.push(event),
+            Line::Actors(actors) => {
+                actors.check(self.actor_count())?;
+                self.actors.push(actors);
+            }
+            Line::Event(event) => {
+                event.check(self.actor_count())?;
+                self.events.push(event);
+            }
             Line::Frame(frame) => self.frames.push(frame),
             Line::Result(result) => self.result = Some(result),
             Line::End(end) => self.end = Some(end),
             Line::Other => {}
         }
         Ok(())
+    }
+
+    /// Number of the scenario's actors.
+    fn actor_count(&self) -> usize {
+        self.scenario.as_ref().map_or(0, |scenario| scenario.actors.len())
     }
 
     /// The rig of an episode's file, with intrinsics and places of the cameras; `None` if the header has names alone.

@@ -294,6 +294,37 @@ impl EventLine {
         let event = Event::Contact(ContactEvent::new(contact));
         Self { step, time_us: contact.time_us, event }
     }
+
+    /// Checks that the event is about one of the scenario's `actors`.
+    ///
+    /// # Errors
+    /// It is not; says what is wrong.
+    pub fn check(&self, actors: usize) -> Result<(), String> {
+        match self.event.actor() {
+            Some(actor) => check_index(actor, actors),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Event {
+    /// Index of the actor that it is about.
+    pub fn actor(&self) -> Option<u16> {
+        match self {
+            Self::Contact(contact) => Some(contact.actor),
+            Self::Triggered { actor, .. } | Self::Appeared { actor } | Self::Left { actor } => {
+                Some(*actor)
+            }
+            Self::StaticContact { .. } | Self::OffModel { .. } | Self::Ended { .. } => None,
+        }
+    }
+}
+
+fn check_index(actor: u16, actors: usize) -> Result<(), String> {
+    match usize::from(actor) < actors {
+        true => Ok(()),
+        false => Err(format!("actor {actor}, but the scenario has {actors} actors")),
+    }
 }
 
 impl EgoLine {
@@ -324,6 +355,26 @@ impl ActorsLine {
     pub fn new(step: u64, time_us: i64, states: &[ActorState]) -> Self {
         let there = states.iter().filter(|state| state.present);
         Self { step, time_us, actors: there.map(ActorStateLine::new).collect() }
+    }
+
+    /// Checks that the line is about some of the scenario's `actors`, each once, by rising index.
+    ///
+    /// # Errors
+    /// It is not, or an actor has no pose; says what is wrong.
+    pub fn check(&self, actors: usize) -> Result<(), String> {
+        let mut before: Option<u16> = None;
+        for state in &self.actors {
+            let actor = state.0;
+            check_index(actor, actors)?;
+            if let Some(before) = before.filter(|before| *before >= actor) {
+                return Err(format!("actor {actor} follows actor {before}: indices must rise"));
+            }
+            if let Err(error) = Pose::checked(state.1, state.2) {
+                return Err(format!("actor {actor}: {error}"));
+            }
+            before = Some(actor);
+        }
+        Ok(())
     }
 }
 

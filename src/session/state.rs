@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_sim::Dynamics;
+use wildcity_sim::contact::Solids;
 use wildcity_twin::residency::Resident;
 
 use crate::engine::answer_budget::BudgetShare;
@@ -54,6 +55,8 @@ pub(crate) struct PinnedVersion {
     pub(crate) profile_hash: blake3::Hash,
     /// Where the twin was recorded; only if images come with their trust or may be repaired.
     pub(crate) coverage: Option<Arc<TrainingCoverage>>,
+    /// Its solid Gaussians beside the scenario's route; only if a contact with them ends an episode.
+    pub(crate) solids: Option<Arc<Solids>>,
 }
 
 /// What a step changes: all that the coming observations depend on, beside the settings and the version. A
@@ -73,7 +76,13 @@ impl PinnedVersion {
         profile: RenderProfile,
         coverage: Option<Arc<TrainingCoverage>>,
     ) -> Self {
-        Self { resident, profile, profile_hash: profile_hash(&profile), coverage }
+        let profile_hash = profile_hash(&profile);
+        Self { resident, profile, profile_hash, coverage, solids: None }
+    }
+
+    /// The same, with solid Gaussians.
+    pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>) -> Self {
+        Self { solids, ..self }
     }
 
     /// Whether it is the same version of the same twin.

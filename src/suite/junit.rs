@@ -38,7 +38,7 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         Status::Failed => {
             let types: Vec<&str> = episode.faults.iter().map(|fault| &*fault.fault).collect();
             let kind = types.first().copied().unwrap_or("unknown");
-            let lines: Vec<String> = episode.faults.iter().map(line).collect();
+            let lines = episode.fault_texts();
             element("failure", kind, lines.first().map_or("", |line| line), &lines.join("\n"))
         }
         Status::OffModel => {
@@ -65,11 +65,6 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
     } else {
         let _ = writeln!(text, ">{inner}</testcase>");
     }
-}
-
-fn line(fault: &wildcity_episode::FaultLine) -> String {
-    let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
-    format!("{}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6)
 }
 
 fn element(name: &str, kind: &str, message: &str, body: &str) -> String {

@@ -1,5 +1,6 @@
 //! `report.html`: one page that loads nothing else.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use data_encoding::BASE64;
@@ -7,7 +8,7 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use crate::picture::Picture;
 use crate::plot::plots;
-use crate::result::{EpisodeEntry, Rate, SuiteResult};
+use crate::result::{Rate, SuiteResult};
 
 const STYLE: &str = "\
 body{font:15px/1.45 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#111}
@@ -101,9 +102,22 @@ fn means(result: &SuiteResult) -> Markup {
                     td { (mean.scenarios) }
                 }
             }
+            @for (name, reason) in without_value(result) {
+                tr { td { (name) } td colspan="3" { "none: " (reason) } }
+            }
         }
-        p { "Scores without a value lack an input; each episode's record says which." }
     }
+}
+
+/// Scores that no episode has a value of, and the reason that the first episode gives.
+fn without_value(result: &SuiteResult) -> BTreeMap<&str, &str> {
+    let all = result.episodes.iter().flat_map(|episode| &episode.scores);
+    let missing = all.filter(|(name, _)| !result.means.contains_key(*name));
+    let mut reasons = BTreeMap::new();
+    for (name, score) in missing {
+        reasons.entry(&**name).or_insert(score.reason.as_deref().unwrap_or("unknown"));
+    }
+    reasons
 }
 
 fn worst(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> Markup {
@@ -113,7 +127,7 @@ fn worst(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> Markup 
             h2 { "Worst episodes" }
             @for episode in worst {
                 figure {
-                    figcaption { b { (episode.name) } ": " (faults(episode)) }
+                    figcaption { b { (episode.name) } ": " (episode.fault_texts().join("; ")) }
                     @match pictures.iter().find(|picture| picture.episode == episode.name) {
                         Some(picture) => (image(picture)),
                         None => p { "There is no picture: its frames cannot be rendered again." },
@@ -127,21 +141,8 @@ fn worst(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> Markup 
 
 fn image(picture: &Picture) -> Markup {
     let source = format!("data:image/jpeg;base64,{}", BASE64.encode(&picture.jpeg));
-    let text = format!("camera {} at step {}", picture.camera, picture.step);
-    html! { div { img src=(source) alt=(text) title=(text); } }
-}
-
-fn faults(episode: &EpisodeEntry) -> String {
-    let texts: Vec<String> = episode
-        .faults
-        .iter()
-        .map(|fault| {
-            let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}"));
-            let seconds = fault.time_us as f64 * 1e-6;
-            format!("{}{} at {seconds:.2} s", fault.fault, actor.unwrap_or_default())
-        })
-        .collect();
-    texts.join(", ")
+    let text = format!("camera {}, step {}", picture.camera, picture.step);
+    html! { div { img src=(source) alt=(text); br; small { (text) } } }
 }
 
 fn table(result: &SuiteResult) -> Markup {
@@ -154,7 +155,7 @@ fn table(result: &SuiteResult) -> Markup {
                     td { (episode.seed) }
                     td class=(episode.status.name()) { (episode.status.name()) }
                     td {
-                        (faults(episode))
+                        (episode.fault_texts().join("; "))
                         @if let Some(error) = episode.errors.last() { " " (error.kind) ": " (error.message) }
                     }
                     td { (episode.steps) }

@@ -46,12 +46,15 @@ pub fn pictures(
 }
 
 impl SuiteResult {
-    /// The failed episodes, those with the earliest fault first.
+    /// The failed episodes: those with a contact or off the road before those that only lack progress, and of these
+    /// those with the earliest fault first.
     pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
         let mut worst: Vec<&EpisodeEntry> =
             self.episodes.iter().filter(|episode| episode.status == Status::Failed).collect();
         worst.sort_by_key(|episode| {
-            (episode.faults.first().map_or(i64::MAX, |fault| fault.time_us), &episode.name)
+            let lacks_progress_alone = episode.faults.iter().all(|fault| fault.fault == "progress");
+            let first_us = episode.faults.first().map_or(i64::MAX, |fault| fault.time_us);
+            (lacks_progress_alone, first_us, &episode.name)
         });
         worst.truncate(limits::WORST);
         worst

@@ -51,7 +51,9 @@ fn from_above(drive: &DriveRecord, fault_us: Option<i64>) -> String {
     let route = drive.reference.as_ref().map_or(Vec::new(), |drive| drive.line.points_m().to_vec());
     let all: Vec<DVec2> = ego.iter().chain(&route).copied().collect();
     let frame = Frame::around(&all, true);
-    let mut svg = begin("the drive from above (grey: as recorded), in metres");
+    let mut svg =
+        begin("from above: driven (blue), recorded (grey), actors (orange), first fault (red)");
+    scale_bar(&mut svg, &frame);
     line(&mut svg, &frame, &route, "#bbb", 4.0);
     let tracks = drive.tracks.iter().flatten();
     for track in tracks {
@@ -117,6 +119,23 @@ fn line(svg: &mut String, frame: &Frame, points: &[DVec2], color: &str, width: f
         let _ = write!(svg, "{x:.1},{y:.1} ");
     }
     svg.push_str("\"/>");
+}
+
+/// A bar of 1, 10, 100 .. m, as long as fits into a third of the plot.
+fn scale_bar(svg: &mut String, frame: &Frame) {
+    let most_m = SIZE_PX.x / 3.0 / frame.scale.x;
+    let bar_m = 10.0_f64.powf(most_m.log10().floor());
+    let from = DVec2::new(MARGIN_PX, SIZE_PX.y - 8.0);
+    let to_x = from.x + bar_m * frame.scale.x;
+    let _ = write!(
+        svg,
+        "<path d=\"M{:.1} {:.1}H{to_x:.1}\" stroke=\"#444\" stroke-width=\"2\"/>\
+         <text x=\"{:.1}\" y=\"{:.1}\" font-size=\"11\" fill=\"#444\">{bar_m} m</text>",
+        from.x,
+        from.y,
+        to_x + 6.0,
+        from.y + 4.0
+    );
 }
 
 fn dot(svg: &mut String, at: DVec2) {

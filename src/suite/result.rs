@@ -6,6 +6,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use wildcity_episode::{FaultLine, ScoreLine};
+use wildcity_score::own;
 use wildcity_score::statistics::{Mean, wilson};
 
 use crate::case::Case;
@@ -292,6 +293,25 @@ impl EpisodeEntry {
             entry.record = record;
         }
         entry
+    }
+}
+
+impl EpisodeEntry {
+    /// The faults in words, by time: `contact.pedestrian with walker at 4.615 s`.
+    pub(crate) fn fault_texts(&self) -> Vec<String> {
+        self.faults.iter().map(|fault| self.fault_text(fault)).collect()
+    }
+
+    fn fault_text(&self, fault: &FaultLine) -> String {
+        let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
+        let text = format!("{}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6);
+        let part = |name: &str| self.scores.get(own::NAME)?.parts.get(name).copied().flatten();
+        match (&*fault.fault, part("progress"), part("least_progress")) {
+            ("progress", Some(progress), Some(least)) => {
+                format!("{text}: {progress:.3} of the recorded drive, and {least} is the least")
+            }
+            _ => text,
+        }
     }
 }
 

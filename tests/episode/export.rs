@@ -3,6 +3,7 @@
 use std::io::Cursor;
 
 use prost::Message as _;
+use serde_json::Value;
 use wildcity_episode::{EpisodeFile, export};
 
 use crate::written::{self, Made};
@@ -43,18 +44,35 @@ fn a_reader_finds_every_message_with_its_schema() {
 
 #[test]
 fn the_file_is_indexed_and_small() {
-    let episode = Made { steps: 200, actors: 30, ..Made::default() }.read();
+    let episode = Made { steps: 200, actors: 30, plan_poses: 64, ..Made::default() }.read();
     let bytes = exported(&episode);
     assert!(bytes.len() < 1_000_000, "{} bytes", bytes.len());
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert!(summary.chunk_indexes.len() > 3, "{} chunks", summary.chunk_indexes.len());
-    assert_eq!(summary.stats.unwrap().message_count, 201 * 3 + 2);
+    assert_eq!(summary.stats.unwrap().message_count, 201 * 3 + 200 + 2);
     // A chunk that is damaged is noticed.
     let mut damaged = bytes;
     let at = summary.chunk_indexes[1].chunk_start_offset as usize + 200;
     damaged[at] ^= 0x40;
     let read = mcap::MessageStream::new(&damaged).unwrap();
     assert!(read.into_iter().any(|message| message.is_err()));
+}
+
+/// The poses of a plan are in one message, their times in the other.
+#[test]
+fn a_plan_is_exported_once() {
+    let bytes = exported(&Made { steps: 3, plan_poses: 64, ..Made::default() }.read());
+    let messages: Vec<_> =
+        mcap::MessageStream::new(&bytes).unwrap().map(|message| message.unwrap()).collect();
+    let of = |topic: &str| -> Vec<_> {
+        messages.iter().filter(|message| message.channel.topic == topic).collect()
+    };
+    assert_eq!(of("/plan").len(), 3);
+    let step: Value = serde_json::from_slice(&of("/wildcity/step")[2].data).unwrap();
+    let trajectory = &step["command"]["trajectory"];
+    assert_eq!(trajectory["poses"], "/plan");
+    let times_us = trajectory["times_us"].as_array().unwrap();
+    assert_eq!((times_us.len(), &times_us[63]), (64, &Value::from(6_400_000)));
 }
 
 #[test]

@@ -67,6 +67,31 @@ fn a_damaged_line_ends_the_reading_and_is_named() {
 }
 
 #[test]
+fn actors_that_the_scenario_does_not_have_end_the_reading() {
+    let made = Made { steps: 3, ..Made::default() };
+    type Change = fn(&mut Vec<serde_json::Value>);
+    let changes: [(Change, &str); 4] = [
+        (|lines| lines[6]["actors"][1][0] = json!(2), "actor 2, but the scenario has 2 actors"),
+        (|lines| lines[6]["actors"][0][0] = json!(1), "actor 1 follows actor 1"),
+        (|lines| lines[6]["actors"][0][2] = json!([0.5, 0, 0, 0]), "actor 0: "),
+        (
+            |lines| {
+                lines[6] = json!({ "kind": "event", "step": 2, "time_us": 200_000, "event": "left", "actor": 9 });
+            },
+            "actor 9, but",
+        ),
+    ];
+    for (change, reason) in changes {
+        let mut lines = made.lines();
+        change(&mut lines);
+        let read = written::read(&lines);
+        let cut = read.cut.unwrap();
+        assert_eq!((cut.line, read.actors.len(), read.frames.len()), (7, 2, 2), "{reason}");
+        assert!(cut.reason.contains(reason), "{}", cut.reason);
+    }
+}
+
+#[test]
 fn what_later_builds_add_is_passed_over() {
     let mut lines = Made { steps: 3, ..Made::default() }.lines();
     lines[0]["origin"] = json!({ "episode": "other-1" });

@@ -23,6 +23,8 @@ pub(crate) struct Made {
     pub(crate) speed_mps: f64,
     /// Number of actors, in two rows beside the road.
     pub(crate) actors: u16,
+    /// Poses of the plan that is the command of each step; 0 for an action.
+    pub(crate) plan_poses: u32,
     /// Contacts, each with the step at which it is written.
     pub(crate) contacts: Vec<(u64, Contact)>,
     /// Outcome of the last line; none to leave it out.
@@ -32,7 +34,8 @@ pub(crate) struct Made {
 impl Default for Made {
     fn default() -> Self {
         let contacts = Vec::new();
-        Self { steps: 50, speed_mps: 10.0, actors: 2, contacts, outcome: Some("completed") }
+        let outcome = Some("completed");
+        Self { steps: 50, speed_mps: 10.0, actors: 2, plan_poses: 0, contacts, outcome }
     }
 }
 
@@ -91,7 +94,11 @@ impl Made {
             lines.extend(
                 due.map(|(_, contact)| tagged("event", &EventLine::contact(step, contact))),
             );
-            lines.push(frame(step, &ego_at(0.1 * self.speed_mps * step as f64)));
+            let mut frame = frame(step, &ego_at(0.1 * self.speed_mps * step as f64));
+            if self.plan_poses > 0 && step > 0 {
+                frame["command"] = json!({ "trajectory": self.plan(step) });
+            }
+            lines.push(frame);
         }
         if let Some(outcome) = self.outcome {
             let steps = self.steps;
@@ -99,6 +106,18 @@ impl Made {
                 "time_us": steps * 100_000, "distance_m": 0.1 * self.speed_mps * steps as f64 }));
         }
         lines
+    }
+
+    /// A plan with all digits, which differs from step to step.
+    fn plan(&self, step: u64) -> Vec<Value> {
+        let pose = |k: u32| {
+            let time_s = 0.1 * f64::from(k);
+            let turned = 0.037 * (0.31 * step as f64).sin() * time_s;
+            let position_m = DVec3::new(self.speed_mps * time_s, 0.5 * turned * time_s, 0.0);
+            let start_from_rig = Pose { position_m, rotation: DQuat::from_rotation_z(turned) };
+            json!({ "time_us": 100_000 * k, "start_from_rig": start_from_rig })
+        };
+        (1..=self.plan_poses).map(pose).collect()
     }
 
     /// Writes the file and reads it.

@@ -5,7 +5,8 @@ use glam::DVec2;
 use wildcity_scene::ActorClass;
 use wildcity_score::own::{Fault, Judgement, verdict};
 use wildcity_score::{
-    DriveRecord, EgoSample, EgoShape, Polyline, ReferenceDrive, Track, TrackSample, score,
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
+    Track, TrackSample, score,
 };
 use wildcity_sim::contact::{CollisionType, Contact, Footprint};
 
@@ -62,6 +63,40 @@ fn contact(time_us: i64, ego_mps: f64, ego_at_fault: bool) -> Contact {
     }
 }
 
+/// A drive beside or behind another box.
+fn drive_with(speed_mps: f64, other: Footprint, other_mps: f64) -> DriveRecord {
+    let mut record = drive(speed_mps);
+    let track = &mut record.tracks.as_mut().unwrap()[0];
+    for (step, sample) in track.samples.iter_mut().enumerate() {
+        let way_m = DVec2::new(0.1 * step as f64 * other_mps, 0.0);
+        let velocity_mps = DVec2::new(other_mps, 0.0);
+        *sample = Some(TrackSample { footprint: other.shifted(way_m), velocity_mps });
+    }
+    record
+}
+
+/// A lane from one x to another, so far to each side of y = 0.
+fn lane(x_m: [f64; 2], y_m: [f64; 2], is_on_route: bool) -> Lane {
+    let corner = |x: usize, y: usize| DVec2::new(x_m[x], y_m[y]);
+    let outline_m = vec![corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
+    Lane { outline_m, is_on_route, is_intersection: false }
+}
+
+fn map(lanes: Vec<Lane>) -> LaneMap {
+    let centerline = Polyline::new(vec![DVec2::ZERO, DVec2::new(150.0, 0.0)]).unwrap();
+    LaneMap { lanes, centerline, red: Vec::new() }
+}
+
+fn part(record: &DriveRecord, name: &str, part: &str) -> Option<f64> {
+    let scores = score(record);
+    let found = scores.iter().find(|score| score.name == name);
+    found.unwrap_or_else(|| panic!("no score {name}")).parts[part]
+}
+
+fn near(found: Option<f64>, expected: f64) -> bool {
+    found.is_some_and(|found| (found - expected).abs() < 1e-9)
+}
+
 fn value(record: &DriveRecord, name: &str) -> Option<f64> {
     let scores = score(record);
     let found = scores.iter().find(|score| score.name == name);
@@ -107,6 +142,151 @@ fn contacts_fail_by_fault_and_pedestrians_always() {
     assert_eq!(standing.judgement, Judgement::Passed, "a standing ego is run into");
     let overlap = Contact { at_start: true, ..contact(0, 10.0, true) };
     assert_eq!(with(ActorClass::Vehicle, overlap).judgement, Judgement::Passed);
+}
+
+#[test]
+fn contacts_with_the_twin_and_the_edge_of_the_road_fail() {
+    let mut record = drive(10.0);
+    record.static_contacts = Some(vec![StaticContact { time_us: 3_000_000, impact_mps: 10.0 }]);
+    let judged = verdict(&record);
+    assert_eq!((judged.faults[0].fault, judged.faults[0].time_us), (Fault::Static, 3_000_000));
+
+    // The ego reaches 1 m to each side and, from its origin, from -1.2 m to 3.8 m.
+    let mut record = drive(10.0);
+    let road = [-10.0, 150.0];
+    record.map = Some(map(vec![lane(road, [-3.0, 0.5], true), lane(road, [0.5, 3.0], true)]));
+    assert_eq!(verdict(&record).judgement, Judgement::Passed, "several lanes are a road");
+    record.map = Some(map(vec![lane([-10.0, 83.9], [-3.0, 3.0], true)]));
+    let judged = verdict(&record);
+    // The front passes 83.9 m after the sample at 80 m, which it reaches at 83.8 m.
+    assert_eq!((judged.faults[0].fault, judged.faults[0].time_us), (Fault::OffRoad, 8_100_000));
+}
+
+#[test]
+fn a_recording_that_stands_says_nothing_of_progress() {
+    let mut record = drive(0.0);
+    let reference = record.reference.as_mut().unwrap();
+    reference.line =
+        Polyline::new((0..=10).map(|k| DVec2::new(0.19 * f64::from(k), 0.0)).collect()).unwrap();
+    assert_eq!(verdict(&record).progress, Some(1.0));
+}
+
+#[test]
+fn the_measures_beside_the_verdict_are_those_of_the_drive() {
+    // The rear of the other is at 118 m; the ego's front comes to 103.8 m at 10 m/s.
+    let other = Footprint::new(DVec2::new(120.0, 0.0), 0.0, 4.0, 2.0);
+    let mut record = drive_with(10.0, other, 0.0);
+    record.ego[40].acceleration_mps2 = DVec2::new(-1.5, 9.9);
+    record.ego[41].velocity_mps = DVec2::new(10.0, 1.0);
+    record.ego[41].yaw_rate_radps = -0.2;
+    record.contacts = vec![contact(1_000_000, 6.0, false), contact(7_000_000, 4.0, false)];
+    let judged = verdict(&record);
+    assert!(near(judged.least_ttc_s, 1.42), "{:?}", judged.least_ttc_s);
+    assert_eq!(judged.impact_mps, Some(6.0));
+    assert_eq!(judged.accelerations_mps2, Some([1.5, 2.0]));
+    // The recorded drive goes 10 m/s in its last 0.5 s.
+    assert!(near(value(&record, "neuroncap.score@ecdcf28"), 4.0 * 0.4));
+}
+
+#[test]
+fn stations_follow_a_route_that_comes_back_beside_itself() {
+    let corners = [[0.0, 0.0], [100.0, 0.0], [100.0, 1.0], [0.0, 1.0]];
+    let mut record = drive(5.0);
+    for sample in &mut record.ego {
+        sample.origin_m.y = 0.9;
+    }
+    let reference = record.reference.as_mut().unwrap();
+    reference.line = Polyline::new(corners.map(DVec2::from_array).to_vec()).unwrap();
+    reference.times_us = vec![0, 10_000_000, 10_100_000, 20_100_000];
+    assert!((reference.station_at_m(2_500_000) - 25.0).abs() < 1e-9);
+    let stations_m = record.stations_m().unwrap();
+    assert!((stations_m[100].0 - 50.0).abs() < 1e-9, "{:?}", stations_m[100]);
+}
+
+#[test]
+fn infractions_of_bench2drive_are_counted_once_and_of_a_moving_ego() {
+    const NAME: &str = "bench2drive.driving@7ec25d1";
+    let count = |speed_mps: f64, seconds: &[i64]| {
+        let mut record = drive(speed_mps);
+        let at = |second: &i64| contact(1_000_000 * second, speed_mps, true);
+        record.contacts = seconds.iter().map(at).collect();
+        part(&record, NAME, "infractions")
+    };
+    assert_eq!(count(10.0, &[1, 3]), Some(1.0), "within 5 s");
+    assert_eq!(count(0.5, &[1, 8]), Some(1.0), "within 5 m");
+    assert_eq!(count(10.0, &[1, 8]), Some(2.0));
+    assert_eq!(count(0.05, &[1]), Some(0.0), "a standing ego is not charged");
+
+    let mut record = drive(10.0);
+    record.contacts = vec![contact(1_000_000, 10.0, true)];
+    let road = [-3.0, 3.0];
+    let lanes = vec![lane([-10.0, 50.5], road, true), lane([50.5, 150.0], road, false)];
+    record.map = Some(map(lanes));
+    assert!(near(part(&record, NAME, "outside_percent"), 50.0));
+    assert!(near(value(&record, NAME), 100.0 * 0.6 * 0.5));
+    // The traffic is half as fast as the ego.
+    let record = drive_with(10.0, Footprint::new(DVec2::new(30.0, 3.5), 0.0, 4.0, 2.0), 5.0);
+    assert!(near(value(&record, "bench2drive.efficiency@7ec25d1"), 200.0));
+}
+
+#[test]
+fn the_parts_of_epdms_are_those_of_the_drive() {
+    const NAME: &str = "navsim.epdms@0a380a9";
+    let parts = [
+        "no_at_fault_collisions",
+        "drivable_area_compliance",
+        "driving_direction_compliance",
+        "time_to_collision_within_bound",
+        "lane_keeping",
+    ];
+    let of = |record: &DriveRecord| parts.map(|name| part(record, NAME, name));
+    let road = || Some(map(vec![lane([-10.0, 160.0], [-3.0, 3.0], true)]));
+    let aside = Footprint::new(DVec2::new(50.0, 100.0), 0.0, 4.0, 2.0);
+    let mut clean = drive_with(10.0, aside, 0.0);
+    assert_eq!(of(&clean), [None; 5], "without a map");
+    clean.map = road();
+    assert_eq!(of(&clean), [Some(1.0); 5]);
+    assert_eq!(value(&clean, NAME), None, "without PDM-Closed there is no score");
+    assert_eq!(part(&clean, NAME, "extended_comfort"), None);
+
+    // In the second 4 s the ego runs into a car that stands, on the wrong side of the road's middle.
+    let mut hit = drive_with(10.0, Footprint::new(DVec2::new(60.0, 1.0), 0.0, 4.0, 2.0), 0.0);
+    hit.map = road();
+    for sample in &mut hit.ego {
+        sample.origin_m.y = 0.6;
+    }
+    assert_eq!(of(&hit), [Some(0.0), Some(1.0), Some(1.0), Some(0.0), Some(0.0)]);
+    // What is left of a drive after the last whole 4 s is not looked at.
+    hit.ego.truncate(44);
+    for track in hit.tracks.as_mut().unwrap() {
+        track.samples.truncate(44);
+    }
+    assert_eq!(of(&hit), [Some(1.0), Some(1.0), Some(1.0), Some(1.0), Some(0.0)]);
+}
+
+#[test]
+fn the_ego_of_alpasim_is_smaller_and_rounded_and_is_cut_off_its_way() {
+    const NAME: &str = "alpasim.scene@3032e0c";
+    let hit = |record: &DriveRecord| part(record, NAME, "collision_at_fault");
+    let beside = |y_m: f64| Footprint::new(DVec2::new(50.0, y_m), 0.0, 4.0, 2.0);
+    // Half of 0.98 of the ego's 2 m, and half of the other's 2 m.
+    assert_eq!(hit(&drive_with(10.0, beside(1.99), 0.0)), Some(0.0));
+    assert_eq!(hit(&drive_with(10.0, beside(1.97), 0.0)), Some(1.0));
+
+    // A corner of the other, 5 cm within the corner of the ego, which has a radius of 0.49 m.
+    let center_m = DVec2::new(1.3 + 0.98 * 2.5 - 0.05 + 2.0, 0.98 - 0.05 + 1.0);
+    assert_eq!(hit(&drive_with(0.0, Footprint::new(center_m, 0.0, 4.0, 2.0), 0.0)), Some(0.0));
+    let inner_m = center_m - DVec2::splat(0.15);
+    assert_eq!(hit(&drive_with(0.0, Footprint::new(inner_m, 0.0, 4.0, 2.0), 0.0)), Some(1.0));
+
+    // More than 4 m off the recorded drive nothing counts any more.
+    for (off_m, expected) in [(3.9, 1.0), (4.1, 0.0)] {
+        let mut record = drive_with(10.0, beside(off_m), 0.0);
+        for sample in &mut record.ego {
+            sample.origin_m.y = off_m;
+        }
+        assert_eq!(hit(&record), Some(expected), "{off_m} m");
+    }
 }
 
 #[test]

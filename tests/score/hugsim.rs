@@ -85,6 +85,30 @@ fn decisions_are_as_in_the_vectors() {
     }
 }
 
+/// An even acceleration has no jerk: the bounds of the acceleration alone decide.
+#[test]
+fn the_comfort_of_a_plan_is_within_the_bounds_of_its_acceleration() {
+    let comfort = |acceleration_mps2: f64| {
+        let pose = |k: i32| {
+            let time_s = 0.5 * f64::from(k);
+            let way_m = 10.0 * time_s + 0.5 * acceleration_mps2 * time_s * time_s;
+            PlanPose { position_m: DVec2::new(way_m, 0.0), yaw_rad: 0.0 }
+        };
+        let plan: Vec<PlanPose> = (1..=4).map(pose).collect();
+        let ego = HugsimBox {
+            footprint: Footprint::new(DVec2::ZERO, 0.0, 3.0, 1.6),
+            bottom_m: 0.0,
+            height_m: 1.5,
+        };
+        let around =
+            Decision { ego, yaw_rad: 0.0, plan: &plan, objects: &[], points_m: &[], ground_m: &[] };
+        decision(&around).c
+    };
+    for (acceleration_mps2, expected) in [(2.3, 1.0), (2.5, 0.0), (-4.0, 1.0), (-4.1, 0.0)] {
+        assert_eq!(comfort(acceleration_mps2), expected, "{acceleration_mps2} m/s²");
+    }
+}
+
 #[test]
 fn the_score_is_as_in_the_vectors() {
     let Some(scores) = cases("hugsim", "hd-score") else { return };

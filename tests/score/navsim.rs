@@ -140,6 +140,8 @@ fn a_standing_ego_is_never_at_fault_even_when_hit_in_front() {
     let found = scored(&input);
     assert_eq!(found.collision_types, [Some(CollisionType::StoppedEgo)]);
     assert_eq!(found.no_at_fault_collisions, 1.0);
+    // Below 5 mm/s it has no time to collision, though the other drives into it.
+    assert_eq!((found.time_to_collision_within_bound, found.first_ttc_step), (1.0, None));
 }
 
 #[test]
@@ -176,6 +178,30 @@ fn extended_comfort_is_as_in_the_vectors() {
         }
         assert_eq!(found.is_within, case.expected["within"], "{}", case.name);
     }
+}
+
+/// A lane that holds the whole ego counts, whatever other lane a corner lies in; edges belong to no lane.
+#[test]
+fn a_lane_of_its_own_is_one_that_holds_all_corners() {
+    let lane = |y_m: [f64; 2]| Lane {
+        outline_m: rectangle([-10.0, 10.0], y_m),
+        is_on_route: false,
+        is_intersection: false,
+    };
+    let centerline = Polyline::new(vec![DVec2::ZERO, DVec2::X]).unwrap();
+    let of = |lanes: Vec<Lane>| LaneMap { lanes, centerline: centerline.clone(), red: Vec::new() };
+    let ego = Footprint::new(DVec2::ZERO, 0.0, 4.0, 2.0);
+    let position = |lanes: Vec<Lane>| {
+        let found = of(lanes).position(&ego);
+        (found.in_multiple_lanes, found.off_drivable)
+    };
+    assert_eq!(position(vec![lane([-2.0, 2.0]), lane([0.0, 4.0])]), (false, false));
+    assert_eq!(position(vec![lane([-2.0, 0.0]), lane([0.0, 2.0])]), (true, false));
+    assert_eq!(position(vec![lane([-1.0, 2.0])]), (false, true), "a corner on the edge");
+    let mut oncoming = lane([-2.0, 2.0]);
+    assert!(of(vec![oncoming.clone()]).is_off_route(DVec2::ZERO));
+    oncoming.is_intersection = true;
+    assert!(!of(vec![oncoming]).is_off_route(DVec2::ZERO));
 }
 
 fn submetrics(value: &Value) -> Submetrics {

@@ -13,20 +13,18 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::{Shutter, ShutterDirection};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
-use wildcity_scene::trajectory::{Keyframe, Trajectory};
-use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat, RenderProfile};
+use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
 use wildcity_session::{
-    CameraSensor, DType, Encoding, Engine, LateFrames, Observation, Outcome, Outputs,
-    RecordedEpisode, ReplayUntil, RigChoice, ScenarioError, ScenarioOptions, ScenarioSource,
-    Sensors, Session, SessionError, SessionOptions, Start, StepOptions, TensorKind,
+    CameraSensor, DType, Encoding, Engine, LateFrames, Observation, Outputs, RigChoice,
+    ScenarioError, ScenarioOptions, ScenarioSource, Sensors, Session, SessionError, SessionOptions,
+    Start, StepOptions, TensorKind,
 };
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::{Catalog, NewVersion, StorageOptions, StoredActor};
+use wildcity_twin::store::StoredActor;
 
 use crate::driving::{Bench, bench, bench_with};
-use crate::images::{psnr, render, view_along};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 
 /// Where the ego stands, along the street.
@@ -35,7 +33,7 @@ const EGO_M: f64 = 100.0;
 const EXPOSURE_US: i64 = 60_000;
 
 /// A coloured box of 400 Gaussians, 4 m long.
-fn car_asset() -> ActorAsset {
+pub(crate) fn car_asset() -> ActorAsset {
     let mut gaussians = Gaussians::with_capacity(0, 400);
     for i in 0..400 {
         let at = |k: usize| (i * k % 397) as f64 / 397.0;
@@ -55,7 +53,7 @@ fn car_asset() -> ActorAsset {
 }
 
 /// The car in the store of the demo street.
-fn car() -> &'static StoredActor {
+pub(crate) fn car() -> &'static StoredActor {
     static CAR: OnceLock<StoredActor> = OnceLock::new();
     CAR.get_or_init(|| demo().catalog().put_actor(&car_asset(), RecordFormat::F32).unwrap())
 }
@@ -84,7 +82,7 @@ fn actors(asset: &Value) -> Value {
     ])
 }
 
-fn options(actors: &Value, shutters: bool) -> SessionOptions {
+pub(crate) fn options(actors: &Value, shutters: bool) -> SessionOptions {
     let scenario = json!({
         "format": "wildcity.scenario/1", "name": "test", "twin": {"name": "demo"}, "actors": actors,
     });
@@ -103,7 +101,7 @@ fn options(actors: &Value, shutters: bool) -> SessionOptions {
     }
 }
 
-async fn open(bench: &Bench, name: &str, options: SessionOptions) -> Session {
+pub(crate) async fn open(bench: &Bench, name: &str, options: SessionOptions) -> Session {
     Session::open(bench.engine.clone(), name.to_owned(), options).await.unwrap()
 }
 
@@ -429,175 +427,6 @@ async fn assets_count_against_the_memory_of_twins() {
     let opened = Session::open(small.engine.clone(), "a".to_owned(), options).await;
     let error = opened.err().map(|error| error.to_string()).unwrap_or_default();
     assert!(error.contains("red-box") && error.contains("--memory-gib"), "{error}");
-}
-
-/// A twin with a recorded drive of 60 m along x, and the car's asset beside it.
-fn straight() -> &'static (tempfile::TempDir, Catalog) {
-    static STRAIGHT: OnceLock<(tempfile::TempDir, Catalog)> = OnceLock::new();
-    STRAIGHT.get_or_init(|| {
-        let mut gaussians = Gaussians::with_capacity(0, 400);
-        for i in 0..400 {
-            let at = |k: usize| (i * k % 397) as f64 / 397.0;
-            gaussians.means_m.push([80.0 * at(31), 20.0 * at(57) - 10.0, 0.1 * at(71)]);
-            gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-            gaussians.ln_scales.push([1.0, 1.0, -3.0]);
-            gaussians.logit_opacities.push(3.0);
-            gaussians.sh.extend([at(13) as f32; 3]);
-        }
-        let keyframe = |k: i64| Keyframe {
-            time_us: 100_000 * k,
-            world_from_rig: Pose { position_m: DVec3::X * (0.6 * k as f64), ..Pose::IDENTITY },
-        };
-        let log =
-            Trajectory { name: "log".to_owned(), keyframes: (0..=100).map(keyframe).collect() };
-        let dir = tempfile::tempdir().unwrap();
-        let catalog = Catalog::open(dir.path()).unwrap();
-        let new = NewVersion {
-            profile: PROFILE,
-            trajectories: vec![log],
-            ..NewVersion::of("straight", &gaussians, Provenance::of("test".to_owned()))
-        };
-        catalog.commit(new, &mut |_, _| {}).unwrap();
-        catalog.put_actor(&car_asset(), RecordFormat::F32).unwrap();
-        (dir, catalog)
-    })
-}
-
-/// A record has where the actors were: in the warm-up, within plans, and when they come and go.
-#[tokio::test(flavor = "multi_thread")]
-async fn a_recorded_episode_is_rendered_again_with_its_actors() {
-    let (_, catalog) = straight();
-    let asset = Value::from(&*car().hash);
-    let actors = json!([
-        {"name": "ahead", "asset": asset, "path": {"along": "log", "station_m": 20, "speed": 7},
-         "script": [{"when": {"time_s": 0.75}, "do": [{"remove": {}}]}]},
-        {"name": "crossing", "asset": asset, "present": false,
-         "collide": {"positions": [{"time_s": 0, "xyz": [24, -6, 0]}, {"time_s": 2, "xyz": [24, 6, 0]}]},
-         "script": [{"when": {"time_s": 0.25}, "do": [{"spawn": {}}]}]},
-        {"name": "passing", "asset": asset,
-         "collide": {"positions": [{"time_s": -1, "xyz": [8, 4, 0]}, {"time_s": 2, "xyz": [40, 4, 0]}]}}
-    ]);
-    let mut bundled = options(&actors, true);
-    bundled.outputs.frames = Some(3);
-    bundled.dynamics =
-        Dynamics { model: EgoModel::Kinematic, speed_m_s: 6.0, ..Dynamics::default() };
-    bundled.twin = "straight".to_owned();
-    bundled.start = Some(Start::Station { trajectory: "log".to_owned(), station_m: 6.0 });
-    bundled.warm_up_us = 400_000;
-    if let Some(ScenarioOptions {
-        source: ScenarioSource::Inline(file), warm_up, dynamics, ..
-    }) = &mut bundled.scenario
-    {
-        file["twin"]["name"] = "straight".into();
-        (*warm_up, *dynamics) = (false, false);
-    }
-    let bench = bench(Cache::new(catalog.clone()));
-    let still = || Command::Action(Action { acceleration_m_s2: 0.0, curvature_1_m: 0.01 });
-    let plan = |until_us| StepOptions { until_us: Some(until_us), ..StepOptions::default() };
-    // One episode from its reset, one from its first step.
-    for (name, resets) in [("reset", true), ("bare", false)] {
-        let mut session = open(&bench, name, bundled.clone()).await;
-        if resets {
-            session.reset(0, None).await.unwrap();
-        }
-        session.step(still(), false).await.unwrap();
-        session.follow(still(), plan(300_000)).await.unwrap();
-        session.observe(vec![session.start()]).await.unwrap();
-        session.take_snapshot("here".to_owned()).unwrap();
-        session.follow(still(), plan(500_000)).await.unwrap();
-        session.step(still(), false).await.unwrap();
-        session.restore("here").await.unwrap();
-        session.step(still(), false).await.unwrap();
-        session.close(wildcity_session::Outcome::Completed).await;
-        for number in [1, 2] {
-            let path = bench.episodes.path().join(format!("{name}-{number}.jsonl"));
-            let report = replay(&path, catalog);
-            assert_eq!((report.diverged, &report.wrong_value), (None, &None), "{name}-{number}");
-            assert_eq!(report.difference, None, "{name}-{number}");
-            // The second file has the restored state and a step.
-            let images = if number == 1 { 7 } else { 4 };
-            assert!(report.images >= images, "{name}-{number}: {}", report.images);
-
-            // Actors that were recorded elsewhere are seen.
-            let text = std::fs::read_to_string(&path).unwrap();
-            let mut lines: Vec<Value> =
-                text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-            let placed = lines.iter_mut().filter(|line| line["kind"] == "actors");
-            for actor in placed.flat_map(|line| line["actors"].as_array_mut().unwrap()) {
-                actor[1][1] = json!(actor[1][1].as_f64().unwrap() + 0.5);
-            }
-            let moved: Vec<String> = lines.iter().map(Value::to_string).collect();
-            std::fs::write(&path, moved.join("\n") + "\n").unwrap();
-            assert!(replay(&path, catalog).difference.is_some(), "{name}-{number}");
-        }
-    }
-}
-
-fn replay(path: &std::path::Path, catalog: &Catalog) -> wildcity_session::ReplayReport {
-    let recording = RecordedEpisode::read(path).unwrap();
-    let cache = Cache::new(catalog.clone());
-    let cpu = crate::images::cpu();
-    recording.replay(&cache, &cpu, ReplayUntil::End, &mut |_| Ok(())).unwrap()
-}
-
-/// A cut-out car at its old place looks as it did within the twin.
-#[test]
-fn what_was_cut_out_and_put_back_looks_as_before() {
-    let mut gaussians = Gaussians::with_capacity(1, 3_000);
-    for i in 0..3_000 {
-        let at = |k: usize| (i * k % 2_999) as f64 / 2_999.0;
-        gaussians.means_m.push([40.0 * at(3109), 12.0 * at(571) - 6.0, 2.5 * at(7127)]);
-        gaussians.quats_wxyz.push([1.0, at(13) as f32, at(17) as f32 - 0.5, at(19) as f32]);
-        gaussians.ln_scales.push([-2.0, -2.4, -3.0]);
-        gaussians.logit_opacities.push(1.0 + 2.0 * at(23) as f32);
-        gaussians.sh.extend((0..12).map(|k| at(29 + k) as f32 - 0.5));
-    }
-    let dir = tempfile::tempdir().unwrap();
-    let catalog = Catalog::open(dir.path()).unwrap();
-    let new = NewVersion {
-        storage: StorageOptions { record: RecordFormat::F32, levels: false },
-        ..NewVersion::of("street", &gaussians, Provenance::of("test".to_owned()))
-    };
-    let base = catalog.commit(new, &mut |_, _| {}).unwrap();
-    let pose = Pose {
-        position_m: DVec3::new(14.0, 1.0, 0.0),
-        rotation: glam::DQuat::from_rotation_z(0.4),
-    };
-    let box_ = ActorBox { length_m: 5.0, width_m: 2.5, height_m: 2.0 };
-    let cut = catalog.cut(&base, &pose, &box_).unwrap();
-    assert!(cut.gaussians.len() >= 20, "{}", cut.gaussians.len());
-    let description = AssetDescription {
-        name: "cut".to_owned(),
-        class: ActorClass::Vehicle,
-        box_,
-        provenance: Provenance::of("test".to_owned()),
-    };
-    let asset = ActorAsset::new(&cut.gaussians, description).unwrap();
-    let stored = catalog.put_actor(&asset, RecordFormat::F32).unwrap();
-    let asset = catalog.actor(&stored.hash).unwrap();
-
-    let cache = Cache::new(catalog);
-    let views = [(2.0, -3.0), (24.0, 4.0)].map(|(x, y)| {
-        let from_m = DVec3::new(x, y, 1.5);
-        let toward = (pose.position_m + DVec3::Z - from_m).normalize();
-        view_along([320, 200], 240.0, from_m, toward, -DVec3::Z)
-    });
-    let profile = RenderProfile { tau_px: 0.0, ..RenderProfile::default() };
-    let draw = |version: u64, placed: Vec<PlacedChunk>| {
-        let resident = cache.open("street", Some(version)).unwrap();
-        let mut scene = resident.scene(&eyes(&views), &profile).unwrap();
-        scene.place(placed);
-        render(&crate::images::cpu(), &scene, &profile, &views)
-    };
-    let put_back = PlacedChunk::at_rest(asset.levels[0].chunk.clone(), pose, 0);
-    let before = draw(1, Vec::new());
-    let after = draw(2, vec![put_back]);
-    let without = draw(2, Vec::new());
-    for ((before, after), without) in before.iter().zip(&after).zip(&without) {
-        let db = psnr(&before.rgba, &after.rgba);
-        assert!(db >= 70.0, "{db:.1} dB");
-        assert!(psnr(&before.rgba, &without.rgba) < 40.0, "the cut must be seen");
-    }
 }
 
 /// The oracle of these tests places what it is given.

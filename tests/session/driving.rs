@@ -40,7 +40,7 @@ pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend
 }
 
 /// The two cameras of the other tests, as a rig.
-fn rig() -> Rig {
+pub(crate) fn rig() -> Rig {
     let cameras = views(Pose::IDENTITY).into_iter().zip(["front", "left"]);
     let camera = |(view, name): (wildcity_render::View, &str)| {
         RigCamera::new(name, view.camera, view.world_from_camera)

@@ -7,8 +7,10 @@ mod source;
 #[path = "../support/streaming.rs"]
 mod streaming;
 
+mod actor_records;
 mod actors;
 mod driving;
 mod fairness;
 mod long;
+mod solids;
 mod trust;

@@ -92,7 +92,7 @@ fn lateral_faults_are_as_in_the_vectors() {
 fn a_nanometre_decides_alike_at_any_origin() {
     for origin in [DVec2::ZERO, DVec2::new(450_000.25, 5_400_000.5), DVec2::new(-3e6, 9e6)] {
         let ego = Footprint::new(origin, 0.0, 4.0, 2.0);
-        for (gap_m, touches) in [(-2e-9, true), (0.0, true), (2e-9, false)] {
+        for (gap_m, touches) in [(-1e-9, true), (0.0, true), (1e-9, false)] {
             for axis in [DVec2::X, DVec2::Y] {
                 let reach_m = 4.0 * axis.x + 2.0 * axis.y;
                 let center_m = origin + (reach_m + gap_m) * axis;
@@ -178,6 +178,29 @@ fn every_step_length_finds_the_same_contacts() {
     // y: |12 t - 30| <= 1.9 from 2.3417 s; x: the front, at 10 t + 3.9, reaches 29.7 at 2.58 s.
     assert_eq!(found[0].time_us, 2_580_000);
     assert!(found[0].ego_at_fault && found[0].kind == CollisionType::ActiveFront, "{found:?}");
+}
+
+/// Two cars pass beside each other, with a nanometre less or more than nothing between them.
+#[test]
+fn every_step_length_decides_alike_about_a_nanometre() {
+    for origin_m in [DVec3::ZERO, DVec3::new(450_000.25, 5_400_000.5, 30.0)] {
+        for (gap_m, count) in [(-1e-9, 1), (0.0, 1), (1e-9, 0)] {
+            let motion = |time_s: f64| {
+                let mut ego = ego_at(10.0 * time_s, 0.0, 0.0, 10.0 * DVec3::X);
+                ego.world_from_rig.position_m += origin_m;
+                let side_m = 0.5 * (EGO.box_.width_m + CAR.width_m);
+                let other_m = DVec3::new(40.0 - 7.0 * time_s, side_m + gap_m, 0.0);
+                (ego, state(origin_m + other_m, std::f64::consts::PI, -7.0 * DVec3::X))
+            };
+            let find = |dt_us| contacts(ActorClass::Vehicle, CAR, dt_us, 5, &motion);
+            let found = find(100_000);
+            assert_eq!(found.len(), count, "{gap_m:e} at {origin_m}: {found:?}");
+            // The fronts meet after 40 - 3.9 - 2 m at 17 m/s: 2.005883 s.
+            assert!(found.iter().all(|contact| contact.time_us == 2_005_883), "{found:?}");
+            assert_eq!(found, find(50_000), "{gap_m:e} at {origin_m}");
+            assert_eq!(found, find(500_000), "{gap_m:e} at {origin_m}");
+        }
+    }
 }
 
 #[test]

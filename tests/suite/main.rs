@@ -2,6 +2,7 @@
 
 mod dial_in;
 mod files;
+mod overhead;
 mod runs;
 mod street;
 mod traffic;

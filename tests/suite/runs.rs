@@ -92,7 +92,7 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     let html = page(&run, &shown, &bench.path("stand"));
     assert_eq!(html.matches("data:image/jpeg;base64,").count(), 4);
     assert_eq!(html.matches("<svg").count(), 8);
-    assert!(html.contains("progress at 2.00 s") && !html.contains("http://cdn"), "{html}");
+    assert!(html.contains("progress at 2.000 s: 0.") && !html.contains("http://cdn"), "{html}");
 
     let xml = junit(&run);
     assert_eq!(xml.matches("<testcase").count(), 4);

@@ -42,6 +42,46 @@ async fn a_driver_that_ignores_the_pedestrian_fails_for_contact() {
     assert_eq!(bare.counts.passed, 1, "{}", bare.to_json());
 }
 
+/// The ego brakes evenly, so that it moves alike whatever the length of a step.
+#[tokio::test(flavor = "multi_thread")]
+async fn every_step_length_finds_the_same_contacts() {
+    let bench = Bench::new();
+    let mut value = scenario("cross", &json!({ "model": "kinematic", "speed": 10.0 }));
+    value["actors"] = json!([
+        { "name": "walker", "class": "pedestrian", "collide": {
+            "along": "log", "station_m": 34.0, "time_s": 1.5, "angle_rad": 1.57, "speed": 1.34 } },
+        { "name": "behind", "path": { "along": "log", "station_m": 2.0, "speed": 17.0 } },
+    ]);
+    bench.write("cross.json", &value);
+    let mut seen = Vec::new();
+    for dt_us in [50_000, 100_000, 500_000] {
+        let suite = json!({ "format": "wildcity.suite/1", "name": "steps", "scenarios": ["cross.json"],
+            "cameras": ["front"], "dt_us": dt_us });
+        let cases = bench.cases(&bench.write("steps.json", &suite)).unwrap();
+        let out = format!("dt{dt_us}");
+        let settings = bench.settings(AgentChoice::BuiltIn(BuiltIn::Stand), 1, &out);
+        let result = run(settings, cases).await.unwrap();
+        let episode =
+            EpisodeFile::read(&bench.path(&out).join(&result.episodes[0].record)).unwrap();
+        let contacts: Vec<_> = episode
+            .events
+            .iter()
+            .filter_map(|line| match &line.event {
+                Event::Contact(contact) => {
+                    Some((line.time_us, contact.actor, contact.collision, contact.ego_at_fault))
+                }
+                _ => None,
+            })
+            .collect();
+        seen.push(contacts);
+    }
+    let met: std::collections::BTreeSet<u16> = seen[0].iter().map(|contact| contact.1).collect();
+    assert_eq!(met.len(), 2, "{seen:?}");
+    assert!(seen[0][0].0 % 100_000 != 0, "within a step: {seen:?}");
+    assert_eq!(seen[0], seen[1]);
+    assert_eq!(seen[0], seen[2]);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn the_session_records_actors_events_and_result() {
     let bench = Bench::new();

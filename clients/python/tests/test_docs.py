@@ -115,7 +115,8 @@ def test_the_demo_suite_tells_drivers_apart(reader: dict[str, str], tmp_path: Pa
 
     bare = drive("log", 0, "--bare", "--jobs", "2")
     assert not any(bare.values()), "each scenario can be passed"
-    assert drive("idm", 0, "--jobs", "1") == drive("idm", 0, "--jobs", "2") == bare
+    for jobs in ("1", "2", "8"):
+        assert drive("idm", 0, "--jobs", jobs) == bare
     assert all("progress" in faults for faults in drive("stand", 1).values())
     blind = drive("log", 1)
     walkers = {name for name in blind if name.startswith("pedestrian")}
@@ -123,8 +124,8 @@ def test_the_demo_suite_tells_drivers_apart(reader: dict[str, str], tmp_path: Pa
     assert all(blind[name][0] == "contact.pedestrian" for name in walkers)
     report = (tmp_path / "log" / "report.html").read_text()
     assert report.count("data:image/jpeg;base64,") == len(walkers)
-    one, two = (tmp_path / f"idm---jobs-{jobs}" / "result.json" for jobs in (1, 2))
-    assert one.read_bytes() == two.read_bytes()
+    results = [tmp_path / f"idm---jobs-{jobs}" / "result.json" for jobs in (1, 2, 8)]
+    assert len({result.read_bytes() for result in results}) == 1
 
 
 def test_a_page_that_says_something_else_fails(reader: dict[str, str], tmp_path: Path) -> None:

@@ -136,7 +136,8 @@ fn is_agent(class: ActorClass) -> bool {
 }
 
 /// The score of an episode. There is none: the published score divides by the way of the planner PDM-Closed, which
-/// this project does not have, and compares successive plans, which an episode as driven has not.
+/// this project does not have, and compares successive plans, which an episode as driven has not. Its parts are the
+/// sub-metrics that need neither, as driven: the least of all whole 4 s. A record has no traffic lights.
 pub fn pdm(record: &DriveRecord) -> Score {
     let map = match record.map {
         None => "a map of the lanes, ",
@@ -148,7 +149,43 @@ pub fn pdm(record: &DriveRecord) -> Score {
     };
     let missing = format!("needs {map}{tracks}the planner PDM-Closed and successive plans");
     let comfort = history_comfort(record).map(|comfort| f64::from(u8::from(comfort)));
-    Score::new(NAME, Err(Missing::new(missing)), [("history_comfort", comfort)])
+    let rules = rules_as_driven(record);
+    let least = |value: &dyn Fn(&Rules) -> f64| rules.iter().map(value).reduce(f64::min);
+    let parts = [
+        ("no_at_fault_collisions", least(&|rules| rules.no_at_fault_collisions)),
+        ("drivable_area_compliance", least(&|rules| rules.drivable_area_compliance)),
+        ("driving_direction_compliance", least(&|rules| rules.driving_direction_compliance)),
+        ("traffic_light_compliance", None),
+        ("ego_progress", None),
+        ("time_to_collision_within_bound", least(&|rules| rules.time_to_collision_within_bound)),
+        ("lane_keeping", least(&|rules| rules.lane_keeping)),
+        ("history_comfort", comfort),
+        ("extended_comfort", None),
+    ];
+    Score::new(NAME, Err(Missing::new(missing)), parts)
+}
+
+/// The rules over each whole 4 s; none without a map, actors, and samples 0.1 s apart.
+fn rules_as_driven(record: &DriveRecord) -> Vec<Rules> {
+    let (Some(map), Some(tracks), Some(shape)) = (&record.map, &record.tracks, record.shape) else {
+        return Vec::new();
+    };
+    if !record.is_driven || record.dt_us != 100_000 {
+        return Vec::new();
+    }
+    let firsts = (0..record.ego.len()).step_by(STATES - 1);
+    let windows = firsts.filter_map(|first| Some((first, record.ego.get(first..first + STATES)?)));
+    windows
+        .map(|(first, ego)| {
+            let of_window = |track: &Track| Track {
+                name: track.name.clone(),
+                class: track.class,
+                samples: track.samples.iter().copied().skip(first).take(STATES).collect(),
+            };
+            let tracks: Vec<Track> = tracks.iter().map(of_window).collect();
+            rules(&Scene { shape, ego, tracks: &tracks, map, reference_progress_m: 0.0 })
+        })
+        .collect()
 }
 
 /// HC over the whole episode, if it has samples 0.1 s apart.

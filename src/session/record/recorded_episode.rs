@@ -49,7 +49,7 @@ impl RecordedEpisode {
         let mut header: Option<EpisodeHeader> = None;
         let mut frames = Vec::new();
         let mut versions = Vec::new();
-        let mut scenario = None;
+        let mut scenario: Option<Box<ScenarioLine>> = None;
         let mut actors = Vec::new();
         let mut frame_lines = Vec::new();
         let mut end_line = 0;
@@ -74,6 +74,7 @@ impl RecordedEpisode {
             }
 
             // The first line is the header, and nothing follows the end.
+            let actor_count = scenario.as_ref().map_or(0, |scenario| scenario.actors.len());
             let line: Line = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
             match line {
                 _ if end.is_some() => {
@@ -98,8 +99,12 @@ impl RecordedEpisode {
                     frame_lines.push(number);
                 }
                 Line::Scenario(line) if number > 1 => scenario = Some(line),
-                Line::Actors(line) if number > 1 => actors.push((frames.len(), line)),
-                Line::Event(_) | Line::Result(_) if number > 1 => {}
+                Line::Actors(line) if number > 1 => {
+                    line.check(actor_count).map_err(wrong)?;
+                    actors.push((frames.len(), line));
+                }
+                Line::Event(event) if number > 1 => event.check(actor_count).map_err(wrong)?,
+                Line::Result(_) if number > 1 => {}
                 Line::Version(version) if number > 1 => versions.push((frames.len(), version)),
                 Line::End(summary) if number > 1 => {
                     end = Some(summary);

@@ -12,17 +12,16 @@ use std::sync::Arc;
 
 use serde_json::Value;
 
-use wildcity_sim::contact::Solids;
 use wildcity_sim::scenario::{AssetInfo, EgoStart, ScenarioFile};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::{Catalog, Version};
+use wildcity_twin::store::Version;
 
 pub use assets::asset_info;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
+pub(crate) use solids::solids_of;
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
 use self::assets::ActorAssets;
-use self::solids::solids_of;
 use crate::error::SessionError;
 use crate::options::Start;
 
@@ -41,8 +40,6 @@ pub(crate) struct SessionScenario {
     file: ScenarioFile,
     /// Whether episodes start where the scenario says: the request named no start.
     gives_start: bool,
-    /// The twin's solid Gaussians; only if a contact with them ends an episode.
-    solids: Option<Arc<Solids>>,
 }
 
 impl SessionScenario {
@@ -58,7 +55,7 @@ impl SessionScenario {
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
         let wrong = |cause| ScenarioError::File { file: "scenario".to_owned(), cause };
         let file = document.with(&chosen).map_err(wrong)?;
-        Ok(Self { scenarios, file, gives_start, solids: None })
+        Ok(Self { scenarios, file, gives_start })
     }
 
     /// The scenario of an episode with a seed, and the assets of its actors, in memory.
@@ -88,22 +85,6 @@ impl SessionScenario {
         for (actor, pinned) in self.file.actors.iter_mut().zip(&first.scenario.file.actors) {
             actor.asset.clone_from(&pinned.asset);
         }
-    }
-
-    /// Looks for the twin's solid Gaussians, if a contact with them ends an episode. Blocks.
-    pub(crate) fn find_solids(
-        &mut self,
-        first: &LoadedScenario,
-        catalog: &Catalog,
-        version: &Version,
-    ) -> Result<(), SessionError> {
-        self.solids = solids_of(&first.scenario, catalog, version)?;
-        Ok(())
-    }
-
-    /// The solid Gaussians that were found.
-    pub(crate) fn solids(&self) -> Option<Arc<Solids>> {
-        self.solids.clone()
     }
 
     /// Where an episode starts, if the scenario says.

@@ -124,7 +124,8 @@ impl EpisodeTraffic {
         }
     }
 
-    /// The same, and contact with solid Gaussians is looked for. Those that the ego meets at the start are no contact.
+    /// The same, and contact with these solid Gaussians is looked for: those of the shown version of the twin. Those that
+    /// the ego meets already, at the start or when the version changes, are no contact.
     pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>, ego: &Ego) -> Self {
         let ego_box = self.loaded.scenario.traffic.ego_box;
         let area_m2 = |solids: &Arc<Solids>| solids.area_m2(&ego.world_from_rig(), &ego_box);
@@ -269,7 +270,7 @@ impl EpisodeTraffic {
     }
 
     /// The scenario, with this episode's seed.
-    pub fn loaded(&self) -> &LoadedScenario {
+    pub fn loaded(&self) -> &Arc<LoadedScenario> {
         &self.loaded
     }
 

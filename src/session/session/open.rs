@@ -24,7 +24,7 @@ use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions,
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::repair::session_repair::SessionRepair;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario, solids_of};
 use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
@@ -53,6 +53,7 @@ impl Session {
         let scenario = options.scenario.take();
         let tells_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
         let mut loaded = None;
+        let mut solids = None;
         let scenario = match scenario {
             None => None,
             Some(asked) => {
@@ -60,15 +61,16 @@ impl Session {
                 let version = resident.version.clone();
                 let seed = options.seed;
                 let gives_start = options.start.is_none();
-                let (asked, scenario, found) = run_blocking(move || {
+                let (asked, scenario, found, found_solids) = run_blocking(move || {
                     let scenarios = engine.scenarios().clone();
                     let read =
                         SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start);
                     let mut scenario = read?;
                     let found = scenario.of_episode(seed, &version, engine.cache())?;
                     scenario.pin_assets(&found.loaded);
-                    scenario.find_solids(&found.loaded, engine.cache().catalog(), &version)?;
-                    Ok::<_, SessionError>((asked, scenario, found))
+                    let catalog = engine.cache().catalog();
+                    let solids = solids_of(&found.loaded.scenario, catalog, &version)?;
+                    Ok::<_, SessionError>((asked, scenario, found, solids))
                 })
                 .await??;
                 let resolved = &found.loaded.scenario;
@@ -80,6 +82,7 @@ impl Session {
                     options.warm_up_us = warm_up_us;
                 }
                 loaded = Some(found);
+                solids = found_solids;
                 Some(scenario)
             }
         };
@@ -181,12 +184,11 @@ impl Session {
             tells_actors,
             repair,
         };
-        let version = PinnedVersion::new(resident, profile, coverage);
+        let version = PinnedVersion::new(resident, profile, coverage).with_solids(solids);
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
-            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
-                .with_solids(solids, episode.ego())
+                .with_solids(version.solids.clone(), episode.ego())
                 .with_reach(episode.reach_us())
         });
         let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
@@ -250,9 +252,22 @@ impl Session {
             Some(_) => Some(training_coverage(&resident, "outputs.trust").await?),
             None => None,
         };
+        let solids = match &self.state.traffic {
+            None => None,
+            Some(traffic) => {
+                let scenario = traffic.loaded().clone();
+                let catalog = self.engine.cache().catalog().clone();
+                let version = resident.version.clone();
+                let find = move || solids_of(&scenario.scenario, &catalog, &version);
+                run_blocking(find).await??
+            }
+        };
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
         self.reservation.exchange(resident.clone(), bytes)?;
-        self.version = PinnedVersion::new(resident, profile, coverage);
+        self.version = PinnedVersion::new(resident, profile, coverage).with_solids(solids.clone());
+        if let Some(traffic) = self.state.traffic.take() {
+            self.state.traffic = Some(traffic.with_solids(solids, self.state.episode.ego()));
+        }
         self.version_switched = true;
         let mut places = vec![(Urgency::Imminent, self.state.episode.world_from_rig())];
         places.extend(self.forecast().places());

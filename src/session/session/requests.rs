@@ -29,7 +29,7 @@ use crate::record::command::RecordedCommand;
 use crate::record::format::{FrameRequest, Line, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 use crate::viewpoint::viewpoints;
@@ -195,9 +195,8 @@ impl Session {
             .with_sensors(settings.layout.episode_sensors());
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
-            let solids = settings.scenario.as_ref().and_then(SessionScenario::solids);
             EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
-                .with_solids(solids, next.ego())
+                .with_solids(self.version.solids.clone(), next.ego())
                 .with_reach(next.reach_us())
         });
 
