@@ -4,8 +4,10 @@
     python tests/actors/softness.py WILDCITY CesiumMilkTruck.glb OUT [GAUSSIANS ...]
 
 Mitsuba 3 (EPFL) is an independent renderer. It draws the triangles unlit, with the display colours of their
-textures, 64 samples per pixel. For each distance and number of Gaussians the script prints the PSNR within the
-box of the truck in dB, and the width of the edge between roof and background from 10 to 90 % in pixels.
+textures, 64 samples per pixel. For each number of Gaussians the script prints, distance by distance: the PSNR
+within the box of the truck in dB; over all edges between two flat colours, the median width from 10 to 90 % and
+the median distance from the edge of the triangles, in pixels. It writes OUT/softness.png: a part of the picture
+at 5 m, as triangles and as Gaussians.
 """
 
 import pathlib
@@ -24,6 +26,10 @@ AXES = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 WIDTH, HEIGHT, FOCAL = 1440, 928, 1800.0
 DISTANCES = (3, 5, 8, 15)
 GREY = 0.55
+# Pixels on each side of an edge in which there is no other.
+REACH = 10
+# The part of the picture at 5 m that is shown: first column, first row, size.
+PART = (700, 60, 330, 400)
 
 
 def shapes(path: pathlib.Path, folder: pathlib.Path) -> tuple[list[dict], np.ndarray]:
@@ -97,26 +103,49 @@ def truth(described: list[dict], size: np.ndarray, distance: float) -> np.ndarra
     return np.clip(np.asarray(mitsuba.render(mitsuba.load_dict(scene))), 0, 1)
 
 
-def edge_px(image: np.ndarray) -> float:
-    """Median width, from 10 to 90 %, of the edges from the background down into the truck's roof."""
-    widths = []
-    for column in range(0, WIDTH, 4):
-        off = np.abs(image[:, column] - GREY).max(axis=1)
-        inside = np.nonzero(off > 0.15)[0]
-        if len(inside) == 0 or inside[0] < 12 or inside[0] > HEIGHT - 12:
-            continue
-        first = inside[0]
-        plateau = image[first + 6 : first + 11, column].mean(axis=0) - GREY
-        if np.abs(plateau).max() < 0.15:
-            continue
-        share = (image[first - 10 : first + 11, column] - GREY) @ plateau / (plateau @ plateau)
-        rows = np.arange(len(share))
-        low, high = np.argmax(share > 0.1), np.argmax(share > 0.9)
-        if low == 0 or high <= low - 1:
-            continue
-        at = lambda level, k: rows[k - 1] + (level - share[k - 1]) / (share[k] - share[k - 1])
-        widths.append(at(0.9, high) - at(0.1, low))
-    return float(np.median(widths)) if widths else float("nan")
+def crossing(share: np.ndarray, level: float) -> float:
+    """Where a profile from 0 to 1 passes a level for the first time, in pixels; nan if it does not."""
+    above = np.nonzero(share > level)[0]
+    if len(above) == 0 or above[0] == 0:
+        return float("nan")
+    k = above[0]
+    return k - 1 + (level - share[k - 1]) / (share[k] - share[k - 1])
+
+
+def edges(image: np.ndarray) -> list[tuple[tuple, np.ndarray, np.ndarray]]:
+    """Sharp edges between two flat colours across rows and columns: the pixels around each, and both colours."""
+    found = []
+    for is_row in (True, False):
+        lines = (image if is_row else image.transpose(1, 0, 2))[::4]
+        # In each line and at each pixel, the colours from so far before it to so far after it.
+        around = np.lib.stride_tricks.sliding_window_view(lines, 2 * REACH + 1, axis=1)
+        before, after = around[..., : REACH - 2], around[..., REACH + 3 :]
+        step = after.mean(axis=-1) - before.mean(axis=-1)
+        flat = np.maximum(np.ptp(before, axis=-1), np.ptp(after, axis=-1)).max(axis=-1) < 0.03
+        last = (-1, 0)
+        for line, first in np.argwhere(flat & (np.abs(step).max(axis=-1) > 0.3)):
+            # The same edge is found by several neighbours; the first one counts.
+            if last[0] == line and first < last[1] + REACH:
+                continue
+            last = (line, first)
+            window = slice(first, first + 2 * REACH + 1)
+            place = (4 * line, window) if is_row else (window, 4 * line)
+            found.append((place, before[line, first].mean(axis=-1), step[line, first]))
+    return found
+
+
+def edge_px(image: np.ndarray, where: list, truths: list | None) -> tuple[float, float, list]:
+    """Medians over edges: width from 10 to 90 %, and distance from the edge of the triangles; and all places."""
+    widths, places = [], []
+    for place, before, step in where:
+        share = (image[place] - before) @ step / (step @ step)
+        low, middle, high = (crossing(share, level) for level in (0.1, 0.5, 0.9))
+        widths.append(high - low)
+        places.append(middle)
+    if truths is None:
+        return float(np.nanmedian(widths)), 0.0, places
+    off = np.abs(np.array(places) - np.array(truths))
+    return float(np.nanmedian(widths)), float(np.nanmedian(off)), places
 
 
 def main() -> None:
@@ -124,23 +153,23 @@ def main() -> None:
     counts = [int(count) for count in sys.argv[4:]] or [50_000, 100_000, 200_000, 400_000, 800_000]
     out.mkdir(parents=True, exist_ok=True)
     described, size = shapes(source, out)
-    truths = {}
+    truths, where, middles = {}, {}, {}
     for distance in DISTANCES:
         stored = out / f"truth_{distance}.npy"
         if not stored.exists():
             np.save(stored, truth(described, size, distance))
         truths[distance] = np.load(stored)
         Image.fromarray((truths[distance] * 255 + 0.5).astype(np.uint8)).save(out / f"truth_{distance}.png")
-        print(f"triangles at {distance} m: edge {edge_px(truths[distance]):.2f} px", flush=True)
+        where[distance] = edges(truths[distance])
+        width, _, middles[distance] = edge_px(truths[distance], where[distance], None)
+        print(f"triangles at {distance} m: {len(where[distance])} edges of {width:.2f} px", flush=True)
     axes = " ".join(str(int(value)) for value in AXES.ravel())
+    parts = [part(truths[5])]
     for count in counts:
         twins = out / f"twins_{count}"
-        subprocess.run(
-            [program, "actor", "import", source, "--name", "truck", "--axes", axes, "--gaussians", str(count)]
-            + ["--record", "f32", "--twins", twins],
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
+        importing = [program, "actor", "import", source, "--name", "truck", "--axes", axes, "--twins", twins]
+        importing += ["--gaussians", str(count), "--record", "f32"]
+        subprocess.run(importing, check=True, stdout=subprocess.DEVNULL)
         row = []
         for distance in DISTANCES:
             picture = out / f"{count}_{distance}.png"
@@ -151,8 +180,18 @@ def main() -> None:
             rows, columns = np.nonzero(covered)
             window = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
             error = np.mean((image[window] - truths[distance][window]) ** 2)
-            row.append(f"{-10 * np.log10(error):.1f} dB {edge_px(image):.2f} px")
+            width, off, _ = edge_px(image, where[distance], middles[distance])
+            row.append(f"{-10 * np.log10(error):.1f} dB {width:.2f} px {off:.2f} px")
+            if distance == 5:
+                parts.append(part(image))
         print(f"{count:>8} | " + " | ".join(row), flush=True)
+    Image.fromarray(np.concatenate(parts, axis=1)).save(out / "softness.png")
+
+
+def part(image: np.ndarray) -> np.ndarray:
+    """The part of a picture that is shown."""
+    x, y, width, height = PART
+    return (image[y : y + height, x : x + width] * 255 + 0.5).astype(np.uint8)
 
 
 if __name__ == "__main__":

@@ -37,6 +37,8 @@ mod support;
 #[path = "../support/versions.rs"]
 mod versions;
 
+mod actor;
+mod bench_actors;
 mod bench_drive;
 mod bench_gpu;
 mod bisect;

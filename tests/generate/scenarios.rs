@@ -3,11 +3,11 @@
 
 use wildcity_generate::{ActorModel, StreetSettings, street_map};
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{ActorBox, ActorClass, Trajectory};
+use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::contact::{Contact, Detector};
 use wildcity_sim::map::Map;
 use wildcity_sim::scenario::{AssetInfo, Document, EgoStart, Scenario, Surroundings};
-use wildcity_sim::traffic::{ActorState, EgoMotion, EgoState, Idm, World, rolled};
+use wildcity_sim::traffic::{ActorState, Beside, Course, EgoMotion, EgoState, Idm, World, rolled};
 
 /// An episode of a scenario with a driver that follows the drive and keeps behind actors on it.
 struct Driven {
@@ -82,6 +82,32 @@ impl Driven {
     fn index(&self, name: &str) -> usize {
         self.names.iter().position(|other| other == name).unwrap()
     }
+
+    /// Where an actor is beside the ego's drive, while it is there: the ego's station, and the actor's place.
+    fn beside(&self, name: &str) -> Vec<(f64, Beside)> {
+        let course = Course::from_drive(&crate::DEMO.trajectory).unwrap();
+        let index = self.index(name);
+        let there = self.steps.iter().map(|step| (step.0, step.2[index]));
+        let present = there.filter(|(_, actor)| actor.present);
+        present.map(|(ego_m, actor)| (ego_m, course.nearest(actor.world_from_actor.position_m))).collect()
+    }
+
+    /// Asserts that cars from ahead keep to their own lane, 3.5 m to the left of the drive, and that at least one
+    /// passes the ego within some steps.
+    fn check_oncoming(&self, steps: usize) {
+        let oncoming = self.names.iter().filter(|name| name.starts_with("oncoming"));
+        let passed = oncoming.map(|name| {
+            let places = self.beside(name);
+            // Beyond the ends of the drive there is no lane.
+            let on_drive = places.iter().filter(|(_, at)| (5.0..260.0).contains(&at.station_m));
+            for (_, at) in on_drive {
+                assert!((at.left_m - 3.5).abs() < 0.3, "{name}: {} m to the left", at.left_m);
+            }
+            assert!(places[0].1.station_m > places[0].0 + 50.0, "{name} comes from ahead");
+            places.iter().take(steps).any(|(ego_m, at)| at.station_m < *ego_m)
+        });
+        assert!(passed.collect::<Vec<_>>().contains(&true), "no car passed the ego");
+    }
 }
 
 #[test]
@@ -89,16 +115,12 @@ fn the_van_cuts_in_and_a_careful_driver_stays_behind() {
     for seed in 0..5 {
         let driven = drive("cut-in.json", seed, 20);
         assert_eq!(driven.contacts, [], "seed {seed}");
-        let van = driven.index("van");
-        let [before, after] = [&driven.steps[10], &driven.steps[60]];
-        let left_m = |step: &(f64, f64, Vec<ActorState>), log: &Trajectory| {
-            let course = wildcity_sim::traffic::Course::from_drive(log).unwrap();
-            course.nearest(step.2[van].world_from_actor.position_m)
-        };
-        let log = &crate::DEMO.trajectory;
-        assert!(left_m(before, log).left_m > 3.0, "in the other lane at first");
-        let cut = left_m(after, log);
-        assert!(cut.left_m.abs() < 0.3 && cut.station_m > after.0, "ahead in the ego's lane");
+        let van = driven.beside("van");
+        assert!(van[10].1.left_m > 3.0, "in the other lane at first");
+        let (ego_m, cut) = van[60];
+        assert!(cut.left_m.abs() < 0.3 && cut.station_m > ego_m, "ahead in the ego's lane");
+        // Within the steps that the demo drives.
+        driven.check_oncoming(100);
         let slowest_mps = driven.steps.iter().map(|step| step.1).fold(f64::MAX, f64::min);
         assert!(slowest_mps < 5.0, "the ego had to brake: {slowest_mps}");
     }
@@ -109,6 +131,17 @@ fn traffic_flows_and_the_walker_crosses() {
     for seed in 0..3 {
         let driven = drive("traffic.json", seed, 35);
         assert_eq!(driven.contacts, [], "seed {seed}");
+        driven.check_oncoming(150);
+        // It is on the ego's lane before the ego, which waits.
+        let crossing: Vec<_> = driven.beside("walker").into_iter().enumerate().collect();
+        let on_lane = crossing.iter().filter(|(_, (_, at))| at.left_m.abs() < 1.5);
+        let gaps_m: Vec<f64> = on_lane.map(|(_, (ego_m, at))| at.station_m - ego_m).collect();
+        let nearest_m = gaps_m.iter().copied().fold(f64::INFINITY, f64::min);
+        assert!((4.0..20.0).contains(&nearest_m), "seed {seed}: {nearest_m} m before the ego");
+        let waits = crossing.iter().filter(|(_, (_, at))| at.left_m.abs() < 2.0);
+        let slowest_mps =
+            waits.map(|(step, _)| driven.steps[*step].1).fold(f64::INFINITY, f64::min);
+        assert!(slowest_mps < 4.0, "seed {seed}: {slowest_mps} m/s");
         let walker = driven.index("walker");
         let [first, last] = [&driven.steps[0], driven.steps.last().unwrap()];
         let way_m = last.2[walker].world_from_actor.position_m

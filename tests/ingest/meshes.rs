@@ -82,6 +82,51 @@ fn vehicles_have_their_size_and_their_colours() {
     assert!(white > 0.25 && tyres > 0.05 && logo > 0.01, "{white} {tyres} {logo}");
 }
 
+/// A triangle in the colours of a 2 x 1 image, red and green, with texture coordinates that all lie in its red half.
+fn textured(info: &str) -> Vec<u8> {
+    let positions: [[f32; 3]; 3] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+    let uv: [[f32; 2]; 3] = [[0.1, 0.2], [0.4, 0.2], [0.1, 0.8]];
+    let floats = positions.as_flattened().iter().chain(uv.as_flattened());
+    let mut buffer: Vec<u8> = floats.flat_map(|value| value.to_le_bytes()).collect();
+    let image = image::RgbImage::from_raw(2, 1, vec![255, 0, 0, 0, 255, 0]).unwrap();
+    let mut png = std::io::Cursor::new(Vec::new());
+    image.write_to(&mut png, image::ImageFormat::Png).unwrap();
+    let png = png.into_inner();
+    buffer.extend(&png);
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0}}],
+        "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"TEXCOORD_0":1}},"material":0}}]}}],
+        "materials":[{{"pbrMetallicRoughness":{{"baseColorTexture":{{"index":0{info}}}}}}}],
+        "textures":[{{"source":0}}],"images":[{{"bufferView":2,"mimeType":"image/png"}}],
+        "accessors":[
+        {{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}},
+        {{"bufferView":1,"componentType":5126,"count":3,"type":"VEC2"}}],
+        "bufferViews":[{{"buffer":0,"byteLength":36}},{{"buffer":0,"byteOffset":36,"byteLength":24}},
+        {{"buffer":0,"byteOffset":60,"byteLength":{}}}],
+        "buffers":[{{"byteLength":{}}}]}}"#,
+        png.len(),
+        buffer.len()
+    );
+    glb((json, buffer))
+}
+
+#[test]
+fn a_texture_may_show_a_part_of_its_image() {
+    let green = |info: &str| {
+        let g = read(&textured(info)).unwrap();
+        let [red, green, _] = colour(&g, g.len() / 2);
+        assert!((red - green).abs() > 0.9, "{info}: {red}, {green}");
+        green > red
+    };
+    let transform = |fields: &str| format!(r#","extensions":{{"KHR_texture_transform":{{{fields}}}}}"#);
+    assert!(!green(""));
+    assert!(!green(&transform(r#""texCoord":0"#)));
+    assert!(green(&transform(r#""offset":[0.5,0]"#)));
+    assert!(green(&transform(r#""offset":[1,0],"scale":[-1,1]"#)));
+    let rotated = refusal(&textured(&transform(r#""rotation":1.5"#)));
+    assert!(rotated.contains("KHR_texture_transform rotates"), "{rotated}");
+}
+
 #[test]
 fn errors_of_meshes_name_the_cause() {
     let replaced = |from: &str, to: &str| {

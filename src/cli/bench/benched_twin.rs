@@ -7,7 +7,7 @@ use crate::cli::backend_options::{self, BackendOptions};
 use crate::cli::directories::{TwinVersion, Twins};
 use wildcity_session::{Engine, EngineSettings, Outputs, Scenarios, SessionOptions};
 use wildcity_twin::residency::Cache;
-use wildcity_twin::store::Version;
+use wildcity_twin::store::{Catalog, Version};
 
 #[derive(Debug, clap::Args)]
 pub(super) struct BenchedTwin {
@@ -31,6 +31,11 @@ impl BenchedTwin {
     pub(super) fn start(&self, episodes: &Path) -> anyhow::Result<(Arc<Engine>, Version)> {
         let catalog = self.twins.catalog()?;
         let version = catalog.version(&self.twin.name, self.twin.number)?;
+        Ok((self.engine(catalog, episodes)?, version))
+    }
+
+    /// Starts an engine on the twins of a catalog that records to a directory.
+    pub(super) fn engine(&self, catalog: Catalog, episodes: &Path) -> anyhow::Result<Arc<Engine>> {
         let limit_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
         let engine = Engine::start(EngineSettings {
             cache: Cache::limited(catalog, limit_bytes),
@@ -40,7 +45,7 @@ impl BenchedTwin {
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
             repairs: Arc::default(),
         })?;
-        Ok((engine, version))
+        Ok(engine)
     }
 
     /// Options of a session on the twin.

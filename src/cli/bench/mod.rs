@@ -1,23 +1,27 @@
 //! `wildcity bench`.
 
+mod actors;
 mod benched_twin;
 mod drive;
 mod gpu;
 mod load;
 mod memory;
+mod processor;
 mod sessions;
+mod size;
 mod soak;
 mod step;
 mod temporary_dir;
 mod timed;
 
-/// Measure the speed of the renderer, of sessions, and of reading twins.
+/// Measure the speed of the renderer, of sessions, of actors, and of reading twins.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
   wildcity bench step street.ply --cameras cameras.json
   wildcity bench drive street --csv steps.csv
   wildcity bench sessions street --size 96x60
+  wildcity bench actors street
   wildcity bench load street
   wildcity bench soak street")]
 pub(super) struct Bench {
@@ -31,6 +35,7 @@ enum Subcommand {
     Gpu(gpu::Gpu),
     Drive(Box<drive::Drive>),
     Sessions(Box<sessions::Sessions>),
+    Actors(Box<actors::Actors>),
     Load(load::Load),
     Soak(soak::Soak),
 }
@@ -42,6 +47,7 @@ impl Bench {
             Subcommand::Gpu(gpu) => gpu.run(),
             Subcommand::Drive(drive) => drive.run(),
             Subcommand::Sessions(sessions) => sessions.run(),
+            Subcommand::Actors(actors) => actors.run(),
             Subcommand::Load(load) => load.run(),
             Subcommand::Soak(soak) => soak.run(),
         }

@@ -1,6 +1,5 @@
 //! `wildcity bench sessions`.
 
-use std::fs;
 use std::io::{self, Write};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,6 +8,8 @@ use anyhow::Context;
 use serde_json::json;
 
 use super::benched_twin::BenchedTwin;
+use super::processor::processor_time;
+use super::size::Size;
 use super::temporary_dir::TemporaryDir;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
@@ -37,7 +38,7 @@ pub(super) struct Sessions {
     rig: Option<String>,
 
     /// Size of all images, for example 96x60 [default: the cameras' own]
-    #[arg(long, value_name = "WxH", value_parser = size)]
+    #[arg(long, value_name = "WxH")]
     size: Option<Size>,
 
     /// Format of the images: jpeg, png or raw.
@@ -57,10 +58,6 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity bench sessions demo --size 96x60
   wildcity bench sessions demo --rig alpamayo2 --size 576x320 --encoding raw --json";
-
-/// Width and height of an image, in pixels.
-#[derive(Clone, Copy, Debug)]
-struct Size([u64; 2]);
 
 /// One step of one session.
 #[derive(Clone, Copy)]
@@ -166,10 +163,8 @@ impl Sessions {
             (None, Some(rig)) => rig.clone(),
             (None, None) => preset(wildcity_session::limits::RIG)?,
         };
-        if let Some(Size([width, height])) = self.size {
-            for camera in &mut rig.cameras {
-                *camera = camera.scaled(width, height)?;
-            }
+        if let Some(size) = self.size {
+            size.apply(&mut rig)?;
         }
         Ok(SessionOptions {
             rig: Some(RigChoice::Full(rig)),
@@ -229,25 +224,6 @@ impl Row {
              {beyond_pixels_ms:>14.3}"
         )
     }
-}
-
-/// Processor time of this process, user and system, of all threads.
-fn processor_time() -> anyhow::Result<Duration> {
-    let text = fs::read_to_string("/proc/self/stat").context("/proc/self/stat")?;
-    // The name of the program, in parentheses, may have spaces. utime and stime are fields 14 and 15 (proc(5)), in
-    // ticks, of which Linux has 100 per second on every architecture.
-    let after_name = text.rsplit(')').next().unwrap_or_default();
-    let mut fields = after_name.split_whitespace().skip(11);
-    let mut ticks = || fields.next().and_then(|field| field.parse::<u64>().ok());
-    let both = ticks().zip(ticks()).context("/proc/self/stat does not say what time is used")?;
-    Ok(Duration::from_millis(10 * (both.0 + both.1)))
-}
-
-fn size(text: &str) -> Result<Size, String> {
-    let sides = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
-    sides
-        .map(Size)
-        .ok_or_else(|| format!("{text:?} is not a size; expected WxH, for example 96x60"))
 }
 
 fn encoding(text: &str) -> Result<Encoding, String> {

@@ -110,7 +110,8 @@ fn read_primitive(
     // Check the accessors before the gltf crate reads them.
     let material = primitive.material();
     let base = material.pbr_metallic_roughness();
-    let set = base.base_color_texture().map_or(0, |texture| texture.tex_coord());
+    let TextureArea { set, offset, scale } =
+        TextureArea::of(base.base_color_texture()).map_err(|reason| bad(place, reason))?;
     const FRACTIONS: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
     const INDICES: &[DataType] = &[DataType::U8, DataType::U16, DataType::U32];
     for (accessor, dimensions, types) in [
@@ -139,7 +140,7 @@ fn read_primitive(
     // Positions, colours, and texture coordinates per corner.
     let positions_m: Vec<DVec3> = positions.map(|m| DVec3::from_array(m.map(f64::from))).collect();
     let uv: Option<Vec<DVec2>> =
-        uv.map(|uv| uv.map(|uv| DVec2::from_array(uv.map(f64::from))).collect());
+        uv.map(|uv| uv.map(|uv| offset + scale * DVec2::from_array(uv.map(f64::from))).collect());
     let factor = DVec4::from_array(base.base_color_factor().map(f64::from));
     let colors: Option<Vec<DVec4>> =
         colors.map(|colors| colors.map(|c| DVec4::from_array(c.map(f64::from))).collect());
@@ -177,6 +178,37 @@ fn read_primitive(
         })
     };
     whole.iter().map(triangle).collect()
+}
+
+/// The part of an image that a texture shows: `offset + scale * uv` (KHR_texture_transform).
+struct TextureArea {
+    /// The set of texture coordinates.
+    set: u32,
+    offset: DVec2,
+    scale: DVec2,
+}
+
+impl TextureArea {
+    /// The area of a texture; all of the image without a texture or without a transform.
+    fn of(info: Option<gltf::texture::Info<'_>>) -> Result<Self, String> {
+        let mut area = Self { set: 0, offset: DVec2::ZERO, scale: DVec2::ONE };
+        let Some(info) = info else { return Ok(area) };
+        area.set = info.tex_coord();
+        let Some(transform) = info.texture_transform() else { return Ok(area) };
+        // Programs disagree about its direction: the formula of the extension's text turns the other way than the
+        // viewer of its authors.
+        if transform.rotation() != 0.0 {
+            return Err("has a texture that KHR_texture_transform rotates; export rotated texture coordinates".into());
+        }
+        area.set = transform.tex_coord().unwrap_or(area.set);
+        area.offset = DVec2::from_array(transform.offset().map(f64::from));
+        area.scale = DVec2::from_array(transform.scale().map(f64::from));
+        let numbers = [area.offset, area.scale];
+        match numbers.iter().all(|pair| pair.is_finite()) {
+            true => Ok(area),
+            false => Err("has a texture with a KHR_texture_transform that is not finite".into()),
+        }
+    }
 }
 
 /// The image of a primitive's base colour texture.

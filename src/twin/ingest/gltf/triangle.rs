@@ -10,10 +10,10 @@ use image::RgbaImage;
 use crate::ingest::activation;
 use wildcity_scene::Gaussians;
 
-/// Ratio of a Gaussian's standard deviation to that of its triangle. Triangles of a regular mesh
-/// with edges of length L have 0.20 L, and their centres are 0.58 L apart: a standard deviation of
-/// 0.6 of that distance leaves no gaps.
-const WIDER: f64 = 1.7;
+/// Ratio of a Gaussian's standard deviation to that of its triangle. Whatever the triangle's shape, a covered surface
+/// lets 4 % of the light through, 9 % at most. With 1.7 these are 8 and 19 %, and what lies behind shows; with 2.1 they
+/// are 2 and 4 %, and edges lie 0.3 to 0.6 px farther out at 3 and 5 m. `tests/actors/softness.py` compares them.
+const WIDER: f64 = 1.9;
 /// Longest edge of a triangle that becomes one Gaussian, in edges of a square with the area of a
 /// share. The Gaussian of a longer, narrow triangle would reach beyond its ends.
 pub(super) const LONGEST: f64 = 4.0;
@@ -214,6 +214,36 @@ mod tests {
             }
             let off = (covariance - exact).to_cols_array().map(f64::abs);
             assert!(off.iter().all(|&off| off < 1e-6), "{cuts}: {off:?}");
+        }
+    }
+
+    /// The light that a covered surface lets through, between its Gaussians and on average.
+    #[test]
+    fn a_covered_surface_lets_little_through() {
+        for third in [[0.0, 1.0, 0.0], [0.5, 0.9, 0.0], [3.0, 0.5, 0.0]] {
+            let whole = triangle([[0.0; 3], [1.0, 0.0, 0.0], third]);
+            let cuts = 24;
+            let mut parts = Gaussians::with_capacity(0, 0);
+            whole.cover(cuts, &mut parts);
+            let [a, b, c] = whole.corners_m;
+            let through = |u: f64, v: f64| -> f64 {
+                let at_m = a + u * (b - a) + v * (c - a);
+                let one = |i: usize| {
+                    let [w, x, y, z] = parts.quats_wxyz[i].map(f64::from);
+                    let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
+                    let off = axes.transpose() * (at_m - DVec3::from_array(parts.means_m[i]));
+                    let [long, short, _] = parts.ln_scales[i].map(|ln| f64::from(ln).exp());
+                    1.0 - OPACITY * (-0.5 * ((off.x / long).powi(2) + (off.y / short).powi(2))).exp()
+                };
+                (0..parts.len()).map(one).product()
+            };
+            // One cell in the middle.
+            let points = (0..400).map(|k| (f64::from(k % 20), f64::from(k / 20)));
+            let place = |share: f64| (8.0 + share / 20.0) / f64::from(cuts);
+            let lets: Vec<f64> = points.map(|(u, v)| through(place(u), place(v))).collect();
+            let mean = lets.iter().sum::<f64>() / 400.0;
+            let most = lets.iter().copied().fold(0.0, f64::max);
+            assert!(mean < 0.05 && most < 0.1, "{third:?}: {mean} on average, {most} at most");
         }
     }
 

@@ -1,0 +1,106 @@
+//! `wildcity actor import` and `wildcity actor show`: how sharp a mesh is as an actor.
+
+use std::path::Path;
+
+use crate::format_files::glb;
+use crate::wildcity;
+
+/// Half of the plate's length and thickness, and its height, in metres. Its 65 m² are those of the lorry that
+/// `tests/actors/softness.py` measures, so that its Gaussians are as large.
+const HALF_LENGTH_M: f32 = 5.2;
+const HALF_THICKNESS_M: f32 = 0.05;
+const HEIGHT_M: f32 = 3.0;
+/// The distance that `show` draws the plate from, in metres, and its camera.
+const DISTANCE_M: f64 = 8.0;
+const FOCAL_PX: f64 = 1800.0;
+/// The background of `show`; the plate is white.
+const GREY: f64 = 0.55;
+
+/// A white plate as a binary glTF: twelve triangles.
+fn plate() -> Vec<u8> {
+    let mut buffer = Vec::new();
+    for corner in 0..8 {
+        let end = |bit: u32| if corner >> bit & 1 == 1 { 1.0 } else { -1.0 };
+        let height_m = HEIGHT_M * 0.5 * (1.0 + end(2));
+        for m in [HALF_LENGTH_M * end(0), HALF_THICKNESS_M * end(1), height_m] {
+            buffer.extend(f32::to_le_bytes(m));
+        }
+    }
+    // The corners of each side, in turn around it: bit 0 of a corner is its x, bit 1 its y, bit 2 its z.
+    for [a, b, c, d] in
+        [[0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5], [0, 1, 3, 2], [4, 5, 7, 6_u8]]
+    {
+        buffer.extend([a, b, c, a, c, d]);
+    }
+    let json = format!(
+        r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0}}],
+        "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
+        "accessors":[
+        {{"bufferView":0,"componentType":5126,"count":8,"type":"VEC3",
+          "min":[-{HALF_LENGTH_M},-{HALF_THICKNESS_M},0],"max":[{HALF_LENGTH_M},{HALF_THICKNESS_M},{HEIGHT_M}]}},
+        {{"bufferView":1,"componentType":5121,"count":36,"type":"SCALAR"}}],
+        "bufferViews":[{{"buffer":0,"byteLength":96}},{{"buffer":0,"byteOffset":96,"byteLength":36}}],
+        "buffers":[{{"byteLength":132}}]}}"#
+    );
+    glb((json, buffer))
+}
+
+/// The edges of the plate in its picture.
+#[derive(Debug)]
+struct Edges {
+    /// From 10 to 90 % of the upper edge, in pixels.
+    width_px: f64,
+    /// How much higher it is than the triangles are, in pixels.
+    grown_px: f64,
+}
+
+/// Imports the plate with more options, and measures its picture.
+fn edges(dir: &Path, options: &[&str]) -> Edges {
+    let file = dir.join("plate.glb");
+    std::fs::write(&file, plate()).unwrap();
+    let twins = dir.join(format!("twins{}", options.join("")));
+    let run = |command: &mut std::process::Command| {
+        let output = command.arg("--twins").arg(&twins).output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+    };
+    run(wildcity().args(["actor", "import"]).arg(&file).args(options));
+    let picture = dir.join("plate.png");
+    let distance = DISTANCE_M.to_string();
+    run(wildcity().args(["actor", "show", "plate", "--distance", &distance, "--picture"]).arg(&picture));
+    let image = image::open(&picture).unwrap().into_rgb8();
+
+    // From the background to the plate, down its middle.
+    let middle = image.width() / 2 - 100..image.width() / 2 + 100;
+    let row = |y: u32| -> f64 {
+        let sum: f64 = middle.clone().map(|x| f64::from(image.get_pixel(x, y).0[1])).sum();
+        (sum / 200.0 / 255.0 - GREY) / (1.0 - GREY)
+    };
+    let rows: Vec<f64> = (0..image.height()).map(row).collect();
+    let crossing = |rows: &mut dyn Iterator<Item = f64>, level: f64| -> f64 {
+        let mut before = 0.0;
+        for (y, share) in rows.enumerate() {
+            if share > level {
+                return y as f64 - (share - level) / (share - before);
+            }
+            before = share;
+        }
+        panic!("no edge at {level}")
+    };
+    let from_above = |level: f64| crossing(&mut rows.iter().copied(), level);
+    let from_below = crossing(&mut rows.iter().rev().copied(), 0.5);
+    let height_px = rows.len() as f64 - 1.0 - from_below - from_above(0.5);
+    let wanted_px = f64::from(HEIGHT_M) * FOCAL_PX / DISTANCE_M;
+    Edges { width_px: from_above(0.9) - from_above(0.1), grown_px: height_px - wanted_px }
+}
+
+/// With the default number of Gaussians, edges at 8 m are about as sharp as those of triangles, which take up to 1.6 px
+/// between pixels: the table in BENCHMARKS.md.
+#[test]
+fn an_edge_of_a_mesh_at_eight_metres_is_sharp() {
+    let dir = tempfile::tempdir().unwrap();
+    let own = edges(dir.path(), &[]);
+    assert!((0.8..2.0).contains(&own.width_px), "{own:?}");
+    assert!(own.grown_px.abs() < 4.0, "{own:?}");
+    let few = edges(dir.path(), &["--gaussians", "20000"]);
+    assert!(few.width_px > 1.5 * own.width_px, "{few:?}, {own:?}");
+}
