@@ -407,7 +407,9 @@ mod tests {
     fn too_many_cameras_are_refused_first() {
         let camera = r#"{"name":"front","width":100,"height":80,"fx":100,"fy":100,"cx":50,"cy":40,
             "overlay":"none","camera_to_rig":{"xyz":[0,0,0],"q":[1,0,0,0]}}"#;
-        let rig = |count| format!(r#"{{"name":"test","cameras":[{}]}}"#, [camera].repeat(count).join(","));
+        let rig = |count| {
+            format!(r#"{{"name":"test","cameras":[{}]}}"#, [camera].repeat(count).join(","))
+        };
         let refused = |count| serde_json::from_str::<Rig>(&rig(count)).unwrap_err().to_string();
         assert!(refused(16).contains("overlay"), "{}", refused(16));
         assert!(refused(100_000).contains("100000 cameras"), "{}", refused(100_000));

@@ -125,7 +125,7 @@ async fn a_recorded_episode_is_rendered_again_with_its_actors() {
     }
 }
 
-fn replay(path: &std::path::Path, catalog: &Catalog) -> wildcity_session::ReplayReport {
+pub(crate) fn replay(path: &std::path::Path, catalog: &Catalog) -> wildcity_session::ReplayReport {
     let recording = RecordedEpisode::read(path).unwrap();
     let cache = Cache::new(catalog.clone());
     let cpu = crate::images::cpu();

@@ -15,7 +15,7 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, RecordFormat};
 use wildcity_session::{
-    CameraSensor, DType, Encoding, Engine, LateFrames, Observation, Outputs, RigChoice,
+    CameraSensor, DType, Encoding, Engine, LateFrames, Observation, Outcome, Outputs, RigChoice,
     ScenarioError, ScenarioOptions, ScenarioSource, Sensors, Session, SessionError, SessionOptions,
     Start, StepOptions, TensorKind,
 };
@@ -24,6 +24,7 @@ use wildcity_sim::{Command, Dynamics, EgoModel};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::StoredActor;
 
+use crate::actor_records::replay;
 use crate::driving::{Bench, bench, bench_with};
 use crate::streaming::{PROFILE, demo, eyes, unlimited, views};
 
