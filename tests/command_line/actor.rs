@@ -66,7 +66,9 @@ fn edges(dir: &Path, options: &[&str]) -> Edges {
     run(wildcity().args(["actor", "import"]).arg(&file).args(options));
     let picture = dir.join("plate.png");
     let distance = DISTANCE_M.to_string();
-    run(wildcity().args(["actor", "show", "plate", "--distance", &distance, "--picture"]).arg(&picture));
+    run(wildcity()
+        .args(["actor", "show", "plate", "--distance", &distance, "--picture"])
+        .arg(&picture));
     let image = image::open(&picture).unwrap().into_rgb8();
 
     // From the background to the plate, down its middle.

@@ -89,7 +89,9 @@ impl Driven {
         let index = self.index(name);
         let there = self.steps.iter().map(|step| (step.0, step.2[index]));
         let present = there.filter(|(_, actor)| actor.present);
-        present.map(|(ego_m, actor)| (ego_m, course.nearest(actor.world_from_actor.position_m))).collect()
+        present
+            .map(|(ego_m, actor)| (ego_m, course.nearest(actor.world_from_actor.position_m)))
+            .collect()
     }
 
     /// Asserts that cars from ahead keep to their own lane, 3.5 m to the left of the drive, and that at least one

@@ -118,7 +118,8 @@ fn a_texture_may_show_a_part_of_its_image() {
         assert!((red - green).abs() > 0.9, "{info}: {red}, {green}");
         green > red
     };
-    let transform = |fields: &str| format!(r#","extensions":{{"KHR_texture_transform":{{{fields}}}}}"#);
+    let transform =
+        |fields: &str| format!(r#","extensions":{{"KHR_texture_transform":{{{fields}}}}}"#);
     assert!(!green(""));
     assert!(!green(&transform(r#""texCoord":0"#)));
     assert!(green(&transform(r#""offset":[0.5,0]"#)));

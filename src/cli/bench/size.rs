@@ -21,7 +21,8 @@ impl std::str::FromStr for Size {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let sides = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+        let sides =
+            text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
         sides
             .map(Self)
             .ok_or_else(|| format!("{text:?} is not a size; expected WxH, for example 96x60"))

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use wildcity_render::compare::psnr::psnr_db_u8;
-use wildcity_scene::geometry::Pose;
 use wildcity_scene::ProfileOverrides;
+use wildcity_scene::geometry::Pose;
 use wildcity_session::{
     Encoding, Engine, Observation, Outputs, RigChoice, ScenarioOptions, ScenarioSource, Session,
     SessionOptions, Start,
@@ -159,7 +159,9 @@ impl Actors {
         let twin = if as_actors { street::BARE } else { street::BAKED };
         Ok(SessionOptions {
             rig: Some(RigChoice::Full(rig)),
-            profile: ProfileOverrides::new([("tau_px".to_owned(), json!(tau_px))].into_iter().collect()),
+            profile: ProfileOverrides::new(
+                [("tau_px".to_owned(), json!(tau_px))].into_iter().collect(),
+            ),
             scenario: as_actors.then_some(scenario),
             ..SessionOptions::twin(twin, Outputs::colour(Encoding::Raw))
         })
@@ -167,8 +169,10 @@ impl Actors {
 
     fn print(&self, row: &Row, out: &mut impl Write) -> io::Result<()> {
         let Row { tau_px, actors, baked, psnr_db } = row;
-        let [actors_ms, baked_ms] = [actors, baked].map(|times| median(times.steps_ms.iter().copied()));
-        let ratios = actors.steps_ms.iter().zip(&baked.steps_ms).map(|(actors, baked)| actors / baked);
+        let [actors_ms, baked_ms] =
+            [actors, baked].map(|times| median(times.steps_ms.iter().copied()));
+        let ratios =
+            actors.steps_ms.iter().zip(&baked.steps_ms).map(|(actors, baked)| actors / baked);
         let ratio = median(ratios);
         let [actors_cpu_ms, baked_cpu_ms] = [actors, baked]
             .map(|times| times.processor.as_secs_f64() * 1e3 / times.steps_ms.len() as f64);

@@ -125,10 +125,7 @@ fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
         let free_m = if from_ahead { 0.0 } else { FREE_M.copysign(from_middle_m) };
         let station_m = 0.5 * length_m + from_middle_m + free_m;
         let beside = match from_ahead {
-            true => Pose {
-                position_m: LANE_M * DVec3::Y,
-                rotation: DQuat::from_rotation_z(PI),
-            },
+            true => Pose { position_m: LANE_M * DVec3::Y, rotation: DQuat::from_rotation_z(PI) },
             false => Pose::IDENTITY,
         };
         drive.at_station(station_m) * beside
@@ -144,7 +141,8 @@ fn refined(mut gaussians: Gaussians, count: usize) -> Gaussians {
     while gaussians.len() < count {
         // Only whole ones are halved in this round.
         let mut order: Vec<usize> = (0..gaussians.len()).collect();
-        let longest = |index: usize| gaussians.ln_scales[index].into_iter().fold(f32::MIN, f32::max);
+        let longest =
+            |index: usize| gaussians.ln_scales[index].into_iter().fold(f32::MIN, f32::max);
         order.sort_by(|&a, &b| longest(b).total_cmp(&longest(a)));
         order.truncate(count - gaussians.len());
         for index in order {

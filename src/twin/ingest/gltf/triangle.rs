@@ -233,7 +233,8 @@ mod tests {
                     let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
                     let off = axes.transpose() * (at_m - DVec3::from_array(parts.means_m[i]));
                     let [long, short, _] = parts.ln_scales[i].map(|ln| f64::from(ln).exp());
-                    1.0 - OPACITY * (-0.5 * ((off.x / long).powi(2) + (off.y / short).powi(2))).exp()
+                    1.0 - OPACITY
+                        * (-0.5 * ((off.x / long).powi(2) + (off.y / short).powi(2))).exp()
                 };
                 (0..parts.len()).map(one).product()
             };
