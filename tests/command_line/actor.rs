@@ -50,7 +50,7 @@ fn plate() -> Vec<u8> {
 struct Edges {
     /// From 10 to 90 % of the upper edge, in pixels.
     width_px: f64,
-    /// How much higher it is than the triangles are, in pixels.
+    /// How much higher the plate is than its triangles are, in pixels.
     grown_px: f64,
 }
 
@@ -102,7 +102,8 @@ fn an_edge_of_a_mesh_at_eight_metres_is_sharp() {
     let dir = tempfile::tempdir().unwrap();
     let own = edges(dir.path(), &[]);
     assert!((0.8..2.0).contains(&own.width_px), "{own:?}");
-    assert!(own.grown_px.abs() < 4.0, "{own:?}");
-    let few = edges(dir.path(), &["--gaussians", "20000"]);
-    assert!(few.width_px > 1.5 * own.width_px, "{few:?}, {own:?}");
+    assert!((0.0..4.0).contains(&own.grown_px), "both edges together: {own:?}");
+    // Half as many would not do.
+    let few = edges(dir.path(), &["--gaussians", "100000"]);
+    assert!(few.width_px > 2.0, "{few:?}, {own:?}");
 }

@@ -42,7 +42,7 @@ fn cars_cost_something_as_actors_and_within_the_twin() {
         assert!(number("ratio") > 0.1 && number("ratio") < 10.0, "{row}");
         assert!(row["actors_stages_ms"]["project"].as_f64().unwrap() > 0.0, "{row}");
         // The same cars are there: only their contact shadows differ.
-        assert!(number("psnr_db") > 30.0 && number("psnr_db") < 90.0, "{row}");
+        assert!(number("psnr_db") > 25.0 && number("psnr_db") < 90.0, "{row}");
     }
     assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0, "nothing is left");
 

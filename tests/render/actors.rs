@@ -21,6 +21,11 @@ fn an_actor_is_drawn_as_if_the_twin_contained_it() {
 }
 
 #[test]
+fn an_actor_is_drawn_through_every_lens_as_if_the_twin_contained_it() {
+    placed::check_merged_lenses(&cpu());
+}
+
+#[test]
 fn a_moving_actor_is_drawn_as_by_a_moving_camera() {
     placed::check_motion(&cpu());
     placed::check_motion(&Reference);

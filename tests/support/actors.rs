@@ -12,6 +12,7 @@ use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::{Chunk, Gaussians, RenderProfile, Scene, sh};
 
 use crate::images::{Image, agree, max_difference, psnr, render, render_one};
+use crate::lenses::{lenses, rolling_view};
 use crate::scene_files::Random;
 use crate::streets::street;
 
@@ -95,12 +96,37 @@ pub(crate) fn street_with_actors() -> (Scene, Scene) {
     (Scene { placed: in_scene, ..scene }, Scene::from_gaussians(&twin))
 }
 
-/// Asserts that actors are drawn as if the twin contained them, by every kind of camera.
+/// Every lens, with a global shutter and with one that rolls.
+fn lens_views() -> Vec<(String, View)> {
+    let pose = views()[0].1.world_from_camera;
+    let directions = [
+        ShutterDirection::TopToBottom,
+        ShutterDirection::RightToLeft,
+        ShutterDirection::BottomToTop,
+        ShutterDirection::LeftToRight,
+    ];
+    let both = |((name, camera), direction): ((&'static str, Camera), ShutterDirection)| {
+        let rolling = rolling_view(camera, pose, direction);
+        [(name.to_owned(), View::new(camera, pose)), (format!("{name}, {direction:?}"), rolling)]
+    };
+    lenses().into_iter().zip(directions.into_iter().cycle()).flat_map(both).collect()
+}
+
+/// Asserts that actors are drawn as if the twin contained them, by some kinds of cameras.
 pub(crate) fn check_merged(backend: &dyn Backend) {
+    check_merged_views(backend, views());
+}
+
+/// The same through every lens and with every shutter.
+pub(crate) fn check_merged_lenses(backend: &dyn Backend) {
+    check_merged_views(backend, lens_views());
+}
+
+fn check_merged_views(backend: &dyn Backend, views: Vec<(impl std::fmt::Display, View)>) {
     let (placed, merged) = street_with_actors();
     let twin = Scene { placed: Vec::new(), ..placed.clone() };
     let profile = RenderProfile::default();
-    for (name, view) in views() {
+    for (name, view) in views {
         let image = render_one(backend, &placed, &profile, view);
         let truth = render_one(backend, &merged, &profile, view);
         let db = psnr(&image.rgba, &truth.rgba);

@@ -1,5 +1,6 @@
 //! Whole episodes of traffic: vectors of motion, order, and determinism.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
@@ -322,11 +323,44 @@ fn the_order_of_actors_does_not_matter() {
     compare_orders(300, 100_000);
 }
 
-/// 100,000 steps of 50 actors, in two orders.
+/// A hash of the bits of all states after every step, actor by actor, of a world in which each actor lies at
+/// `place(index)` of the list.
+fn episode_hash(steps: u32, place: &dyn Fn(usize) -> usize) -> u64 {
+    let actors = fifty();
+    let mut listed = actors.clone();
+    for (index, actor) in actors.iter().enumerate() {
+        listed[place(index)] = actor.clone();
+    }
+    let road = winding();
+    let mut world = World::new(traffic(listed));
+    let mut hash = DefaultHasher::new();
+    for step in 0..steps {
+        let ego =
+            EgoMotion { from: ego_at(&road, step), to: ego_at(&road, step + 1), smooth: true };
+        world.step(10_000, &ego, &mut |_| {});
+        for index in 0..actors.len() {
+            bits(&world.states()[place(index)]).hash(&mut hash);
+        }
+    }
+    hash.finish()
+}
+
+/// 100,000 steps of 50 actors: alone, and then in three orders at the same time, each on a thread of its own.
 #[test]
-#[ignore = "half a minute; run it after a change of traffic: cargo test --release -p wildcity-sim --test sim -- --ignored hundred_thousand"]
+#[ignore = "a minute; run it after a change of traffic: cargo test --release -p wildcity-sim --test sim -- --ignored hundred_thousand"]
 fn a_hundred_thousand_steps_are_deterministic() {
-    compare_orders(100_000, 10_000);
+    const STEPS: u32 = 100_000;
+    let alone = episode_hash(STEPS, &|index| index);
+    std::thread::scope(|scope| {
+        let orders = [(1, 0), (17, 5), (49, 49)];
+        let running = orders.map(|(factor, first)| {
+            scope.spawn(move || episode_hash(STEPS, &|index| (factor * index + first) % 50))
+        });
+        for (run, order) in running.into_iter().zip(orders) {
+            assert_eq!(run.join().unwrap(), alone, "order {order:?}");
+        }
+    });
+    assert_ne!(episode_hash(1, &|index| index), alone);
 }
 
 #[test]

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use serde_json::json;
 
 use wildcity_render::compare::psnr::psnr_db_u8;
+use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::{ProfileOverrides, Rig};
 use wildcity_session::{
     Encoding, Engine, Observation, Outputs, RigChoice, ScenarioOptions, ScenarioSource, Session,
     SessionOptions, Start,
@@ -137,7 +137,7 @@ impl Actors {
                 };
                 seen.push(times.step(session, pose).await?);
             }
-            row.psnr_db = psnr_db_u8(seen[0].buffer.bytes().iter().zip(seen[1].buffer.bytes()));
+            row.psnr_db = psnr_db_u8(pixels(&seen[0]).iter().zip(pixels(&seen[1])));
             bar.inc(1);
         }
         bar.finish_and_clear();
@@ -211,6 +211,13 @@ impl Actors {
         }
         Ok(())
     }
+}
+
+/// The tensors of an observation, which are behind its header: almost all of them pixels.
+fn pixels(seen: &Observation) -> &[u8] {
+    let bytes = seen.buffer.bytes();
+    let length = seen.tensors.last().map_or(0, |tensor| tensor.bytes.end);
+    &bytes[bytes.len().saturating_sub(length)..]
 }
 
 impl Times {

@@ -69,7 +69,7 @@ pub(super) fn commit(
     // The twins.
     let mut all = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
     source.visit_full_detail(version, &|_| true, &mut |section| all.append(&section))?;
-    let mut write = |name: &str, all: &Gaussians| {
+    let write = |name: &str, all: &Gaussians| {
         let bar = progress::count("writing");
         let new = NewVersion {
             profile: manifest.profile,
