@@ -10,7 +10,7 @@ use super::frames::{self, Frame, Recipe};
 use super::{blessing, check_file, check_json, read};
 
 /// The golden frames: name, `seq` of the request vector that the frame answers, recipe.
-fn golden() -> [(&'static str, u64, Recipe); 10] {
+fn golden() -> [(&'static str, u64, Recipe); 11] {
     let raw = Recipe::RAW;
     [
         ("raw", 3, raw),

@@ -481,5 +481,5 @@ fn scattered_gaussians_are_refused() {
     let few = scene.select(0..4096);
     commit.put(&few, None, &mut |_, _| {}).unwrap();
     drop(commit);
-    assert!(catalog.list().unwrap().twins.is_empty());
+    assert!(catalog.twins().unwrap().twins.is_empty());
 }
