@@ -155,7 +155,10 @@ test("the page fits a phone", { skip }, async () => {
 test("a token that may not push is told so", async () => {
   const token = "a-token-for-the-viewer";
   const path = await tokenFile(folder, [{ name: "viewer", role: "drive", token }]);
-  const guarded = await serve(folder, "--tokens", path, "--uploads", join(folder, "uploads-of-the-other"));
+  // Only one server at a time may use a folder of uploads.
+  const other = join(folder, "other");
+  await mkdir(join(other, "twins"), { recursive: true });
+  const guarded = await serve(other, "--tokens", path);
   try {
     const { page, close } = await open(browser, guarded);
     await page.fill("input[type=password]", token);
