@@ -55,14 +55,20 @@ fn answers_with_unknown_fields_are_the_same_answers() {
     }
 }
 
-/// Adds a field to every object, except `profile` and `period_us`: they are maps, so any field is known.
+/// Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they are maps, so any field
+/// is known.
 pub(crate) fn add_unknown_fields(value: &mut Value) {
     match value {
         Value::Object(fields) => {
-            fields
-                .iter_mut()
-                .filter(|(name, _)| !["profile", "period_us"].contains(&name.as_str()))
-                .for_each(|(_, inner)| add_unknown_fields(inner));
+            for (name, inner) in &mut *fields {
+                match (name.as_str(), inner) {
+                    ("profile" | "period_us", _) => {}
+                    ("cameras", Value::Object(by_name)) => {
+                        by_name.values_mut().for_each(add_unknown_fields);
+                    }
+                    (_, inner) => add_unknown_fields(inner),
+                }
+            }
             fields.insert("since_next_year".to_owned(), json!([1, "x"]));
         }
         Value::Array(items) => items.iter_mut().for_each(add_unknown_fields),

@@ -1,5 +1,6 @@
 //! What the sensors of the ego do to what they see: effects that a session asks for. All are drawn with the
-//! episode's seed.
+//! episode's seed. Answers repeat these types, and a newer server may add fields to them; in requests, unknown fields are
+//! refused by `decode`.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// Effects of the sensors, and the delay of the planner. What is absent is off.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct Sensors {
     /// Effects on images, by camera name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
@@ -28,7 +29,7 @@ pub struct Sensors {
 /// Effects on the images of a camera.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct CameraSensor {
     /// Probability that a frame is lost. The camera's last frame that arrived stands in for it.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -54,7 +55,6 @@ pub struct CameraSensor {
 /// Frames that arrive late.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
 pub struct LateFrames {
     /// Probability that a frame is late.
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
@@ -67,7 +67,6 @@ pub struct LateFrames {
 /// Times in which a camera repeats a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
 pub struct FrozenFrames {
     /// Probability that the camera is frozen in an interval of `for_us`.
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 1.0)))]
@@ -80,7 +79,6 @@ pub struct FrozenFrames {
 /// Shot and read noise of an image sensor.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
 pub struct ImageNoise {
     /// Electrons of a pixel at full white: fewer are noisier.
     #[cfg_attr(feature = "schema", schemars(range(min = 10.0, max = 1e6)))]
@@ -93,7 +91,6 @@ pub struct ImageNoise {
 /// Drift of a camera's exposure.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
 pub struct ExposureDrift {
     /// Standard deviation, in stops: one stop doubles the light.
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 4.0)))]
@@ -106,7 +103,6 @@ pub struct ExposureDrift {
 /// Dirt on a lens: round, dark spots with soft edges.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
 pub struct LensDirt {
     /// Number of spots.
     #[cfg_attr(feature = "schema", schemars(range(min = 1, max = 256)))]
@@ -122,7 +118,6 @@ pub struct LensDirt {
 /// An inertial measurement unit at the rig's origin, along the rig's axes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields)]
 pub struct Imu {
     /// Errors of each axis of the specific force, in m/s². If absent, none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -139,7 +134,7 @@ pub struct Imu {
 /// Errors of an axis of an inertial measurement unit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct AxisNoise {
     /// Standard deviation of one sample.
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 100.0)))]
@@ -152,7 +147,7 @@ pub struct AxisNoise {
 /// Errors of the speed that the wheels measure.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(default, deny_unknown_fields)]
+#[serde(default)]
 pub struct WheelSpeed {
     /// Standard deviation of one sample, in m/s.
     #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 100.0)))]

@@ -182,7 +182,7 @@ fn normal(gaussians: &Gaussians, i: usize) -> Option<DVec3> {
 fn hypothesis(places: &[Place], at: usize, random: &mut Random) -> Option<GroundPlane> {
     let mut pick = || places[random.below(places.len())];
     let [a, b, c] = [pick(), pick(), pick()];
-    if at % 2 == 0 {
+    if at.is_multiple_of(2) {
         return a.normal.map(|up| GroundPlane { point: a.at, up });
     }
     let up = (b.at - a.at).cross(c.at - a.at).try_normalize()?;
