@@ -26,7 +26,6 @@ use crate::base::find_base;
 use crate::blocking::run_blocking;
 use crate::commit::{NewContent, commit};
 use crate::error::PushError;
-use crate::limits;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
 use crate::queue::{PushQueue, Turn};

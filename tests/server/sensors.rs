@@ -36,7 +36,7 @@ fn command(model: &str, step: u64) -> Value {
             let q = [(0.1 * phase.sin()).cos(), 0.0, 0.0, (0.1 * phase.sin()).sin()];
             json!({ "type": "step", "pose": { "xyz": [5.0 + 0.3 * phase, phase.sin(), 0.1], "q": q } })
         }
-        _ if step % 3 == 0 => {
+        _ if step.is_multiple_of(3) => {
             let ahead = |k: u64| json!({ "time_us": 250_000 * k, "pose": pose(2.0 * k as f64) });
             json!({ "type": "step", "trajectory": [ahead(1), ahead(2), ahead(3)] })
         }

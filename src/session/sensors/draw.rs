@@ -57,6 +57,8 @@ pub(crate) fn wandering(seed: u64, name: &str, period_us: i64, time_us: i64) -> 
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::FRAC_1_SQRT_2;
+
     use super::*;
 
     /// Abramowitz and Stegun, "Handbook of Mathematical Functions", table 26.1: P(z) of the normal distribution.
@@ -96,7 +98,7 @@ mod tests {
         let covariance =
             |by_us: i64| of_seed(0).zip(of_seed(by_us)).map(|(a, b)| a * b).sum::<f64>() / 2e4;
         // cos(π/4) after half a period, nothing after one.
-        assert!((covariance(500) - 0.7071).abs() < 0.04, "{}", covariance(500));
+        assert!((covariance(500) - FRAC_1_SQRT_2).abs() < 0.04, "{}", covariance(500));
         assert!(covariance(1000).abs() < 0.04, "{}", covariance(1000));
     }
 }
