@@ -9,8 +9,9 @@ use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
 use wildcity_generate::StreetSettings;
 use wildcity_scene::geometry::Pose;
+use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Rig, Trajectory};
-use wildcity_twin::store::Catalog;
+use wildcity_twin::store::{Catalog, CommitKind, StorageOptions, VersionChange};
 
 use crate::scene_files::{inria_columns, ply};
 use crate::wildcity;
@@ -216,6 +217,16 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     assert_eq!(second.manifest.chunks, third.manifest.chunks);
     assert_eq!(third.manifest.rig.unwrap().name, "capture");
     assert!(done(at, &["twin", "fsck", "street"]).ends_with("all sound\n"));
+
+    // 5. A version that was pushed does not say how the rest of it was imported.
+    let options = StorageOptions { record: second.manifest.record, levels: true };
+    let push = catalog.begin("street", CommitKind::Push, options).unwrap();
+    push.change(3, VersionChange::none(Provenance::of("block7.ply".into()))).unwrap();
+    let route = |twin| ["route", "from-colmap", "model", "--twin", twin, "--out", "four"];
+    let told = refused(at, &route("street"));
+    assert!(told.contains("version 4 was pushed") && told.contains("give --axes"), "{told}");
+    assert!(!at.join("four").exists());
+    done(at, &route("street@3"));
 }
 
 #[test]

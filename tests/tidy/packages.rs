@@ -35,6 +35,7 @@ const FILES: &[&str] = &[
     "src/session/scenario/load.rs",
     "src/episode",
     "src/suite",
+    "src/server/audit.rs",
     "src/server/start.rs",
     "src/server/spool",
     "src/server/tls.rs",

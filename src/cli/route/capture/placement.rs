@@ -5,6 +5,7 @@ use anyhow::Context;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::manifest::Provenance;
 use wildcity_twin::ingest::Axes;
+use wildcity_twin::store::{Catalog, Version};
 
 use crate::cli::directories::{TwinVersion, Twins};
 
@@ -37,8 +38,10 @@ impl Placement {
                 imported(axes, self.scale.unwrap_or(1.0))
             }
             Some(twin) => {
-                let version = self.twins.catalog()?.version(&twin.name, twin.number)?;
+                let catalog = self.twins.catalog()?;
+                let version = catalog.version(&twin.name, twin.number)?;
                 let about = || format!("twin {} version {}", twin.name, version.number);
+                check_lineage(&catalog, &version).with_context(about)?;
                 of_provenance(&version.manifest.provenance).with_context(about)
             }
         }
@@ -51,6 +54,30 @@ fn imported(axes: &str, scale: f64) -> anyhow::Result<Alignment> {
     alignment.with_context(|| {
         format!("--axes {axes:?} mirrors the scene, and a mirrored camera has no pose: give axes without a mirror")
     })
+}
+
+/// Checks that a version says how all of it was made. A push of some cells replaces the provenance of its base by that of
+/// the pushed files, which are in the twin's axes already.
+fn check_lineage(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
+    let twin = &version.manifest.twin;
+    let log = catalog.versions(twin)?;
+    let parent_of = |number| log.iter().find(|entry| entry.number == number)?.parent;
+    let mut options = version.manifest.provenance.options.clone();
+    let mut number = version.number;
+    while let Some(parent) = parent_of(number).filter(|parent| *parent < number) {
+        let before = catalog.version(twin, Some(parent)).with_context(|| {
+            format!("it was made from version {parent}, which cannot be read: give --axes and --scale in place of --twin")
+        })?;
+        let before = before.manifest.provenance.options;
+        anyhow::ensure!(
+            options.starts_with(&before),
+            "version {number} was pushed, and does not say how version {parent} was imported and aligned: name an older \
+             version, or give --axes and --scale in place of --twin"
+        );
+        options = before;
+        number = parent;
+    }
+    Ok(())
 }
 
 /// Follows the options with which a version was made: axes and scale of the import, then each alignment.
