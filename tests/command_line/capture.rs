@@ -40,8 +40,7 @@ fn capture_from_street() -> (Pose, f64) {
 
 /// A street in the axes of its capture.
 fn captured_street() -> (Gaussians, Trajectory) {
-    let settings = StreetSettings { density: 0.2, ..StreetSettings::default() };
-    let street = wildcity_generate::street(&settings).unwrap();
+    let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let mut gaussians = street.gaussians;
     let (pose, scale) = capture_from_street();
     gaussians.transform(&pose);
