@@ -80,6 +80,7 @@ def yaw_of(q: list[float]) -> float:
 
 @pytest.fixture(scope="module")
 def driven(reader: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> list[Driven]:
+    checkout()
     folder = tmp_path_factory.mktemp("anchors")
     for name, actors in ACTORS.items():
         scenario = {

@@ -150,7 +150,7 @@ def test_an_export_is_indexed(driven: tuple[list[dict[str, Any]], bytes]) -> Non
     everything = read(data)
     assert summary.statistics.message_count == len(everything)
     # A part of the time and one topic are found by the index.
-    begin = summary.statistics.message_start_time + 1_000_000_000
+    begin = summary.statistics.message_start_time + 500_000_000
     part = read(data, topics=["/tf"], starting_at=begin, ending_before=begin + 500_000_000)
     wanted = [one[2] for one in everything if one[0] == "/tf" and begin <= one[2] < begin + 500_000_000]
     assert [one[2] for one in part] == wanted and len(wanted) == 5

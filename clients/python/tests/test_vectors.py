@@ -224,15 +224,21 @@ def test_observations_of_several_sessions() -> None:
 
 
 def with_unknown_fields(value: Any) -> Any:
-    """Adds a field to every object, except `profile` and `period_us`: they are maps, so any field is known."""
+    """Adds a field to every object, except `profile`, `period_us` and the `cameras` of sensors: they are maps, so any field
+    is known."""
     if isinstance(value, list):
         return [with_unknown_fields(item) for item in value]
     if not isinstance(value, dict):
         return value
-    fields = {
-        name: inner if name in ("profile", "period_us") else with_unknown_fields(inner)
-        for name, inner in value.items()
-    }
+
+    def inner(name: str, value: Any) -> Any:
+        if name in ("profile", "period_us"):
+            return value
+        if name == "cameras" and isinstance(value, dict):
+            return {camera: with_unknown_fields(effects) for camera, effects in value.items()}
+        return with_unknown_fields(value)
+
+    fields = {name: inner(name, value) for name, value in value.items()}
     return {**fields, "since_next_year": [1, "x"]}
 
 
