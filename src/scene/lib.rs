@@ -26,6 +26,7 @@ pub mod rig;
 pub mod route;
 pub mod sh;
 pub mod sky;
+pub mod srgb;
 pub mod trajectory;
 pub mod validate;
 

@@ -14,7 +14,7 @@ use crate::rig::{RigCamera, RigError, is_name};
 use crate::trajectory::Keyframe;
 use crate::{Rig, Trajectory};
 
-use super::Alignment;
+use super::{Alignment, median};
 
 /// A training image and its camera.
 #[derive(Clone, Debug, PartialEq)]
@@ -304,11 +304,6 @@ fn camera_name(folder: &str, index: usize) -> String {
         "" => format!("camera{index}"),
         name => name.chars().take(64).collect(),
     }
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 #[cfg(test)]

@@ -11,6 +11,8 @@ use glam::{DMat3, DQuat, DVec3};
 use crate::Gaussians;
 use crate::random::Random;
 
+use super::median;
+
 /// A plane, and which of its sides is up.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GroundPlane {
@@ -146,11 +148,6 @@ fn extent(gaussians: &Gaussians, opaque: &[usize]) -> SceneExtent {
     let middle = DVec3::new(axis(0), axis(1), axis(2));
     let distance = |&i: &usize| DVec3::from_array(gaussians.means_m[i]).distance(middle);
     SceneExtent { middle, radius: median(opaque.iter().map(distance).collect()) }
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 /// The first Gaussian of each occupied cube, in the order of the Gaussians.

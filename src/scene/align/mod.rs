@@ -195,6 +195,12 @@ impl FromStr for Alignment {
     }
 }
 
+/// The median; the upper one of an even number. There is at least one value.
+fn median(mut values: Vec<f64>) -> f64 {
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

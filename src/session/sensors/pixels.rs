@@ -1,7 +1,7 @@
 //! Noise, exposure and dirt: from the pixels of a rendered image to those of a sensor.
 //!
-//! All of it happens in linear light. A stored value v (0 to 255) is decoded by the curve of sRGB (IEC 61966-2-1):
-//! L = v/255/12.92 up to v/255 = 0.04045, else ((v/255 + 0.055)/1.055)^2.4. Then, for each pixel and channel,
+//! All of it happens in linear light L, which [`wildcity_scene::srgb`] decodes from stored values. For each pixel and
+//! channel,
 //!
 //! ```text
 //! L' = L 2^e (1 - a)            e stops of exposure; dirt takes the fraction a of the light
@@ -18,6 +18,7 @@
 use std::sync::LazyLock;
 
 use wildcity_scene::random::{Random, mix};
+use wildcity_scene::srgb::{linear_from_stored, stored_from_linear};
 
 use super::draw::{normal_table, wandering};
 use super::settings::{CameraSensor, ImageNoise, LensDirt};
@@ -47,23 +48,13 @@ const ENCODE_STEPS: usize = 1 << 16;
 
 /// Linear light of each stored value.
 static LINEAR: LazyLock<[f32; 256]> =
-    LazyLock::new(|| std::array::from_fn(|value| linear(value as f64 / 255.0) as f32));
+    LazyLock::new(|| std::array::from_fn(|value| linear_from_stored(value as f64 / 255.0) as f32));
 
 /// The stored value of linear light in steps.
 static STORED: LazyLock<Box<[u8]>> = LazyLock::new(|| {
-    let stored = |step: usize| stored(step as f64 / (ENCODE_STEPS - 1) as f64);
+    let stored = |step: usize| stored_from_linear(step as f64 / (ENCODE_STEPS - 1) as f64);
     (0..ENCODE_STEPS).map(|step| (255.0 * stored(step)).round() as u8).collect()
 });
-
-/// Linear light of a stored value, both from 0 to 1.
-fn linear(stored: f64) -> f64 {
-    if stored <= 0.04045 { stored / 12.92 } else { ((stored + 0.055) / 1.055).powf(2.4) }
-}
-
-/// The stored value of linear light, both from 0 to 1.
-fn stored(linear: f64) -> f64 {
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
-}
 
 impl PixelEffects {
     /// The effects on the picture that a camera takes at a time, in microseconds; `None` if it has none.
@@ -189,7 +180,7 @@ mod tests {
 
     /// Mean and variance of the linear light of stored values.
     fn moments(rgb8: &[u8]) -> [f64; 2] {
-        let light = || rgb8.iter().map(|&value| linear(f64::from(value) / 255.0));
+        let light = || rgb8.iter().map(|&value| linear_from_stored(f64::from(value) / 255.0));
         let count = rgb8.len() as f64;
         let mean = light().sum::<f64>() / count;
         [mean, light().map(|one| (one - mean).powi(2)).sum::<f64>() / count]
@@ -200,10 +191,10 @@ mod tests {
     fn mean_and_variance_of_the_noise_are_those_of_the_formula_at_every_level() {
         for (full_well, read) in [(2000.0, 0.0), (2000.0, 30.0), (400.0, 5.0)] {
             for value in [60_u8, 90, 128, 160, 200] {
-                let light = linear(f64::from(value) / 255.0);
+                let light = linear_from_stored(f64::from(value) / 255.0);
                 let [mean, variance] = moments(&applied(&noise(full_well, read), 5, 0, value));
-                let slope = (linear((f64::from(value) + 1.0) / 255.0)
-                    - linear((f64::from(value) - 1.0) / 255.0))
+                let slope = (linear_from_stored((f64::from(value) + 1.0) / 255.0)
+                    - linear_from_stored((f64::from(value) - 1.0) / 255.0))
                     / 2.0;
                 let model = light / full_well + (read / full_well).powi(2);
                 let expected = model + slope * slope / 12.0;
@@ -221,7 +212,7 @@ mod tests {
         let rgb8 = applied(&noise(400.0, 5.0), 1, 0, 128);
         let [mean, variance] = moments(&rgb8);
         let light: Vec<f64> =
-            rgb8.iter().map(|&value| linear(f64::from(value) / 255.0) - mean).collect();
+            rgb8.iter().map(|&value| linear_from_stored(f64::from(value) / 255.0) - mean).collect();
         let width = 3 * WIDTH as usize;
         for apart in [1, 2, 3, width, width + 3] {
             let pairs = light.iter().zip(&light[apart..]).map(|(a, b)| a * b);
@@ -249,7 +240,8 @@ mod tests {
         let sensor = CameraSensor { exposure: Some(drift), ..CameraSensor::default() };
         for taken_us in [0, 400_000, 7_300_000] {
             let stops = wandering(9, "front/exposure", 1_000_000, taken_us);
-            let expected = 255.0 * stored((linear(90.0 / 255.0) * stops.exp2()).min(1.0));
+            let expected = 255.0
+                * stored_from_linear((linear_from_stored(90.0 / 255.0) * stops.exp2()).min(1.0));
             let [value, ..] = applied(&sensor, 9, taken_us, 90)[..] else { panic!("no pixels") };
             assert!((f64::from(value) - expected).abs() < 0.6, "{value} {expected}");
         }

@@ -9,6 +9,7 @@ use image::RgbaImage;
 
 use crate::ingest::activation;
 use wildcity_scene::Gaussians;
+use wildcity_scene::srgb::{linear_from_stored, stored_from_linear};
 
 /// Ratio of a Gaussian's standard deviation to that of its triangle. Whatever the triangle's shape, a covered surface
 /// lets 4 % of the light through, 9 % at most. With 1.7 these are 8 and 19 %, and what lies behind shows; with 2.1 they
@@ -153,23 +154,15 @@ impl Triangle {
             };
             let texel = image.get_pixel(place(uv.x, image.width()), place(uv.y, image.height()));
             let [red, green, blue, alpha] = texel.0.map(|value| f64::from(value) / 255.0);
-            let [red, green, blue] = [red, green, blue].map(linear_from_display);
+            let [red, green, blue] = [red, green, blue].map(linear_from_stored);
             color *= DVec4::new(red, green, blue, alpha);
         }
         let opacity = if color.w >= self.material.cutoff { color.w.clamp(0.0, 1.0) } else { 0.0 };
-        ([color.x, color.y, color.z].map(display_from_linear), opacity)
+        (
+            [color.x, color.y, color.z].map(|light| stored_from_linear(light.clamp(0.0, 1.0))),
+            opacity,
+        )
     }
-}
-
-/// The sRGB transfer function of IEC 61966-2-1, decoded.
-fn linear_from_display(value: f64) -> f64 {
-    if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
-}
-
-/// The sRGB transfer function of IEC 61966-2-1, encoded.
-fn display_from_linear(value: f64) -> f64 {
-    let value = value.clamp(0.0, 1.0);
-    if value <= 0.003_130_8 { 12.92 * value } else { 1.055 * value.powf(1.0 / 2.4) - 0.055 }
 }
 
 #[cfg(test)]
