@@ -29,6 +29,8 @@ pub(crate) enum Plant {
     RecordBeforeObjects,
     /// A lease is not removed when its version is closed.
     LeakedLease,
+    /// In an object store, a log record is put in place of another one.
+    RecordReplaced,
 }
 
 /// What happens at a write.
@@ -36,9 +38,10 @@ pub(crate) enum Plant {
 pub(crate) enum Fault {
     /// The process is killed. What it wrote stays.
     Kill,
-    /// The power fails.
+    /// The power fails. Of an object store: the process is killed, and the request that it was making is on its way.
     PowerCut,
-    /// The disk is full, for this write alone.
+    /// The disk is full, for this write alone. Of an object store: it refuses one to three writes, or loses the
+    /// answers.
     Full,
 }
 
@@ -127,9 +130,9 @@ impl SimDisk {
         Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
     }
 
-    /// Lets a fault happen at the write after so many others.
-    pub(crate) fn fail_after(&self, writes: u64, fault: Fault) {
-        self.lock_state().fault = Some((writes, fault));
+    /// Lets a fault happen at the write after so many others, or none.
+    pub(crate) fn set_fault(&self, fault: Option<(u64, Fault)>) {
+        self.lock_state().fault = fault;
     }
 
     /// Whether the process was stopped.

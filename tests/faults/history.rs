@@ -3,6 +3,7 @@
 use std::fmt;
 
 use crate::disk::{Fault, Plant};
+use crate::medium::Kind;
 use crate::random::Random;
 use crate::world::World;
 
@@ -72,8 +73,8 @@ impl History {
     ///
     /// # Errors
     /// Says which promise is broken.
-    pub(crate) fn run(&self, plant: Option<Plant>) -> Result<(), String> {
-        let mut world = World::new(plant)?;
+    pub(crate) fn run(&self, kind: Kind, plant: Option<Plant>) -> Result<(), String> {
+        let mut world = World::new(kind, plant)?;
         for (index, step) in self.operations.iter().enumerate() {
             world.run(step).map_err(|reason| format!("operation {index}: {reason}"))?;
         }
@@ -81,8 +82,8 @@ impl History {
     }
 
     /// The shortest failing history that leaving out operations and faults of this one leads to.
-    pub(crate) fn shrunk(self, plant: Option<Plant>) -> Failure {
-        let fails = |history: &Self| history.run(plant).err();
+    pub(crate) fn shrunk(self, kind: Kind, plant: Option<Plant>) -> Failure {
+        let fails = |history: &Self| history.run(kind, plant).err();
         let mut reason = fails(&self).expect("it fails");
         let mut history = self;
         loop {

@@ -1,12 +1,16 @@
 //! Simulated faults: thousands of histories of commits, leases, garbage collections and rollbacks on a disk that
-//! fails, with a clock that jumps, in a process that is killed between any two writes. After each history nothing that
-//! was acknowledged is lost, no version is mixed, nothing in use is removed, and the store goes on working.
+//! fails, and in an object store that refuses requests and loses answers, with a clock that jumps, in a process that is
+//! killed between any two writes. After each history nothing that was acknowledged is lost, no version is mixed,
+//! nothing in use is removed, and the store goes on working.
 //!
 //! A history follows from its seed alone. A failure prints the seed and the shortest history that still fails; `SEED=n
-//! cargo test -p wildcity-twin --test faults one_history` runs one, and `HISTORIES=n ... many_histories` any number.
+//! cargo test -p wildcity-twin --test faults one_history` runs one on both, and `HISTORIES=n ... many_histories` any
+//! number.
 
+mod bucket;
 mod disk;
 mod history;
+mod medium;
 mod random;
 mod world;
 
@@ -15,9 +19,13 @@ use std::time::Instant;
 
 use disk::Plant;
 use history::{Failure, History};
+use medium::Kind;
 
-/// Histories in the gate.
+/// Histories in the gate, on a disk.
 const HISTORIES: u64 = 10_000;
+
+/// Histories in the gate, in an object store, whose requests run on a thread of their own.
+const BUCKET_HISTORIES: u64 = 3_000;
 
 /// Histories within which a planted fault must be found.
 const HISTORIES_TO_FIND: u64 = 1_000;
@@ -28,7 +36,7 @@ fn number(variable: &str) -> Option<u64> {
 }
 
 /// Runs histories of the seeds from 1 on, on all cores. Returns the first failure, shrunk.
-fn run(histories: u64, plant: Option<Plant>) -> Option<Failure> {
+fn run(kind: Kind, histories: u64, plant: Option<Plant>) -> Option<Failure> {
     let next = AtomicU64::new(1);
     let failed = AtomicU64::new(u64::MAX);
     let threads = std::thread::available_parallelism().map_or(1, |threads| threads.get());
@@ -40,7 +48,7 @@ fn run(histories: u64, plant: Option<Plant>) -> Option<Failure> {
                     if seed > histories || failed.load(Ordering::Relaxed) < seed {
                         return;
                     }
-                    if History::of(seed).run(plant).is_err() {
+                    if History::of(seed).run(kind, plant).is_err() {
                         failed.fetch_min(seed, Ordering::Relaxed);
                     }
                 }
@@ -48,34 +56,53 @@ fn run(histories: u64, plant: Option<Plant>) -> Option<Failure> {
         }
     });
     let seed = failed.into_inner();
-    (seed < u64::MAX).then(|| History::of(seed).shrunk(plant))
+    (seed < u64::MAX).then(|| History::of(seed).shrunk(kind, plant))
+}
+
+fn run_or_panic(kind: Kind, histories: u64) {
+    let begun = Instant::now();
+    if let Some(failure) = run(kind, histories, None) {
+        panic!("{failure}");
+    }
+    let took = begun.elapsed();
+    eprintln!("{histories} histories on a {kind:?} in {took:.1?}");
 }
 
 #[test]
 fn many_histories() {
-    let histories = number("HISTORIES").unwrap_or(HISTORIES);
-    let begun = Instant::now();
-    if let Some(failure) = run(histories, None) {
-        panic!("{failure}");
-    }
-    let took = begun.elapsed();
-    eprintln!("{histories} histories in {took:.1?}");
+    run_or_panic(Kind::Disk, number("HISTORIES").unwrap_or(HISTORIES));
+}
+
+#[test]
+fn many_histories_in_an_object_store() {
+    run_or_panic(Kind::Bucket, number("HISTORIES").unwrap_or(BUCKET_HISTORIES));
 }
 
 #[test]
 fn one_history() {
     let seed = number("SEED").unwrap_or(1);
-    if History::of(seed).run(None).is_err() {
-        panic!("{}", History::of(seed).shrunk(None));
+    for kind in [Kind::Disk, Kind::Bucket] {
+        if History::of(seed).run(kind, None).is_err() {
+            panic!("{kind:?}, {}", History::of(seed).shrunk(kind, None));
+        }
     }
 }
 
-/// The simulation finds what it is made for: each planted fault of the store's use of the disk.
+/// The simulation finds what it is made for: each planted fault of the store's use of the disk, or of an object store.
 #[test]
 fn planted_faults_are_found() {
-    for plant in [Plant::MissingSync, Plant::RecordBeforeObjects, Plant::LeakedLease] {
-        let failure = run(HISTORIES_TO_FIND, Some(plant));
-        let failure = failure.unwrap_or_else(|| panic!("{plant:?} is not found"));
-        assert!(failure.history.operations.len() <= 6, "{plant:?} is not shrunk: {failure}");
+    let plants = [
+        (Kind::Disk, Plant::MissingSync),
+        (Kind::Disk, Plant::RecordBeforeObjects),
+        (Kind::Disk, Plant::LeakedLease),
+        (Kind::Bucket, Plant::RecordBeforeObjects),
+        (Kind::Bucket, Plant::LeakedLease),
+        (Kind::Bucket, Plant::RecordReplaced),
+    ];
+    for (kind, plant) in plants {
+        let failure = run(kind, HISTORIES_TO_FIND, Some(plant));
+        let failure = failure.unwrap_or_else(|| panic!("{plant:?} on a {kind:?} is not found"));
+        let operations = failure.history.operations.len();
+        assert!(operations <= 6, "{plant:?} on a {kind:?} is not shrunk: {failure}");
     }
 }

@@ -1,7 +1,6 @@
 //! One simulated machine with one twin, and what its users were promised.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,8 +11,9 @@ use wildcity_twin::store::{
     VersionChange,
 };
 
-use crate::disk::{Fault, Plant, ROOT, SimClock, SimDisk};
+use crate::disk::{Fault, Plant, SimClock};
 use crate::history::{Operation, Step};
+use crate::medium::{Kind, Medium};
 use crate::random::Random;
 
 const TWIN: &str = "city";
@@ -41,7 +41,7 @@ struct Prepared {
 /// The machine, and the promises.
 pub(crate) struct World {
     clock: Arc<SimClock>,
-    disk: SimDisk,
+    medium: Box<dyn Medium>,
     catalog: Catalog,
     sessions: Vec<Session>,
     prepared: Option<Prepared>,
@@ -94,13 +94,13 @@ fn merged(below: &Cells, above: &Cells) -> Cells {
 }
 
 impl World {
-    pub(crate) fn new(plant: Option<Plant>) -> Result<Self, String> {
+    pub(crate) fn new(kind: Kind, plant: Option<Plant>) -> Result<Self, String> {
         let clock = Arc::new(SimClock::new());
-        let disk = SimDisk::new(clock.clone(), plant);
-        let catalog = open(&disk, &clock)?;
+        let medium = kind.new(&clock, plant);
+        let catalog = open(&*medium, &clock)?;
         Ok(Self {
             clock,
-            disk,
+            medium,
             catalog,
             sessions: Vec::new(),
             prepared: None,
@@ -113,19 +113,20 @@ impl World {
     /// Carries out one step. If it stops the process, starts the next one and checks the promises.
     pub(crate) fn run(&mut self, step: &Step) -> Promise {
         if let Some((writes, fault)) = step.fault {
-            self.disk.fail_after(writes, fault);
+            self.medium.fail_after(writes, fault);
         }
         let is_full = matches!(step.fault, Some((_, Fault::Full)));
         let done = self.carry_out(step.operation);
-        if self.disk.is_stopped() {
+        self.medium.settle(&self.catalog);
+        if self.medium.is_stopped() {
             return self.restart(step.seed);
         }
-        // A disk that is full refuses; without a fault everything works.
+        // What is full refuses; without a fault everything works.
         match done {
             Err(error) if !is_full => return Err(format!("{error} without a fault")),
             _ => {}
         }
-        self.disk.fail_after(u64::MAX, Fault::Full);
+        self.medium.stop_failing();
         self.check_sessions()
     }
 
@@ -148,12 +149,9 @@ impl World {
             Operation::Collect { keep, grace_s } => {
                 self.collect(Retention { versions: keep, grace: Duration::from_secs(grace_s) })
             }
-            Operation::Jump { seconds } => {
-                self.clock.jump(seconds * 1_000_000);
-                Ok(())
-            }
+            Operation::Jump { seconds } => self.jump(seconds),
             Operation::Stop(fault) => {
-                self.disk.stop(fault);
+                self.medium.stop(fault);
                 Ok(())
             }
         }
@@ -174,26 +172,43 @@ impl World {
         Ok(latest.map(|latest| latest.saturating_sub(back).max(1)))
     }
 
-    /// Carries out a commit whose version is to have a content, and notes what its client is told.
+    /// Carries out a commit upon the version `before`, and notes what its client is told. `content` is what the commit
+    /// makes of a version's content. The record of a stopped process may arrive meanwhile and be the version below.
     fn commit(
         &mut self,
         before: u64,
-        cells: Cells,
+        base: &Cells,
+        content: impl Fn(&Cells) -> Cells,
         commit: impl FnOnce(&mut Self) -> Result<Version, StoreError>,
     ) -> Result<(), StoreError> {
         // Until the answer is there, the version may be or not be.
-        self.possible.entry(before + 1).or_default().push(cells.clone());
+        let below = self.possible.get(&(before + 1)).cloned().unwrap_or_default();
+        let mut may = vec![(before + 1, content(base))];
+        may.extend(below.iter().map(|cells| (before + 2, content(cells))));
+        for (number, cells) in &may {
+            self.possible.entry(*number).or_default().push(cells.clone());
+        }
         let result = commit(self);
-        let is_unknown =
-            self.disk.is_stopped() || matches!(result, Err(StoreError::NotSynced { .. }));
+        let is_unknown = self.medium.is_stopped()
+            || matches!(
+                result,
+                Err(StoreError::NotSynced { .. } | StoreError::OutcomeUnknown { .. })
+            );
         if !is_unknown {
-            self.possible.entry(before + 1).or_default().pop();
+            for (number, _) in may {
+                self.possible.entry(number).or_default().pop();
+            }
         }
         let version = match result {
-            Err(StoreError::NotSynced { .. }) => return Ok(()),
+            Err(StoreError::NotSynced { .. } | StoreError::OutcomeUnknown { .. }) => return Ok(()),
+            Err(StoreError::Overlap { latest, .. }) if latest > before => return Ok(()),
             result => result?,
         };
-        if !self.disk.is_stopped() {
+        if !self.medium.is_stopped() {
+            let cells = match version.number {
+                number if number <= before + 1 => content(base),
+                number => content(&content_of(&self.catalog.version(TWIN, Some(number - 1))?)),
+            };
             self.acknowledged.insert(version.number, cells);
         }
         Ok(())
@@ -204,7 +219,10 @@ impl World {
         let before = latest.as_ref().map_or(0, |version| version.number);
         let base = latest.as_ref().map(content_of).unwrap_or_default();
         let gaussians = gaussians_of(cells);
-        self.commit(before, merged(&base, cells), |world| {
+        // A new twin replaces what another process has made of that name meanwhile.
+        let content =
+            |below: &Cells| if before == 0 { cells.clone() } else { merged(below, cells) };
+        self.commit(before, &base, content, |world| {
             if before == 0 {
                 let new = NewVersion {
                     storage: storage(),
@@ -229,8 +247,12 @@ impl World {
     fn publish_prepared(&mut self) -> Result<(), StoreError> {
         let Some(Prepared { commit, base, cells }) = self.prepared.take() else { return Ok(()) };
         let Some(latest) = self.latest()? else { return Ok(()) };
-        let content = merged(&content_of(&latest), &cells);
-        let published = self.commit(latest.number, content, |_| commit.change(base, cells_alone()));
+        let published = self.commit(
+            latest.number,
+            &content_of(&latest),
+            |below| merged(below, &cells),
+            |_| commit.change(base, cells_alone()),
+        );
         match published {
             // Others changed the same cells, or the base is gone.
             Err(StoreError::Overlap { .. }) if latest.number != base => Ok(()),
@@ -249,7 +271,8 @@ impl World {
             }
             Err(error) => return Err(error),
         };
-        self.commit(latest, content, |world| world.catalog.rollback(TWIN, number))
+        let restored = |_: &Cells| content.clone();
+        self.commit(latest, &content, restored, |world| world.catalog.rollback(TWIN, number))
     }
 
     fn open_session(&mut self, back: u64) -> Result<(), StoreError> {
@@ -266,7 +289,29 @@ impl World {
         Ok(())
     }
 
+    /// Lets the clock jump. Where a lease alone protects a session's version, a process that lives renews it in time.
+    fn jump(&mut self, seconds: i64) -> Result<(), StoreError> {
+        self.medium.end_late();
+        self.clock.jump(seconds * 1_000_000);
+        if self.medium.has_locks() {
+            return Ok(());
+        }
+        let mut renewed = Ok(());
+        self.sessions.retain_mut(|session| {
+            let result = session.lease.renew();
+            let is_renewed = result.is_ok();
+            renewed = std::mem::replace(&mut renewed, Ok(())).and(result);
+            is_renewed
+        });
+        renewed
+    }
+
     fn collect(&mut self, keep: Retention) -> Result<(), StoreError> {
+        self.medium.end_late();
+        // Without locks, garbage must not be collected while a commit is in preparation.
+        if !self.medium.has_locks() {
+            self.prepared = None;
+        }
         let latest = match self.catalog.latest(TWIN) {
             Ok(latest) => latest,
             Err(StoreError::NoTwin { .. }) => return Ok(()),
@@ -284,13 +329,9 @@ impl World {
         // The sessions and the commits of the stopped process write nothing any more.
         self.sessions.clear();
         self.prepared = None;
-        self.disk = self.disk.restarted(&mut Random::new(seed));
-        self.catalog = open(&self.disk, &self.clock)?;
-        let staged = self.disk.files_below(".staging");
-        let left: Vec<_> = staged
-            .iter()
-            .filter(|path| path.parent() != Some(&Path::new(ROOT).join(".staging")))
-            .collect();
+        self.medium = self.medium.restarted(&mut Random::new(seed));
+        self.catalog = open(&*self.medium, &self.clock)?;
+        let left = self.medium.commits_left();
         if !left.is_empty() {
             return Err(format!("the start left {left:?}"));
         }
@@ -358,14 +399,14 @@ impl World {
         self.prepared = None;
         let failed = |what: &'static str| move |e: StoreError| format!("{what}: {e}");
         self.push(&cells_of(7, 9)).map_err(failed("a push"))?;
-        let left = self.disk.files_below("city/leases");
+        let left = self.medium.leases_left();
         // The leases of processes that were stopped expire; those of sessions that ended are gone.
         let keep = Retention { versions: 1, grace: Duration::from_secs(60) };
         for _ in 0..2 {
             self.clock.jump(30 * 86_400_000_000);
             self.collect(keep).map_err(failed("a garbage collection"))?;
         }
-        let expired = self.disk.files_below("city/leases");
+        let expired = self.medium.leases_left();
         if !expired.is_empty() {
             return Err(format!("of the leases {left:?}, {expired:?} do not end"));
         }
@@ -377,9 +418,8 @@ impl World {
     }
 }
 
-fn open(disk: &SimDisk, clock: &Arc<SimClock>) -> Result<Catalog, String> {
-    let opened = Catalog::on(Path::new(ROOT), Arc::new(disk.clone()), clock.clone());
-    opened.map_err(|error| format!("the store does not open: {error}"))
+fn open(medium: &dyn Medium, clock: &Arc<SimClock>) -> Result<Catalog, String> {
+    medium.open(clock).map_err(|error| format!("the store does not open: {error}"))
 }
 
 fn cells_alone() -> VersionChange {

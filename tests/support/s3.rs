@@ -133,7 +133,14 @@ impl S3 {
 /// Short time-outs and few retries, for tests.
 pub(crate) fn quick() -> RetryPolicy {
     let (timeout, backoff) = (Duration::from_secs(3), Duration::from_millis(10));
-    RetryPolicy { timeout, tries: 3, backoff, section_timeout: timeout, section_tries: 3 }
+    RetryPolicy {
+        timeout,
+        tries: 3,
+        backoff,
+        section_timeout: timeout,
+        section_tries: 3,
+        ..RetryPolicy::default()
+    }
 }
 
 /// All files below a folder that are objects of the server, without the server's own metadata files.

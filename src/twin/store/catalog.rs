@@ -125,6 +125,11 @@ impl Catalog {
         Remote::over(store, url, prefix, open_cache(cache)?, retry).map(Self::remote)
     }
 
+    /// The same twins with another clock.
+    pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
+        Self { clock, ..self }
+    }
+
     /// Opens a directory of twins on a disk, with a clock: the parts of a machine, or of a simulated one. As
     /// [`Catalog::open`], removes the remains of killed commits.
     ///

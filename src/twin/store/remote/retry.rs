@@ -13,19 +13,21 @@ use tokio::runtime::{Builder, Runtime};
 
 use crate::limits;
 
-/// Time-outs and retries of requests to an object store.
+/// Time-outs, retries and threads of requests to an object store.
 #[derive(Clone, Copy, Debug)]
 pub struct RetryPolicy {
     /// How long one request may take, including its bytes.
     pub timeout: Duration,
     /// The most attempts of one request.
     pub tries: u32,
-    /// Pause before the second attempt; it doubles before each further one.
+    /// Pause before the second attempt; it doubles before each further one. With none, no other request comes in between.
     pub backoff: Duration,
     /// How long one request for a section may take. Steps wait for these.
     pub section_timeout: Duration,
     /// The most attempts of a request for a section.
     pub section_tries: u32,
+    /// Number of threads that wait for answers. On one thread, requests are sent in the order in which they begin.
+    pub threads: usize,
 }
 
 impl RetryPolicy {
@@ -43,6 +45,7 @@ impl Default for RetryPolicy {
             backoff: limits::REMOTE_BACKOFF,
             section_timeout: limits::SECTION_TIMEOUT,
             section_tries: limits::SECTION_TRIES,
+            threads: limits::REMOTE_THREADS,
         }
     }
 }
@@ -87,7 +90,7 @@ pub(super) struct PendingRequest<T>(Receiver<io::Result<T>>);
 impl RequestRunner {
     pub(super) fn new(retry: RetryPolicy) -> io::Result<Self> {
         let runtime = Builder::new_multi_thread()
-            .worker_threads(limits::REMOTE_THREADS)
+            .worker_threads(retry.threads)
             .thread_name("store")
             .enable_all()
             .build()?;
@@ -145,7 +148,9 @@ impl RequestRunner {
                     return Err(error);
                 }
                 add(&counts, RequestCounter::Retry);
-                tokio::time::sleep(backoff).await;
+                if !backoff.is_zero() {
+                    tokio::time::sleep(backoff).await;
+                }
                 tries += 1;
                 backoff = backoff.saturating_mul(2);
             }
