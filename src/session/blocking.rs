@@ -1,13 +1,18 @@
 //! Work that waits for a disk or takes long, off the threads that answer requests.
 
+use tracing::Span;
+
 use crate::error::SessionError;
 
-/// Runs `work` on one of tokio's blocking threads and waits for its result.
+/// Runs `work` on one of tokio's blocking threads, within the current span, and waits for its result.
 ///
 /// # Errors
 /// [`SessionError::Crashed`] if `work` panicked.
 pub(crate) async fn run_blocking<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, SessionError> {
-    tokio::task::spawn_blocking(work).await.map_err(|_| SessionError::Crashed)
+    let span = Span::current();
+    tokio::task::spawn_blocking(move || span.in_scope(work))
+        .await
+        .map_err(|_| SessionError::Crashed)
 }

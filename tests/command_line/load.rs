@@ -1,8 +1,5 @@
 //! Many clients, slow clients, and the memory of the server after them.
 
-use std::io::{BufRead, BufReader};
-use std::net::SocketAddr;
-use std::process::{Child, Command, Stdio};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -11,77 +8,8 @@ use tokio::net::TcpSocket;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use wildcity_server::Limits;
 
-use crate::support::{self, Agent, Reply, TestServer, pose, refused};
-
-/// `wildcity serve` as a separate process, so that its memory can be measured.
-struct Served {
-    child: Child,
-    address: SocketAddr,
-    _twins: tempfile::TempDir,
-    _episodes: tempfile::TempDir,
-}
-
-impl Served {
-    fn start() -> Self {
-        let (twins, episodes) = (support::twins(), tempfile::tempdir().unwrap());
-        let mut child = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--log", "warn", "--threads", "1"])
-            .arg("--twins")
-            .arg(twins.path())
-            .arg("--episodes")
-            .arg(episodes.path())
-            .arg("--uploads")
-            .arg(twins.path().join(".uploads"))
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-        let address = line
-            .strip_prefix("listening on ws://")
-            .and_then(|rest| rest.trim_end().strip_suffix("/v1/session"));
-        let address = address.expect(&line).parse().unwrap();
-        Self { child, address, _twins: twins, _episodes: episodes }
-    }
-
-    /// Resident memory, in bytes.
-    fn rss(&self) -> u64 {
-        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
-    }
-
-    async fn whole_session(&self, steps: u32) {
-        let mut agent = Agent::connect(self.address).await;
-        agent.hello().await;
-        agent.open(json!({})).await;
-        for step in 0..steps {
-            agent.step(f64::from(step)).await;
-        }
-        agent.ask(json!({ "type": "close" })).await;
-    }
-
-    fn signal_and_wait(mut self) -> Option<i32> {
-        let kill = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
-        assert!(kill.success());
-        let deadline = Instant::now() + Duration::from_secs(20);
-        loop {
-            match self.child.try_wait().unwrap() {
-                Some(status) => return status.code(),
-                None if Instant::now() > deadline => return None,
-                None => std::thread::sleep(Duration::from_millis(10)),
-            }
-        }
-    }
-}
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        // It may have ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
+use crate::served::Served;
+use crate::support::{Agent, Reply, TestServer, pose, refused};
 
 #[tokio::test]
 async fn a_thousand_sessions_leave_nothing_behind() {

@@ -62,7 +62,9 @@ mod report;
 mod rig;
 mod route;
 mod scenario;
+mod served;
 mod sky;
+mod traces;
 mod twin;
 
 use std::process::Command;

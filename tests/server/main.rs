@@ -42,4 +42,5 @@ mod shutdown;
 mod socket;
 mod starts;
 mod tls;
+mod traces;
 mod viewer;

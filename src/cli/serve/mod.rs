@@ -2,14 +2,14 @@
 
 mod config_file;
 mod limit_options;
+mod log;
 
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use tracing_subscriber::EnvFilter;
 
 use wildcity_alpasim::sensorsim;
 use wildcity_server::{Origins, TlsFiles, Tokens};
@@ -106,6 +106,11 @@ pub(super) struct Serve {
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
 
+    /// OpenTelemetry collector that gets traces of requests and pushes, by OTLP over HTTP, for example
+    /// http://127.0.0.1:4318. Needs a program built with the feature otlp.
+    #[arg(long, value_name = "URL")]
+    otlp_endpoint: Option<String>,
+
     #[command(flatten)]
     limits: LimitOptions,
 }
@@ -164,12 +169,8 @@ impl Serve {
     }
 
     fn serve(self) -> anyhow::Result<()> {
-        let filter = EnvFilter::try_new(self.log_filter())?;
-        tracing_subscriber::fmt()
-            .with_env_filter(filter)
-            .with_writer(io::stderr)
-            .with_ansi(io::stderr().is_terminal())
-            .init();
+        // Dropped last, so that the end of the server is traced, too.
+        let _traces = log::start(&self.log_filter(), self.otlp_endpoint.as_deref())?;
         let directories = self.directories.all()?;
         let twins = &directories.twins;
         anyhow::ensure!(

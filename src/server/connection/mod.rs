@@ -7,6 +7,7 @@
 //! | `mod.rs` | the loop, the numbers, and what is for one session |
 //! | `opening.rs` | open, branch, resume |
 //! | `steps.rs` | step, step_many |
+//! | `trace.rs` | their spans |
 //!
 //! Requests are numbered. A request is carried out if its number follows the last one answered, or
 //! repeats one that was refused since the last one that was carried out. A request that was carried out is
@@ -14,12 +15,14 @@
 
 mod opening;
 mod steps;
+mod trace;
 
 use std::future::pending;
 use std::sync::Arc;
 
 use futures_util::future::select_all;
 use tokio::time::{Instant, sleep_until, timeout};
+use tracing::Instrument as _;
 
 use wildcity_session::{Observation, Outcome, Session, SessionError};
 
@@ -77,12 +80,7 @@ impl Connection {
     async fn run(&mut self, inbox: &mut Inbox) -> Disconnect {
         loop {
             let handled = match self.next_request(inbox).await {
-                Ok(text) => match inbox.during(self.handle(&text)).await {
-                    Ok(answer) => self.send(&mut inbox.socket, &answer).await,
-                    Err(Refusal { seq, fault }) => {
-                        self.refuse(&mut inbox.socket, seq, &fault).await
-                    }
-                },
+                Ok(text) => self.answer(inbox, &text).instrument(trace::request()).await,
                 Err(Disconnect::Fault(fault)) if !fault.is_fatal() => {
                     self.refuse(&mut inbox.socket, None, &fault).await
                 }
@@ -90,6 +88,18 @@ impl Connection {
             };
             if let Err(reason) = handled {
                 return reason;
+            }
+        }
+    }
+
+    /// Carries out one request and sends its answer.
+    async fn answer(&mut self, inbox: &mut Inbox, text: &str) -> Result<(), Disconnect> {
+        let handled = inbox.during(self.handle(text)).await;
+        let send = tracing::debug_span!("send");
+        match handled {
+            Ok(answer) => self.send(&mut inbox.socket, &answer).instrument(send).await,
+            Err(Refusal { seq, fault }) => {
+                self.refuse(&mut inbox.socket, seq, &fault).instrument(send).await
             }
         }
     }
@@ -154,6 +164,7 @@ impl Connection {
             slot.answered_seq = seq;
         }
         let command = command.map_err(refusal)?;
+        trace::note(seq, session.as_deref(), &command);
         // `resume` itself sets the numbers: they continue those of the session.
         let is_resume = matches!(command, Command::Resume { .. });
         let answer = self.carry_out(seq, session.as_deref(), command).await.map_err(refusal)?;

@@ -7,6 +7,7 @@ use axum::extract::{Path, State as Shared};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse as _, Response};
 use axum::{Extension, Json};
+use tracing::Instrument as _;
 
 use wildcity_push::{Begun, Push, PushError, PushRequest, SourceFile, State};
 
@@ -100,7 +101,8 @@ async fn run(
     let twin = request.twin.clone();
     let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
     let published =
-        wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints);
+        wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints)
+            .instrument(tracing::debug_span!("push", twin, id = owned.id));
     let result = tokio::select! {
         result = published => result,
         () = push.cancelled() => Err(PushError::Cancelled),

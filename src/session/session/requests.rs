@@ -5,6 +5,7 @@
 
 use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
+use tracing::{Instrument as _, debug_span};
 
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
@@ -92,7 +93,7 @@ impl Session {
             record.steps = steps as u64;
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
-        self.record(record, traffic.as_ref()).await?;
+        self.record(record, traffic.as_ref()).instrument(debug_span!("record")).await?;
 
         next.add_trusts(rendered.trusts());
         next.set_repairing(rendered.repairing);
@@ -136,7 +137,7 @@ impl Session {
         let moment = Moment { episode: &episode, traffic: self.state.traffic.as_ref() };
         let rendered = self.render(&self.version, moment, captures, None).await?;
         let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
-        self.record(record, None).await?;
+        self.record(record, None).instrument(debug_span!("record")).await?;
         Ok(rendered.observation)
     }
 
@@ -274,7 +275,8 @@ impl Session {
             });
             // Load before the job is queued, so that no render thread waits for a disk.
             let resident = version.resident.clone();
-            let mut pinned = pin(resident, profile, deadline, viewpoints).await?;
+            let pinned = pin(resident, profile, deadline, viewpoints);
+            let mut pinned = pinned.instrument(debug_span!("load")).await?;
             pinned.place(placed.unwrap_or_default());
             builder.add_load(pinned.waited_for, pinned.waited);
             let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
@@ -290,6 +292,7 @@ impl Session {
             builder.add_queue_time(queued);
             if builder.has_candidates() {
                 let repaired = run_blocking(move || builder.repair().map(|()| builder));
+                let repaired = repaired.instrument(debug_span!("repair"));
                 let in_time = timeout_at(deadline, repaired).await;
                 builder = in_time.map_err(|_| SessionError::DeadlineExceeded)???;
             }

@@ -20,6 +20,7 @@ use std::time::Duration;
 use parking_lot::{Condvar, Mutex};
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout_at};
+use tracing::{Span, debug_span};
 
 use wildcity_render::Backend;
 
@@ -112,15 +113,20 @@ impl RenderQueue {
         work: impl FnOnce(&mut Scratch, &dyn Backend) -> T + Send + 'static,
     ) -> Result<(T, Duration), SessionError> {
         let (reply, answer) = oneshot::channel();
+        let within = Span::current();
+        let waiting = debug_span!("queue");
         let requested = Instant::now();
         let backend = self.shared.backend.clone();
         let job = move |scratch: &mut Scratch| {
             let queued = requested.elapsed();
+            drop(waiting);
             if reply.is_closed() {
                 return;
             }
             // A panic in one session's frame must not end the thread that renders for all sessions.
-            let result = catch_unwind(AssertUnwindSafe(|| work(scratch, &*backend)));
+            let work = || work(scratch, &*backend);
+            let rendering = debug_span!(parent: &within, "render", pixels = cost.pixels);
+            let result = catch_unwind(AssertUnwindSafe(|| rendering.in_scope(work)));
             // Sending fails if the deadline has passed and the receiver is gone.
             let _ = reply.send(result.map(|result| (result, queued)));
         };

@@ -7,6 +7,8 @@ use std::mem;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
+use tracing::{Span, debug_span};
+
 use wildcity_render::{Backend, Frame, FrameStats, Target, View};
 
 use super::buffer::ObservationBuffer;
@@ -177,8 +179,11 @@ impl ObservationBuilder {
         // repaired is copied instead.
         let slots: Vec<OnceLock<FinishedView>> =
             frame.views.iter().map(|_| OnceLock::new()).collect();
+        let rendering = Span::current();
         let finished = |index: usize, target: &Target<'_>| {
             let camera = capture.cameras[index];
+            let name = &*layout.cameras()[camera].name;
+            let _encoding = debug_span!(parent: &rendering, "encode", camera = name).entered();
             let pixels = target.rgb8.as_deref().unwrap_or_default();
             let trust = coverage.as_ref().map(|coverage| {
                 let opacity = target.opacity.as_deref().unwrap_or_default();

@@ -1,0 +1,39 @@
+//! The spans of requests, which `wildcity serve --otlp-endpoint` sends to a collector.
+
+use tracing::Span;
+use tracing::field::Empty;
+
+use crate::convert::Command;
+
+/// The span of a request, from the moment when its text is there until its answer is sent.
+pub(super) fn request() -> Span {
+    tracing::debug_span!("request", r#type = Empty, seq = Empty, session = Empty)
+}
+
+/// Notes in the current span what the request is.
+pub(super) fn note(seq: u64, session: Option<&str>, command: &Command) {
+    let span = Span::current();
+    span.record("type", name(command)).record("seq", seq);
+    if let Some(session) = session {
+        span.record("session", session);
+    }
+}
+
+/// The `type` of a request, as in `protocol/README.md`.
+fn name(command: &Command) -> &'static str {
+    match command {
+        Command::Hello { .. } => "hello",
+        Command::Open { .. } => "open",
+        Command::Step { .. } => "step",
+        Command::StepMany { .. } => "step_many",
+        Command::Observe { .. } => "observe",
+        Command::Prefetch { .. } => "prefetch",
+        Command::Reset { .. } => "reset",
+        Command::SwitchVersion { .. } => "switch_version",
+        Command::Snapshot { .. } => "snapshot",
+        Command::Restore { .. } => "restore",
+        Command::Branch { .. } => "branch",
+        Command::Close => "close",
+        Command::Resume { .. } => "resume",
+    }
+}

@@ -1,0 +1,86 @@
+//! A server as a process of its own, with a twin of its own.
+
+use std::io::{BufRead, BufReader};
+use std::net::SocketAddr;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use crate::support::{self, Agent};
+
+/// `wildcity serve` as a separate process.
+pub(crate) struct Served {
+    child: Child,
+    pub(crate) address: SocketAddr,
+    _twins: tempfile::TempDir,
+    _episodes: tempfile::TempDir,
+}
+
+impl Served {
+    pub(crate) fn start() -> Self {
+        Self::with(&[])
+    }
+
+    /// With more arguments.
+    pub(crate) fn with(arguments: &[&str]) -> Self {
+        let (twins, episodes) = (support::twins(), tempfile::tempdir().unwrap());
+        let mut child = Command::new(env!("CARGO_BIN_EXE_wildcity"))
+            .args(["serve", "--listen", "127.0.0.1:0", "--log", "warn", "--threads", "1"])
+            .args(arguments)
+            .arg("--twins")
+            .arg(twins.path())
+            .arg("--episodes")
+            .arg(episodes.path())
+            .arg("--uploads")
+            .arg(twins.path().join(".uploads"))
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let address = line
+            .strip_prefix("listening on ws://")
+            .and_then(|rest| rest.trim_end().strip_suffix("/v1/session"));
+        let address = address.expect(&line).parse().unwrap();
+        Self { child, address, _twins: twins, _episodes: episodes }
+    }
+
+    /// Resident memory, in bytes.
+    pub(crate) fn rss(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
+    }
+
+    pub(crate) async fn whole_session(&self, steps: u32) {
+        let mut agent = Agent::connect(self.address).await;
+        agent.hello().await;
+        agent.open(json!({})).await;
+        for step in 0..steps {
+            agent.step(f64::from(step)).await;
+        }
+        agent.ask(json!({ "type": "close" })).await;
+    }
+
+    pub(crate) fn signal_and_wait(mut self) -> Option<i32> {
+        let kill = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
+        assert!(kill.success());
+        let deadline = Instant::now() + Duration::from_secs(20);
+        loop {
+            match self.child.try_wait().unwrap() {
+                Some(status) => return status.code(),
+                None if Instant::now() > deadline => return None,
+                None => std::thread::sleep(Duration::from_millis(10)),
+            }
+        }
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        // It may have ended already.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
