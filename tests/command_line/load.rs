@@ -1,7 +1,7 @@
 //! Many clients, slow clients, and the memory of the server after them.
 
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use serde_json::json;
 use tokio::net::TcpSocket;
@@ -9,7 +9,7 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use wildcity_server::Limits;
 
 use crate::served::Served;
-use crate::support::{Agent, Reply, TestServer, pose, refused};
+use crate::support::{self, Agent, Reply, TestServer, pose, refused};
 
 #[tokio::test]
 async fn a_thousand_sessions_leave_nothing_behind() {
