@@ -142,7 +142,7 @@ def test_memory_is_given_back(connect: Connect, server: Server) -> None:  # noqa
     files = set(os.listdir("/dev/shm"))
     before = names_of_memory()
     client = connect(server.url, shared_memory=True, copy=False)
-    session = client.open("corridor", session="lost", rig=PAIR)
+    session = client.open("corridor", rig=PAIR)
     seen = session.step(Pose((1.0, 0.0, 0.0)))
     names = names_of_memory() - before
     assert len(names) == 1
@@ -160,7 +160,7 @@ def test_memory_is_given_back(connect: Connect, server: Server) -> None:  # noqa
     program = (
         "import sys, time, wildcity\n"
         "client = wildcity.connect(sys.argv[1], shared_memory=True, copy=False)\n"
-        "seen = client.open('corridor', session='killed').reset(seed=1)\n"
+        "seen = client.open('corridor').reset(seed=1)\n"
         "print('ready', flush=True)\n"
         "time.sleep(60)\n"
     )
