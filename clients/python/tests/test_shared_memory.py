@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import wildcity
+from conftest import vector
 from fake_server import FakeServer
 from test_end_to_end import PAIR, Server, server  # noqa: F401
 from wildcity import Action, ConnectFailed, Observation, Outputs, Pose, SlotInUse
@@ -173,11 +175,13 @@ def test_memory_is_given_back(connect: Connect, server: Server) -> None:  # noqa
 
 
 def test_memory_of_another_machine_is_not_opened(connect: Connect) -> None:
-    # The golden path is one of a process that has no such file, or another one.
-    with FakeServer(["welcome", "shared_memory"]) as elsewhere:
-        with pytest.raises(ConnectFailed, match="same container"):
-            connect(elsewhere.url, shared_memory=True)
-    assert [request["type"] for request in elsewhere.requests[0]] == ["hello", "share_memory"]
+    # The golden path is one of a process that has no such file; that of this program is another file.
+    other = json.dumps({**vector("answers/shared_memory.json"), "path": "/proc/self/exe"})
+    for answer in ("shared_memory", other):
+        with FakeServer(["welcome", answer]) as elsewhere:
+            with pytest.raises(ConnectFailed, match="same container"):
+                connect(elsewhere.url, shared_memory=True)
+        assert [request["type"] for request in elsewhere.requests[0]] == ["hello", "share_memory"]
 
 
 def test_memory_that_was_not_asked_for_is_an_error(connect: Connect) -> None:
