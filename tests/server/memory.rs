@@ -301,6 +301,9 @@ async fn memory_is_given_back() {
     agent.open(json!({ "session": "last" })).await;
     agent.place(step(1.0)).await;
     let target = memory.target.clone();
+    // The observation itself is gone with the next answer. What counts then is the shared memory.
+    let prefetch = json!({ "type": "prefetch", "poses": [pose(1.0)] });
+    assert_eq!(agent.ask(prefetch).await["type"], "ok");
     assert!(engine.reserve_answer_bytes(ANSWERS_BYTES).is_err(), "the memory is counted");
     // The server stops: the client keeps what it has opened, and the server nothing.
     server.running.stop().await;
