@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 
 use super::benched_twin::BenchedTwin;
-use super::processor::processor_time;
+use super::processor::threads_processor_time;
 use super::timed::median;
 use crate::cli::backend_options::bytes_of_gib;
 use crate::cli::progress;
@@ -24,8 +24,8 @@ use wildcity_session::{Encoding, Outputs, RigChoice, Session, Still, Stills};
 /// Measure what it costs to bring a step's raw images to an agent on the same machine.
 ///
 /// The same poses are rendered in four ways, in turn: the renderer alone; a session of this process; a client through the
-/// socket; and a client with shared memory. Server and client are in this process. Prints the median wall time of a step,
-/// its mean processor time, and that in relation to rendering alone.
+/// socket; and a client with shared memory. Server and client are in this process. Prints the medians of the wall time
+/// and of the processor time of a step, and the median of its ratio to rendering alone in the same round.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Delivery {
@@ -115,12 +115,12 @@ impl Delivery {
             for turn in 0..WAYS.len() {
                 // Each way comes first equally often.
                 let way = (turn + round as usize) % WAYS.len();
-                let processor = processor_time()?;
+                let processor = threads_processor_time()?;
                 let begun = Instant::now();
                 ways.step(way, pose).await?;
                 of_round[way] = Cost {
                     wall: begun.elapsed(),
-                    processor: processor_time()?.saturating_sub(processor),
+                    processor: threads_processor_time()?.saturating_sub(processor),
                 };
             }
             costs.push(of_round);
@@ -195,15 +195,14 @@ fn print(out: &mut impl Write, costs: &[[Cost; 4]]) -> io::Result<()> {
         "{:<15} {:>10} {:>14} {:>18}",
         "", "wall ms", "processor ms", "of rendering alone"
     )?;
-    // Sums, because the kernel counts processor time in ticks of 10 ms.
-    let processor_ms = |way: usize| {
-        let all: Duration = costs.iter().map(|round| round[way].processor).sum();
-        1e3 * all.as_secs_f64() / costs.len() as f64
-    };
     for (way, name) in WAYS.iter().enumerate() {
-        let wall_ms = 1e3 * median(costs.iter().map(|round| round[way].wall.as_secs_f64()));
-        let ratio = processor_ms(way) / processor_ms(0);
-        let processor_ms = processor_ms(way);
+        let median_ms = |of: &dyn Fn(&Cost) -> Duration| {
+            1e3 * median(costs.iter().map(|round| of(&round[way]).as_secs_f64()))
+        };
+        let wall_ms = median_ms(&|cost| cost.wall);
+        let processor_ms = median_ms(&|cost| cost.processor);
+        let ratio = |round: &[Cost; 4]| round[way].processor.div_duration_f64(round[0].processor);
+        let ratio = median(costs.iter().map(ratio));
         writeln!(out, "{name:<15} {wall_ms:>10.1} {processor_ms:>14.1} {ratio:>18.3}")?;
     }
     Ok(())
