@@ -52,8 +52,8 @@ impl Memory {
     /// Whether this process, which is server and client, has the memory open.
     fn is_open(target: &str) -> bool {
         let files = std::fs::read_dir("/proc/self/fd").unwrap();
-        let links = files.filter_map(|file| std::fs::read_link(file.unwrap().path()).ok());
-        links.into_iter().any(|link| link == Path::new(target))
+        let mut links = files.filter_map(|file| std::fs::read_link(file.unwrap().path()).ok());
+        links.any(|link| link == Path::new(target))
     }
 
     async fn is_given_back(target: &str) {
