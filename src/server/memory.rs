@@ -5,8 +5,8 @@
 //! does not depend on the size of `/dev/shm` either, which is 64 MB in a container by default, less than three
 //! observations of six raw images.
 //!
-//! The client opens it by its path in `/proc` of this process. The kernel permits that only to programs of the same user
-//! (and to root) that see this process by the same number. A program elsewhere may have another file at that path: the
+//! The client opens it by its path in `/proc` of this process. The kernel permits that only to programs of the same
+//! user (and to root) that see this process by the same number. A program elsewhere may have another file at that path: the
 //! target of the path, a symbolic link, has a random name by which the client recognises the file before it opens
 //! it. Then it sends back a random text from the file, which proves to the server that it can read the observations.
 //!

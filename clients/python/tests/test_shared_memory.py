@@ -45,7 +45,12 @@ def is_given_back(names: set[str]) -> None:
 
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("encoding", ["raw", "png"])
-def test_memory_and_socket_have_the_same_bytes(connect: Connect, server: Server, encoding: Any, copy: bool) -> None:  # noqa: F811
+def test_memory_and_socket_have_the_same_bytes(
+    connect: Connect,
+    server: Server,  # noqa: F811
+    encoding: Any,
+    copy: bool,
+) -> None:
     outputs = Outputs(encoding=encoding, depth=True, opacity=True, normals=True, instances=True)
     client = connect(server.url, shared_memory=True, copy=copy)
     session = client.open("corridor", rig=PAIR, outputs=outputs)

@@ -23,8 +23,8 @@ use wildcity_session::{Encoding, Outputs, RigChoice, Session, Still, Stills};
 
 /// Measure what it costs to bring a step's raw images to an agent on the same machine.
 ///
-/// The same poses are rendered in four ways, in turn: the renderer alone; a session of this process; a client through the
-/// socket; and a client with shared memory. Server and client are in this process. Prints the medians of the wall time
+/// The same poses are rendered in four ways, in turn: the renderer alone; a session of this process; a client through
+/// the socket; and a client with shared memory. Server and client are in this process. Prints the medians of the wall time
 /// and of the processor time of a step, and the median of its ratio to rendering alone in the same round.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
