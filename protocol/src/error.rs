@@ -50,6 +50,8 @@ pub enum Code {
     RepairUnavailable,
     /// The repair model failed, and the session asked for an error then. Nothing changed.
     RepairFailed,
+    /// The server cannot share memory with this client.
+    SharedMemoryUnavailable,
     /// A session of this name already exists.
     SessionExists,
     /// A name is not 1 to 64 characters of `[a-z0-9._-]`, or starts with a dot.

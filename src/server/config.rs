@@ -54,6 +54,8 @@ pub struct Config {
     pub repairs: Arc<Models>,
     /// Changes of the render profile of every twin; a session may change more.
     pub profile: ProfileOverrides,
+    /// Whether clients on this machine may ask for observations in shared memory.
+    pub shared_memory: bool,
     /// Time-outs, counts and bytes.
     pub limits: Limits,
 }
@@ -73,6 +75,7 @@ impl Config {
             backend,
             repairs: Arc::default(),
             profile: ProfileOverrides::default(),
+            shared_memory: true,
             limits: Limits::default(),
         }
     }
@@ -184,6 +187,7 @@ impl std::fmt::Debug for Config {
             backend,
             repairs,
             profile,
+            shared_memory,
             limits,
         } = self;
         f.debug_struct("Config")
@@ -197,6 +201,7 @@ impl std::fmt::Debug for Config {
             .field("backend", &backend.name())
             .field("repairs", &repairs.names().collect::<Vec<_>>())
             .field("profile", profile)
+            .field("shared_memory", shared_memory)
             .field("limits", limits)
             .finish()
     }

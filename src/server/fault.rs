@@ -247,6 +247,14 @@ pub(crate) enum Fault {
         /// The name.
         protocol: &'static str,
     },
+    /// The client cannot have observations in shared memory.
+    #[error("no shared memory: {reason}")]
+    NoSharedMemory {
+        /// The field at fault.
+        field: &'static str,
+        /// Why not, and what to do.
+        reason: String,
+    },
     /// There is no route of this path.
     #[error("there is no {path}; protocol/README.md lists the routes")]
     NoRoute {

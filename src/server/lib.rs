@@ -21,6 +21,7 @@
 //! socket         WebSocket messages, with a time-out on every wait
 //! inbox          what a client sends while its last request is carried out
 //! connection     one agent, in lock step: read a request, answer it
+//! memory         observations in memory that a client on the same machine maps
 //! watchers       clients that look at a session without taking part in it
 //! sessions       the sessions of the server: connected, or waiting to be resumed
 //! fault          why a request is refused
@@ -40,6 +41,7 @@ mod idle_deadline;
 mod inbox;
 pub mod limits;
 mod listen;
+mod memory;
 mod metrics;
 mod newcomers;
 mod open_pushes;

@@ -61,6 +61,10 @@ pub const KEEPALIVE_PROBES: u32 = 3;
 /// 17 MB, which takes about 20 ms.
 pub const INLINE_REQUEST_BYTES: usize = 16 << 10;
 
+/// Messages up to this length are written into shared memory at once, on the thread of the connection: 256 KiB take
+/// about 0.1 ms. Longer ones are written on a thread that may block.
+pub const INLINE_MEMORY_BYTES: u64 = 256 << 10;
+
 /// Uploads that a server keeps, finished or not: the blocks of a city, each in a file.
 pub const UPLOADS: usize = 1024;
 

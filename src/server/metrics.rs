@@ -26,6 +26,7 @@ pub(crate) struct Metrics {
     pub(crate) uploads_begun: Counter,
     pub(crate) uploaded_bytes: Counter,
     pub(crate) observation_bytes: Counter,
+    pub(crate) memory_bytes: Counter,
     pub(crate) versions_switched: Counter,
     refusals: CountersByLabel,
     pushes: CountersByLabel,
@@ -66,6 +67,7 @@ impl Metrics {
             uploads_begun: Counter::default(),
             uploaded_bytes: Counter::default(),
             observation_bytes: Counter::default(),
+            memory_bytes: Counter::default(),
             versions_switched: Counter::default(),
             refusals: CountersByLabel::default(),
             pushes: CountersByLabel::default(),
@@ -85,8 +87,10 @@ impl Metrics {
         registry.register("refusals", "Requests refused, by code", m.refusals.clone());
         registry.register("uploads_begun", "Uploads announced", m.uploads_begun.clone());
         registry.register("uploaded_bytes", "Bytes of uploads", m.uploaded_bytes.clone());
-        let help = "Bytes of observations sent";
+        let help = "Bytes of observations sent through the socket";
         registry.register("observation_bytes", help, m.observation_bytes.clone());
+        let help = "Bytes of observations written into shared memory";
+        registry.register("memory_bytes", help, m.memory_bytes.clone());
         let help = "Sessions that switched to another version";
         registry.register("versions_switched", help, m.versions_switched.clone());
         registry.register("pushes", "Pushes that ended, by outcome", m.pushes.clone());

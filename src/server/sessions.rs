@@ -113,6 +113,25 @@ pub(crate) enum Answer {
     Many(Arc<ManyAnswer>),
 }
 
+impl Answer {
+    /// The parts of a message, in order.
+    pub(crate) fn message_parts(&self) -> Vec<&[u8]> {
+        match self {
+            Self::Text(text) => vec![text.as_bytes()],
+            Self::Observation(frame) => vec![frame.buffer.bytes()],
+            Self::Many(many) => {
+                let frames = many.frames.iter().map(|frame| frame.buffer.bytes());
+                std::iter::once(&*many.header).chain(frames).collect()
+            }
+        }
+    }
+
+    /// Length of the message.
+    pub(crate) fn message_bytes(&self) -> u64 {
+        self.message_parts().iter().map(|part| part.len() as u64).sum()
+    }
+}
+
 /// The answer to steps of several sessions.
 #[derive(Debug)]
 pub(crate) struct ManyAnswer {

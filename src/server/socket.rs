@@ -67,6 +67,11 @@ impl Socket {
         Self { stream: stream.await, send_timeout, peer_closed: false }
     }
 
+    /// Whether the other end is on this machine; if not, why.
+    pub(crate) fn same_machine(&self) -> Result<(), &'static str> {
+        self.stream.get_ref().same_machine()
+    }
+
     /// Waits for the next message. Dropping the future loses no request.
     pub(crate) async fn receive(&mut self) -> Result<Incoming, Disconnect> {
         match self.stream.next().await {

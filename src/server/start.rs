@@ -91,6 +91,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         backend,
         repairs,
         profile,
+        shared_memory,
         limits,
     } = config;
     if tokens.is_none() && !listen.ip().is_loopback() {
@@ -138,6 +139,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         stopping,
         limits,
         profile,
+        shares_memory: shared_memory,
         tokens,
         tickets: Tickets::default(),
         audit,

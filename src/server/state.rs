@@ -31,6 +31,8 @@ pub(crate) struct ServerState {
     pub(crate) limits: Limits,
     /// Changes of the render profile of every twin.
     pub(crate) profile: ProfileOverrides,
+    /// Whether clients on this machine may ask for shared memory.
+    pub(crate) shares_memory: bool,
     pub(crate) tokens: Option<Tokens>,
     pub(crate) tickets: Tickets,
     pub(crate) audit: Audit,

@@ -33,6 +33,19 @@ impl Stream {
     }
 }
 
+impl Stream {
+    /// Whether the other end is on this machine; if not, or if that is not known, why.
+    pub(crate) fn same_machine(&self) -> Result<(), &'static str> {
+        match self {
+            Self::Tls(_) => Err("the connection has TLS, and may come through another machine"),
+            Self::Plain(stream) => match stream.peer_addr() {
+                Ok(peer) if peer.ip().to_canonical().is_loopback() => Ok(()),
+                _ => Err("the client is not connected through the loopback interface"),
+            },
+        }
+    }
+}
+
 impl AsyncRead for Stream {
     fn poll_read(
         self: Pin<&mut Self>,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use tokio::net::TcpListener;
 use tokio::time::timeout;
-use wildcity_client::{Action, Client, ClientError, Movement};
+use wildcity_client::{Action, Client, ClientError, ConnectOptions, Movement};
 use wildcity_protocol::error::Code;
 use wildcity_protocol::message::{Open, Outcome, Pose, Request};
 
@@ -292,4 +292,31 @@ async fn connecting_without_a_server_fails() {
         let result = Client::connect(url, "test").await;
         assert!(matches!(result, Err(ClientError::Connect { .. })), "{url}: {result:?}");
     }
+}
+
+/// A server elsewhere names a path that is another file here, or none: it is not opened.
+#[tokio::test]
+async fn memory_that_is_not_the_servers_is_not_opened() {
+    for (path, target) in [("/proc/self/exe", "/memfd:wildcity (deleted)"), ("/none/such", "x")] {
+        let offer = serde_json::json!({
+            "type": "shared_memory", "seq": 1, "path": path, "target": target, "proof_bytes": 32, "slots": 3,
+            "slot_bytes": 4096,
+        });
+        let server = FakeServer::start(vec![vec![HELLO, Reply::Text(offer.to_string())]]).await;
+        let options = ConnectOptions { shared_memory: true, ..ConnectOptions::default() };
+        let refused = Client::connect_with(&server.url, "test", &options).await.unwrap_err();
+        let ClientError::SharedMemory(reason) = &refused else { panic!("{refused}") };
+        assert!(reason.contains(path) && reason.contains("same container"), "{reason}");
+        assert_eq!(server.requests().await[0].len(), 2, "no proof was sent");
+    }
+}
+
+/// A place in memory that was not asked for is not an answer.
+#[tokio::test]
+async fn memory_that_was_not_asked_for_is_an_error() {
+    let (_server, mut client) = opened(vec![vec![HELLO, OPEN, Reply::Golden("in_memory")]]).await;
+    let refused = client.step(HERE).await.unwrap_err();
+    assert!(matches!(refused, ClientError::SharedMemory(_)), "{refused}");
+    let lost = client.step(HERE).await.unwrap_err();
+    assert!(matches!(lost, ClientError::Disconnected(_)), "{lost}");
 }

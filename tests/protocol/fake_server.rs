@@ -133,6 +133,7 @@ pub(crate) fn seq_of(request: &Request) -> u64 {
     match request {
         Request::Open(open) => open.seq,
         Request::Hello { seq, .. }
+        | Request::ShareMemory { seq, .. }
         | Request::Step { seq, .. }
         | Request::Observe { seq, .. }
         | Request::Prefetch { seq, .. }

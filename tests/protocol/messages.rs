@@ -325,6 +325,8 @@ fn requests() -> Vec<(&'static str, Request)> {
     let recorded = BranchPoint::Recorded { episode: "run-17-1".into(), step: 40 };
     vec![
         ("hello", Request::Hello { seq: 0, client, protocols }),
+        ("share_memory", Request::ShareMemory { seq: 1, proof: None }),
+        ("share_memory_proof", Request::ShareMemory { seq: 2, proof: Some("5f1c0e64".repeat(4)) }),
         ("open", Request::Open(Box::new(open))),
         ("open_preset", Request::Open(Box::new(preset))),
         ("open_dynamics", Request::Open(Box::new(driven))),
@@ -512,6 +514,15 @@ fn answers() -> Vec<(&'static str, Answer)> {
         field: None,
         fatal: true,
     };
+    let shared_memory = Answer::SharedMemory {
+        seq: 1,
+        path: "/proc/4242/fd/17".into(),
+        target: "/memfd:wildcity-c161acb4065fb456 (deleted)".into(),
+        proof_bytes: 32,
+        slots: 3,
+        slot_bytes: 1_610_612_736,
+    };
+    let in_memory = Answer::InMemory { seq: 5, slot: 1, offset: 1_610_612_736, bytes: 20_077_000 };
     let mut offering = welcome.clone();
     if let Answer::Welcome { repairs, .. } = &mut offering {
         repairs.extend(["deblur".to_owned(), "zero-dce".to_owned()]);
@@ -526,6 +537,8 @@ fn answers() -> Vec<(&'static str, Answer)> {
         ("resumed_also", resumed_also),
         ("ok", Answer::Ok { seq: 6 }),
         ("switched", switched),
+        ("shared_memory", shared_memory),
+        ("in_memory", in_memory),
         ("closed", Answer::Closed { seq: 8, summary }),
         ("error", refused),
         ("error_fatal", fatal),

@@ -18,9 +18,9 @@ fn every_json_example_is_a_message() {
         ("answer", parses::<Answer>),
         ("observation", parses::<ObservationMetadata>),
     ];
-    // Every request has one example `open` three, `reset`, `branch`, `close` and `resume` two; `step` has four. Every
-    // answer has one.
-    assert_eq!(counted(page, kinds), [22, 7, 1]);
+    // Every request has one example `open` three, `reset`, `branch`, `close`, `resume` and `share_memory` two; `step` has
+    // four. Every answer has one.
+    assert_eq!(counted(page, kinds), [24, 9, 1]);
     let kinds: [Kind; 8] = [
         ("new upload", parses::<http::NewUpload>),
         ("upload", parses::<http::Upload>),

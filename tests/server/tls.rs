@@ -44,6 +44,10 @@ async fn a_session_over_tls_and_a_new_certificate_at_sighup() {
     assert!(url.starts_with("wss://127.0.0.1:"), "{url}");
     assert!(server.running.page().starts_with("https://"), "{}", server.running.page());
     assert!(drives(&url, &first).await);
+    // The other end of a connection with TLS may be another machine.
+    let sharing = ConnectOptions { shared_memory: true, ..first.clone() };
+    let refused = Client::connect_with(&url, "test", &sharing).await.unwrap_err();
+    assert!(refused.to_string().contains("the connection has TLS"), "{refused}");
     // Neither without trust nor without TLS.
     assert!(!drives(&url, &ConnectOptions::default()).await);
     assert!(!drives(&url.replace("wss:", "ws:"), &first).await);

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from functools import cache
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import jsonschema
@@ -148,6 +149,8 @@ REQUESTS: dict[str, Callable[[SessionProtocol], Any]] = {
     "branch_recorded": lambda c: c.branch(RecordedPoint("run-17-1", 40), None),
     "close": lambda c: c.close(),
     "close_named": lambda c: with_sessions(c, "run-17", "run-18").close(on="run-17"),
+    "share_memory": lambda p: p.ask_for_memory(),
+    "share_memory_proof": lambda p: p.use_memory(SimpleNamespace(proof="5f1c0e64" * 4)),
     "resume": lambda c: c.resume("run-17", 4),
     "resume_also": lambda c: c.resume("run-17", 4, ["run-18"]),
     "step_many": lambda c: c.step_many(
@@ -172,7 +175,7 @@ def names(folder: str) -> list[str]:
 def test_requests_are_the_golden_ones(name: str) -> None:
     golden = vector(f"requests/{name}.json")
     protocol = SessionProtocol("golden")
-    protocol.next_seq = golden["seq"]
+    protocol.first_seq = protocol.next_seq = golden["seq"]
     assert json.loads(next(REQUESTS[name](protocol))) == golden
 
 

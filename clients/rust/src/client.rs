@@ -59,6 +59,8 @@ pub struct Client {
     sessions: Vec<String>,
     /// The one that calls are for.
     selected: Option<String>,
+    /// Number of the first request of a connection after those that begin it.
+    first_seq: u64,
     next_seq: u64,
     answer_timeout: Duration,
 }
@@ -175,10 +177,11 @@ impl Client {
         Self::connect_with(url, name, &ConnectOptions::default()).await
     }
 
-    /// As [`Client::connect`], with a token or with additional root certificates.
+    /// As [`Client::connect`], with a token, additional root certificates, or shared memory.
     ///
     /// # Errors
-    /// As [`Client::connect`]. An unknown token gives [`ClientError::Connect`] with HTTP status 401 in its
+    /// As [`Client::connect`]. With shared memory, [`Code::SharedMemoryUnavailable`] if the server refuses it, and
+    /// [`ClientError::SharedMemory`] if its memory cannot be opened. An unknown token gives [`ClientError::Connect`] with HTTP status 401 in its
     /// reason, a token without the role `drive` 403.
     pub async fn connect_with(
         url: &str,
@@ -186,8 +189,9 @@ impl Client {
         options: &ConnectOptions,
     ) -> Result<Self, ClientError> {
         let endpoint = Endpoint::new(url, options)?;
-        let mut connection = endpoint.connect().await?;
-        let welcome = hello(&mut connection, name).await?;
+        let (connection, welcome) = begin(&endpoint, name).await?;
+        // `hello` has number 0, and sharing memory takes two.
+        let first_seq = if endpoint.shares_memory { 3 } else { 1 };
         Ok(Self {
             endpoint,
             name: name.to_owned(),
@@ -196,7 +200,8 @@ impl Client {
             welcome,
             sessions: Vec::new(),
             selected: None,
-            next_seq: 1,
+            first_seq,
+            next_seq: first_seq,
             answer_timeout: limits::ANSWER_TIMEOUT,
         })
     }
@@ -238,11 +243,11 @@ impl Client {
     /// opened.
     pub async fn reconnect(&mut self) -> Result<Option<Resumed>, ClientError> {
         self.connection = None;
-        let mut connection = self.endpoint.connect().await?;
-        self.welcome = hello(&mut connection, &self.name).await?;
+        let (connection, welcome) = begin(&self.endpoint, &self.name).await?;
+        self.welcome = welcome;
         self.connection = Some(connection);
         if self.sessions.is_empty() {
-            self.next_seq = 1;
+            self.next_seq = self.first_seq;
             return Ok(None);
         }
         self.resume_sessions(self.next_seq - 1).await.map(Some)
@@ -508,28 +513,30 @@ impl Client {
         result
     }
 
-    /// Continues the sessions on a new connection, on which `hello` had number 0 and this request has 1.
+    /// Continues the sessions on a new connection, of which this is the first request after those that begin it.
     async fn resume_sessions(&mut self, last_seq: u64) -> Result<Resumed, ClientError> {
         let mut connection = self.take_connection()?;
         let mut names = self.sessions.iter().cloned();
         let session = names.next().unwrap_or_default();
-        let request = Request::Resume { seq: 1, session, last_seq, also: names.collect() };
-        let incoming = match connection.exchange(&request, 1, self.answer_timeout).await {
-            Ok(incoming) => incoming,
-            Err(error) => {
-                if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
-                    // A session is over. A new one can be opened on this connection, and its request
-                    // takes the number of this refused one.
-                    self.sessions.clear();
-                    self.selected = None;
-                    self.next_seq = 1;
-                    self.connection = Some(connection);
-                } else {
-                    self.disconnect_reason = error.to_string();
+        let request =
+            Request::Resume { seq: self.first_seq, session, last_seq, also: names.collect() };
+        let incoming =
+            match connection.exchange(&request, self.first_seq, self.answer_timeout).await {
+                Ok(incoming) => incoming,
+                Err(error) => {
+                    if matches!(error, ClientError::Refused { code: Code::UnknownSession, .. }) {
+                        // A session is over. A new one can be opened on this connection, and its request
+                        // takes the number of this refused one.
+                        self.sessions.clear();
+                        self.selected = None;
+                        self.next_seq = self.first_seq;
+                        self.connection = Some(connection);
+                    } else {
+                        self.disconnect_reason = error.to_string();
+                    }
+                    return Err(error);
                 }
-                return Err(error);
-            }
-        };
+            };
         match incoming {
             // One request is under way at a time, so the session has carried out either the request with
             // number `last_seq` or the one after it.
@@ -589,6 +596,16 @@ impl Client {
         self.disconnect_reason = error.to_string();
         error
     }
+}
+
+/// Connects, says `hello`, and shares memory if that is asked for.
+async fn begin(endpoint: &Endpoint, name: &str) -> Result<(Connection, Welcome), ClientError> {
+    let mut connection = endpoint.connect().await?;
+    let welcome = hello(&mut connection, name).await?;
+    if endpoint.shares_memory {
+        connection.share_memory(1).await?;
+    }
+    Ok((connection, welcome))
 }
 
 async fn hello(connection: &mut Connection, name: &str) -> Result<Welcome, ClientError> {

@@ -22,6 +22,7 @@ use wildcity_protocol::message::{Answer, Request};
 
 use crate::error::{ClientError, FrameError};
 use crate::many::Many;
+use crate::memory::{Offer, SharedMemory};
 use crate::observation::Observation;
 use crate::options::ConnectOptions;
 use crate::tls;
@@ -32,11 +33,14 @@ pub(crate) struct Endpoint {
     url: String,
     upgrade: UpgradeRequest,
     connector: Connector,
+    /// Whether connections share memory.
+    pub(crate) shares_memory: bool,
 }
 
 #[derive(Debug)]
 pub(crate) struct Connection {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+    memory: Option<SharedMemory>,
 }
 
 /// A message from the server.
@@ -69,7 +73,8 @@ impl Endpoint {
         } else {
             Connector::Plain
         };
-        Ok(Self { url: url.to_owned(), upgrade, connector })
+        let shares_memory = options.shared_memory;
+        Ok(Self { url: url.to_owned(), upgrade, connector, shares_memory })
     }
 
     /// Opens a connection. Fails after [`HELLO_TIMEOUT`].
@@ -87,7 +92,7 @@ impl Endpoint {
             Some(self.connector.clone()),
         );
         match timeout(HELLO_TIMEOUT, connecting).await {
-            Ok(Ok((socket, _response))) => Ok(Connection { socket }),
+            Ok(Ok((socket, _response))) => Ok(Connection { socket, memory: None }),
             Ok(Err(error)) => Err(failed(error.to_string())),
             Err(_) => Err(failed(format!("no answer within {HELLO_TIMEOUT:?}"))),
         }
@@ -136,8 +141,51 @@ impl Connection {
             {
                 Err(ClientError::Refused { code, message, field, fatal })
             }
+            Incoming::Answer(Answer::InMemory { offset, bytes, .. })
+                if answered_seq == Some(seq) =>
+            {
+                let memory = self.memory.as_ref().ok_or_else(|| {
+                    ClientError::SharedMemory(
+                        "the server uses one that was not asked for".to_owned(),
+                    )
+                })?;
+                let incoming = decode(memory.read(offset, bytes).await?)?;
+                match incoming.seq() {
+                    found if found == Some(seq) => Ok(incoming),
+                    got => Err(ClientError::SeqMismatch { expected: seq, got }),
+                }
+            }
             incoming if answered_seq == Some(seq) => Ok(incoming),
             _ => Err(ClientError::SeqMismatch { expected: seq, got: answered_seq }),
+        }
+    }
+
+    /// Lets the server send observations in shared memory. `seq` is the first of two numbers.
+    ///
+    /// # Errors
+    /// The server refuses, or its memory cannot be opened.
+    pub(crate) async fn share_memory(&mut self, seq: u64) -> Result<(), ClientError> {
+        let asked = Request::ShareMemory { seq, proof: None };
+        let offer = match self.exchange(&asked, seq, HELLO_TIMEOUT).await? {
+            Incoming::Answer(Answer::SharedMemory {
+                path,
+                target,
+                proof_bytes,
+                slots,
+                slot_bytes,
+                ..
+            }) => Offer { path, target, proof_bytes, size: slots.saturating_mul(slot_bytes) },
+            other => return Err(unexpected("shared_memory", &other)),
+        };
+        let (memory, proof) = SharedMemory::open(&offer)?;
+        let seq = seq + 1;
+        let proven = Request::ShareMemory { seq, proof: Some(proof) };
+        match self.exchange(&proven, seq, HELLO_TIMEOUT).await? {
+            Incoming::Answer(Answer::Ok { .. }) => {
+                self.memory = Some(memory);
+                Ok(())
+            }
+            other => Err(unexpected("ok", &other)),
         }
     }
 
@@ -167,6 +215,10 @@ impl Connection {
     }
 }
 
+fn unexpected(expected: &'static str, got: &Incoming) -> ClientError {
+    ClientError::UnexpectedAnswer { expected, got: got.to_string() }
+}
+
 fn decode(frame: Bytes) -> Result<Incoming, ClientError> {
     match Observation::decode(frame.clone()) {
         Ok(observation) => Ok(Incoming::Observation(Box::new(observation))),
@@ -191,6 +243,8 @@ impl Incoming {
                 Answer::Welcome { seq, .. }
                 | Answer::Resumed { seq, .. }
                 | Answer::Ok { seq }
+                | Answer::SharedMemory { seq, .. }
+                | Answer::InMemory { seq, .. }
                 | Answer::Switched { seq, .. }
                 | Answer::Closed { seq, .. },
             ) => Some(*seq),

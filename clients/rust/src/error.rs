@@ -51,6 +51,9 @@ pub enum ClientError {
         /// Number of the answer.
         got: Option<u64>,
     },
+    /// The server's memory cannot be used. The client closed the connection.
+    #[error("shared memory: {0}")]
+    SharedMemory(String),
     /// The request cannot be written as JSON.
     #[error("cannot write the request: {0}")]
     Request(serde_json::Error),

@@ -35,6 +35,7 @@ mod error;
 mod http;
 pub mod limits;
 mod many;
+mod memory;
 mod observation;
 mod options;
 mod tls;

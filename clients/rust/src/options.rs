@@ -20,6 +20,9 @@ pub struct ConnectOptions {
     /// Root certificates in PEM format that `wss://` and `https://` trust in addition to those of the
     /// operating system, for example that of a private certificate authority.
     pub root_certificates_pem: Vec<u8>,
+    /// Whether observations come in memory that the server shares, in place of the socket. The server must run on this
+    /// machine, in the same container and as the same user; otherwise connecting fails.
+    pub shared_memory: bool,
 }
 
 impl ConnectOptions {
@@ -39,6 +42,7 @@ impl fmt::Debug for ConnectOptions {
                 "root_certificates_pem",
                 &format_args!("{} bytes", self.root_certificates_pem.len()),
             )
+            .field("shared_memory", &self.shared_memory)
             .finish()
     }
 }

@@ -53,10 +53,37 @@ pub enum Answer {
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         also: Vec<ResumedSession>,
     },
-    /// Answer to `prefetch` and to `snapshot`.
+    /// Answer to `prefetch`, to `snapshot` and to `share_memory` with a proof.
     Ok {
         /// Number of the request.
         seq: u64,
+    },
+    /// Answer to `share_memory` without `proof`: the memory that the server offers. Its first bytes are the proof.
+    SharedMemory {
+        /// Number of the request.
+        seq: u64,
+        /// Path by which the memory can be opened, of a client in the same container and of the same user.
+        path: String,
+        /// Target of that path, which is a symbolic link. If it has another one, the path is of another machine or
+        /// container, and must not be opened.
+        target: String,
+        /// Bytes of the proof, at the beginning of the memory.
+        proof_bytes: u64,
+        /// Number of slots.
+        slots: u64,
+        /// Bytes from one slot to the next.
+        slot_bytes: u64,
+    },
+    /// In place of an observation, or of the answer to `step_many`: where in the shared memory it is.
+    InMemory {
+        /// Number of the request.
+        seq: u64,
+        /// Index of the slot.
+        slot: u64,
+        /// Offset in the memory, in bytes.
+        offset: u64,
+        /// Length of the message, in bytes.
+        bytes: u64,
     },
     /// Answer to `switch_version`: the version that the session shows from the next step on.
     Switched {

@@ -24,6 +24,16 @@ pub enum Request {
         /// Protocol versions that the client supports.
         protocols: Vec<String>,
     },
+    /// Asks for the observations in memory instead of the socket, for a client on the same machine. Without `proof`
+    /// the answer is `shared_memory`: where the memory is. With it, the answer is `ok`, and the observations come in
+    /// that memory from then on.
+    ShareMemory {
+        /// Number of this request.
+        seq: u64,
+        /// The text at the beginning of the memory, which only a client that can open it knows.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        proof: Option<String>,
+    },
     /// Opens a session on a twin. Answer: `opened`.
     Open(Box<Open>),
     /// Moves the ego, advances the time by `dt_us` or to `until_us`, and renders. Exactly one of `pose`, `trajectory` and

@@ -2,6 +2,7 @@
 
 mod actors;
 mod benched_twin;
+mod delivery;
 mod drive;
 mod gpu;
 mod load;
@@ -21,6 +22,7 @@ Examples:
   wildcity bench step street.ply --cameras cameras.json
   wildcity bench drive street --csv steps.csv
   wildcity bench sessions street --size 96x60
+  wildcity bench delivery street
   wildcity bench actors street
   wildcity bench load street
   wildcity bench soak street")]
@@ -35,6 +37,7 @@ enum Subcommand {
     Gpu(gpu::Gpu),
     Drive(Box<drive::Drive>),
     Sessions(Box<sessions::Sessions>),
+    Delivery(Box<delivery::Delivery>),
     Actors(Box<actors::Actors>),
     Load(load::Load),
     Soak(soak::Soak),
@@ -47,6 +50,7 @@ impl Bench {
             Subcommand::Gpu(gpu) => gpu.run(),
             Subcommand::Drive(drive) => drive.run(),
             Subcommand::Sessions(sessions) => sessions.run(),
+            Subcommand::Delivery(delivery) => delivery.run(),
             Subcommand::Actors(actors) => actors.run(),
             Subcommand::Load(load) => load.run(),
             Subcommand::Soak(soak) => soak.run(),

@@ -85,6 +85,10 @@ pub(super) struct Serve {
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     alpasim_open: bool,
 
+    /// Refuse shared memory to clients on this machine: their observations then come through the socket alone.
+    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
+    no_shared_memory: bool,
+
     /// Memory that the Gaussians of all twins may take, in GiB, for example 2 or 0.5 [default: three
     /// quarters of the machine's]. A session is refused if its largest frame does not fit into memory
     /// together with those of the other sessions; the rest of the memory is a cache for later frames.
@@ -208,6 +212,7 @@ impl Serve {
             backend: Arc::from(self.backend.backend()?),
             repairs: self.repair.models()?,
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),
+            shared_memory: !self.no_shared_memory,
             limits: self.limits.limits(self.memory_gib.map(bytes_of_gib)),
         };
         let served = &config.directories;

@@ -6,6 +6,7 @@
 //! |---|---|
 //! | `mod.rs` | the loop, the numbers, and what is for one session |
 //! | `opening.rs` | open, branch, resume |
+//! | `sharing.rs` | share_memory |
 //! | `steps.rs` | step, step_many |
 //! | `trace.rs` | their spans |
 //!
@@ -14,6 +15,7 @@
 //! never carried out again: if its number is repeated, the stored answer is sent again.
 
 mod opening;
+mod sharing;
 mod steps;
 mod trace;
 
@@ -31,13 +33,23 @@ use crate::convert::{self, Command, Parsed};
 use crate::fault::Fault;
 use crate::inbox::Inbox;
 use crate::limits;
+use crate::memory::SharedMemory;
 use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
 use crate::socket::{Disconnect, Incoming, Socket};
 use crate::state::ServerState;
 
 /// Serves a client until the connection ends. An open session is parked then.
-pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Grant>) {
+pub(crate) async fn serve(
+    state: Arc<ServerState>,
+    socket: Socket,
+    grant: Arc<Grant>,
+    is_forwarded: bool,
+) {
     let hello_deadline = Instant::now() + state.limits.hello;
+    let same_machine = match is_forwarded {
+        true => Err("the connection comes through a proxy"),
+        false => socket.same_machine(),
+    };
     let mut inbox = Inbox::new(socket);
     let mut connection = Connection {
         state,
@@ -47,6 +59,8 @@ pub(crate) async fn serve(state: Arc<ServerState>, socket: Socket, grant: Arc<Gr
         answered_seq: None,
         last: None,
         slots: Vec::new(),
+        same_machine,
+        memory: None,
     };
     let reason = connection.run(&mut inbox).await;
     connection.end(inbox.socket, reason).await;
@@ -64,6 +78,10 @@ struct Connection {
     last: Option<AnsweredRequest>,
     /// The sessions, in the order in which they were opened.
     slots: Vec<SlotGuard>,
+    /// Whether the client is on this machine; if not, why it seems so.
+    same_machine: Result<(), &'static str>,
+    /// Memory that the client may have opened, for observations.
+    memory: Option<SharedMemory>,
 }
 
 /// A request that was refused.
@@ -149,13 +167,14 @@ impl Connection {
             Parsed::Unnumbered(fault) => return Err(Refusal { seq: None, fault }),
         };
 
+        let refusal = |fault| Refusal { seq: Some(seq), fault };
         // A repeated request gets the stored answer.
         if let Some(last) = &self.last
             && last.seq == seq
         {
-            return Ok(last.answer.clone());
+            let answer = last.answer.clone();
+            return self.delivered(seq, answer).await.map_err(refusal);
         }
-        let refusal = |fault| Refusal { seq: Some(seq), fault };
         self.check_order(seq).map_err(refusal)?;
 
         // Carries the request out.
@@ -177,7 +196,7 @@ impl Connection {
                 slot.answered_seq = seq;
             }
         }
-        Ok(answer)
+        self.delivered(seq, answer).await.map_err(refusal)
     }
 
     /// Accepts the numbers after the last request that was carried out, up to the one after the last answer: all
@@ -214,6 +233,8 @@ impl Connection {
         match command {
             Command::Hello { client } => self.hello(seq, client).await,
             _ if !self.hello_done => Err(Fault::WrongOrder("the first request is hello")),
+            Command::ShareMemory { proof: None } => self.offer_memory(seq),
+            Command::ShareMemory { proof: Some(proof) } => self.open_memory(seq, &proof),
             Command::Open { name, opening, drive } => {
                 self.check_room(name.as_ref())?;
                 self.open(seq, name, *opening, drive).await
@@ -338,17 +359,9 @@ impl Connection {
     async fn send(&self, socket: &mut Socket, answer: &Answer) -> Result<(), Disconnect> {
         match answer {
             Answer::Text(text) => socket.send_text(text).await,
-            Answer::Observation(frame) => {
-                let bytes = frame.buffer.bytes();
-                self.state.metrics.observation_bytes.inc_by(bytes.len() as u64);
-                socket.send_binary(&[bytes]).await
-            }
-            Answer::Many(many) => {
-                let frames = many.frames.iter().map(|frame| frame.buffer.bytes());
-                let parts: Vec<&[u8]> = std::iter::once(&*many.header).chain(frames).collect();
-                let bytes = parts.iter().map(|part| part.len() as u64).sum();
-                self.state.metrics.observation_bytes.inc_by(bytes);
-                socket.send_binary(&parts).await
+            Answer::Observation(_) | Answer::Many(_) => {
+                self.state.metrics.observation_bytes.inc_by(answer.message_bytes());
+                socket.send_binary(&answer.message_parts()).await
             }
         }
     }

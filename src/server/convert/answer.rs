@@ -7,7 +7,9 @@ use serde::Serialize;
 
 use crate::config::Limits as ServerLimits;
 use crate::fault::Fault;
+use crate::memory::{MemoryPlace, SharedMemory};
 use crate::sessions::ClosedSession;
+use wildcity_protocol::limits::MEMORY_SLOTS;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
 };
@@ -193,6 +195,24 @@ pub(crate) fn resumed(
 /// The answer to `prefetch`.
 pub(crate) fn ok(seq: u64) -> Result<String, Fault> {
     text(&Answer::Ok { seq })
+}
+
+/// The answer to `share_memory` without a proof.
+pub(crate) fn shared_memory(seq: u64, memory: &SharedMemory) -> Result<String, Fault> {
+    text(&Answer::SharedMemory {
+        seq,
+        path: memory.path.clone(),
+        target: memory.target.clone(),
+        proof_bytes: memory.proof_bytes() as u64,
+        slots: MEMORY_SLOTS as u64,
+        slot_bytes: SharedMemory::SLOT_BYTES,
+    })
+}
+
+/// Where in the shared memory an answer is.
+pub(crate) fn in_memory(seq: u64, place: MemoryPlace) -> Result<String, Fault> {
+    let MemoryPlace { slot, offset, bytes } = place;
+    text(&Answer::InMemory { seq, slot: slot as u64, offset, bytes })
 }
 
 /// The answer to `switch_version`.

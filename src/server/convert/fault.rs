@@ -148,9 +148,10 @@ fn status_of(code: Code) -> StatusCode {
         Code::TwinDamaged | Code::RepairFailed | Code::Internal => {
             StatusCode::INTERNAL_SERVER_ERROR
         }
-        Code::Busy | Code::ShuttingDown | Code::RepairUnavailable => {
-            StatusCode::SERVICE_UNAVAILABLE
-        }
+        Code::Busy
+        | Code::ShuttingDown
+        | Code::RepairUnavailable
+        | Code::SharedMemoryUnavailable => StatusCode::SERVICE_UNAVAILABLE,
         Code::DeadlineExceeded => StatusCode::GATEWAY_TIMEOUT,
         Code::StorageFull => StatusCode::INSUFFICIENT_STORAGE,
     }
@@ -224,6 +225,7 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::NoUpgrade => at(Code::InvalidRequest, "upgrade"),
         Fault::Handshake { header, .. } => at(Code::InvalidRequest, header),
         Fault::NoSubprotocol { .. } => at(Code::UnsupportedProtocol, "sec-websocket-protocol"),
+        Fault::NoSharedMemory { field, .. } => at(Code::SharedMemoryUnavailable, field),
         Fault::NoRoute { .. } | Fault::NoMethod { .. } => plain(Code::InvalidRequest),
         Fault::UnknownUpload { field, .. } => {
             WireFault { code: Code::UnknownUpload, field: field.clone() }

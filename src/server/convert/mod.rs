@@ -26,7 +26,10 @@ mod request;
 mod rig;
 mod sensors;
 
-pub(crate) use answer::{AlsoResumed, closed, ok, opened, resumed, switched, twin, twins, welcome};
+pub(crate) use answer::{
+    AlsoResumed, closed, in_memory, ok, opened, resumed, shared_memory, switched, twin, twins,
+    welcome,
+};
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
 pub(crate) use http::{

@@ -49,6 +49,11 @@ pub(crate) enum Command {
         /// Name and version of the client.
         client: String,
     },
+    /// Asks for observations in shared memory.
+    ShareMemory {
+        /// The text that is in the memory, once the client has opened it.
+        proof: Option<String>,
+    },
     /// Opens a session.
     Open {
         /// Its name, if the client chose one.
@@ -172,6 +177,7 @@ fn convert(request: Request) -> Parsed {
             };
             general(seq, command)
         }
+        Request::ShareMemory { seq, proof } => general(seq, Ok(Command::ShareMemory { proof })),
         Request::Open(open) => general(open.seq, open_command(*open)),
         Request::Step { seq, session, pose, trajectory, action, until_us, notes, terminate } => {
             let movement = movement_of(pose, trajectory, action);

@@ -33,8 +33,9 @@ pub(super) async fn upgrade(
     let accept = accept(request.headers(), convert::SUBPROTOCOL)?;
     grant.require(Role::Drive)?;
     let shared = state.clone();
+    let is_forwarded = is_forwarded(request.headers());
     hand_over(&state, slot, accept, convert::SUBPROTOCOL, request, async move |socket| {
-        connection::serve(shared, socket, grant).await;
+        connection::serve(shared, socket, grant, is_forwarded).await;
     })
 }
 
@@ -130,6 +131,13 @@ fn check_handshake<'a>(headers: &'a HeaderMap, protocol: &'static str) -> Result
             Err(Fault::Handshake { header: "sec-websocket-key", must })
         }
     }
+}
+
+/// Whether the headers say that a proxy is in between.
+fn is_forwarded(headers: &HeaderMap) -> bool {
+    ["forwarded", "x-forwarded-for", "x-real-ip", "via"]
+        .iter()
+        .any(|name| headers.contains_key(*name))
 }
 
 /// Whether a text is base64 of 16 bytes: 22 digits, and padding.

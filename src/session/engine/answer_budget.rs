@@ -1,8 +1,8 @@
 //! The budget of bytes for answers, shared by all sessions.
 //!
 //! It covers the observations that are being made, sent, or kept for a repeated `seq`, the earlier frames
-//! that later observations contain again, and the overlays of the sessions' cameras. Without it, a few slow
-//! clients with large images could exhaust the server's memory.
+//! that later observations contain again, memory that is shared with clients, and the overlays of the sessions'
+//! cameras. Without it, a few slow clients with large images could exhaust the server's memory.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -16,7 +16,7 @@ pub(crate) struct AnswerBudget(Arc<AtomicU64>);
 
 /// Reserved bytes of the budget. Dropping it returns them.
 #[derive(Debug)]
-pub(crate) struct BudgetShare {
+pub struct BudgetShare {
     budget: AnswerBudget,
     bytes: u64,
 }
@@ -38,7 +38,7 @@ impl AnswerBudget {
 
 impl BudgetShare {
     /// Adds another share of the same budget to this one.
-    pub(crate) fn merge(&mut self, mut other: Self) {
+    pub fn merge(&mut self, mut other: Self) {
         // `other` is dropped with 0 bytes, so that it returns none.
         self.bytes += std::mem::take(&mut other.bytes);
     }

@@ -22,7 +22,7 @@ use wildcity_twin::residency::{
 };
 use wildcity_twin::store::Catalog;
 
-use self::answer_budget::AnswerBudget;
+use self::answer_budget::{AnswerBudget, BudgetShare};
 use self::leases::Leases;
 use self::render_queue::{FrameCost, RenderQueue, Scratch};
 use self::twin_summaries::{SummaryCache, TwinSummaries};
@@ -306,6 +306,14 @@ impl Engine {
     /// How long one step may take, time in queues included.
     pub fn step_timeout(&self) -> Duration {
         self.step_timeout
+    }
+
+    /// Counts bytes that hold answers outside of the sessions against the budget for answers, until the share is dropped.
+    ///
+    /// # Errors
+    /// [`SessionError::Busy`] if fewer are left.
+    pub fn reserve_answer_bytes(&self, bytes: u64) -> Result<BudgetShare, SessionError> {
+        self.answer_budget.reserve(bytes)
     }
 
     pub(crate) fn answer_budget(&self) -> &AnswerBudget {

@@ -14,6 +14,7 @@ from .errors import (
     ProtocolError,
     PushFailed,
     Refused,
+    SlotInUse,
     TimedOut,
     WildCityError,
 )
@@ -121,6 +122,7 @@ __all__ = [
     "ServeFailed",
     "Session",
     "Shutter",
+    "SlotInUse",
     "SnapshotPoint",
     "Station",
     "Step",

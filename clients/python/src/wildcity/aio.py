@@ -45,6 +45,7 @@ from .protocol import (
     Trajectory,
     Welcome,
 )
+from .shared_memory import SharedMemory
 
 T = TypeVar("T")
 
@@ -55,15 +56,23 @@ async def connect(
     name: str = "wildcity-python",
     timeout: float = 90.0,
     token: str | None = None,
+    shared_memory: bool = False,
+    copy: bool = True,
 ) -> Client:
     """Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`.
 
     `name` appears in the server's log. `timeout` is how long an answer may take, in seconds; the server's own
     limits are shorter. `token` is for a server that was started with tokens.
 
-    Raises `ConnectFailed`, or `ProtocolError` if the server speaks another protocol.
+    With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must run
+    on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
+    views of that memory: at most two observations can be kept beside the one that is asked for, and while arrays of an
+    older one exist, calls raise `SlotInUse`.
+
+    Raises `ConnectFailed`, `ProtocolError` if the server speaks another protocol, or `Refused` with the code
+    `shared_memory_unavailable`.
     """
-    client = Client(url, name=name, timeout=timeout, token=token)
+    client = Client(url, name=name, timeout=timeout, token=token, shared_memory=shared_memory, copy=copy)
     await client._connect()
     return client
 
@@ -74,9 +83,13 @@ class Client:
     welcome: Welcome
     """The server's answer to `hello`: its limits and its twins."""
 
-    def __init__(self, url: str, *, name: str, timeout: float, token: str | None) -> None:
+    def __init__(
+        self, url: str, *, name: str, timeout: float, token: str | None, shared_memory: bool = False, copy: bool = True
+    ) -> None:
         self.url = url
         self.timeout = timeout
+        self._shared_memory = shared_memory
+        self._copy = copy
         self._headers = authorization_headers(token)
         self._protocol = SessionProtocol(name)
         self._connection: ClientConnection | None = None
@@ -163,6 +176,7 @@ class Client:
         """Closes the connection. An open session can be resumed within `welcome.limits.resume_ms`."""
         connection = self._connection
         self._connection = None
+        self._protocol.memory = None
         if connection is not None:
             await connection.close()
 
@@ -183,6 +197,16 @@ class Client:
             await self.close()
             raise ConnectFailed(f"{self.url} does not speak {PROTOCOL}")
         self.welcome = await self._run(self._protocol.hello())
+        if self._shared_memory:
+            await self._share_memory()
+
+    async def _share_memory(self) -> None:
+        try:
+            offer = await self._run(self._protocol.ask_for_memory())
+            await self._run(self._protocol.use_memory(SharedMemory(offer, self._copy)))
+        except BaseException:
+            await self.close()
+            raise
 
     async def _reconnect(self) -> Resumed:
         await self._connect()

@@ -26,6 +26,7 @@ Code = Literal[
     "unknown_repair",
     "repair_unavailable",
     "repair_failed",
+    "shared_memory_unavailable",
     "session_exists",
     "invalid_name",
     "pose_not_finite",
@@ -65,6 +66,13 @@ class Disconnected(WildCityError):
 
 class TimedOut(WildCityError):
     """No answer came in time, and the client closed the connection. `Session.resume` may continue the session."""
+
+
+class SlotInUse(WildCityError):
+    """Arrays of an earlier observation still exist, whose memory the next one takes. Nothing was sent.
+
+    Only with `connect(..., shared_memory=True, copy=False)`.
+    """
 
 
 class ProtocolError(WildCityError):

@@ -1,4 +1,8 @@
-"""Decodes the binary frame, which has safetensors layout. Arrays are views of it, without a copy."""
+"""Decodes the binary frame, which has safetensors layout. Arrays are views of it, without a copy.
+
+No object here refers to itself, not even through others: so a frame in shared memory is free as soon as the last
+observation, view or array of it is gone.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +46,7 @@ class Observation:
     def __init__(self, frame: bytes | memoryview) -> None:
         self.frame = frame
         self._tensors, text = _read_layout(frame, "observation")
+        self._content = _Content(frame, self._tensors)
         try:
             self.metadata: Metadata = decode(Metadata, parse_json(text, "metadata"), "metadata")
         except BadFrame:
@@ -50,7 +55,7 @@ class Observation:
             raise BadFrame(str(error)) from error
         self._check()
         poses = {image.pose for image in self.metadata.images} | {0}
-        self.views: tuple[View, ...] = tuple(View(self, pose) for pose in sorted(poses))
+        self.views: tuple[View, ...] = tuple(View(self._content, self.metadata.images, pose) for pose in sorted(poses))
 
     @property
     def ego(self) -> Ego:
@@ -110,7 +115,7 @@ class Observation:
         There are `Outputs.frames` of them, or fewer at the start of an episode. `frame_infos` has their times.
         Raises `KeyError` if there are none.
         """
-        frames = [_decode_image(self, image) for image in self.frame_infos(camera)]
+        frames = [_decode_image(self._content, image) for image in self.frame_infos(camera)]
         if not frames:
             raise KeyError(f"{camera!r} has no frames in this observation")
         return np.stack(frames)
@@ -123,15 +128,11 @@ class Observation:
 
     def tensor(self, name: str) -> NDArray[Any]:
         """A tensor of the frame by name, without a copy. Raises `KeyError` if there is none."""
-        tensor = self._tensors[name]
-        count = math.prod(tensor.shape)
-        array = np.frombuffer(self.frame, tensor.dtype, count, tensor.start)
-        return array.reshape(tensor.shape)
+        return self._content.tensor(name)
 
     def encoded(self, image: ImageInfo) -> memoryview:
         """The bytes of an image as received: a JPEG or PNG file, or raw pixels."""
-        tensor = self._tensors[image.tensor]
-        return memoryview(self.frame)[tensor.start : tensor.start + math.prod(tensor.shape)]
+        return self._content.encoded(image)
 
     def __repr__(self) -> str:
         m = self.metadata
@@ -176,7 +177,7 @@ class Many:
     The observations are views of the message, without a copy. Raises `BadFrame` if it is not such a message.
     """
 
-    def __init__(self, frame: bytes) -> None:
+    def __init__(self, frame: bytes | memoryview) -> None:
         tensors, text = _read_layout(frame, "many")
         try:
             metadata: ManyMetadata = decode(ManyMetadata, parse_json(text, "many"), "many")
@@ -201,9 +202,9 @@ class Many:
 class View:
     """The images of one pose."""
 
-    def __init__(self, observation: Observation, pose: int) -> None:
-        self._observation = observation
-        self._infos = {i.camera: i for i in observation.metadata.images if i.pose == pose}
+    def __init__(self, content: _Content, images: tuple[ImageInfo, ...], pose: int) -> None:
+        self._content = content
+        self._infos = {i.camera: i for i in images if i.pose == pose}
 
     @property
     def cameras(self) -> Mapping[str, ImageInfo]:
@@ -213,7 +214,8 @@ class View:
     @cached_property
     def images(self) -> Mapping[str, NDArray[np.uint8]]:
         """uint8 [height, width, 3] by camera. JPEG and PNG are decoded at the first access, and kept."""
-        return _LazyArrays(self._infos, lambda image: _decode_image(self._observation, image))
+        content = self._content
+        return _LazyArrays(self._infos, lambda image: _decode_image(content, image))
 
     @cached_property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
@@ -236,9 +238,9 @@ class View:
         return self._maps("instances")
 
     def _maps(self, output: str) -> Mapping[str, NDArray[Any]]:
-        tensors = self._observation._tensors
-        present = {name: i for name, i in self._infos.items() if _sibling(i, output) in tensors}
-        return _LazyArrays(present, lambda image: self._observation.tensor(_sibling(image, output)))
+        content = self._content
+        present = {name: i for name, i in self._infos.items() if _sibling(i, output) in content.tensors}
+        return _LazyArrays(present, lambda image: content.tensor(_sibling(image, output)))
 
 
 class _LazyArrays(Mapping[str, NDArray[Any]]):
@@ -271,15 +273,32 @@ class _Tensor:
     """Offset of its first byte in the frame."""
 
 
+class _Content:
+    """The bytes of a frame, and the tensors in it."""
+
+    def __init__(self, frame: bytes | memoryview, tensors: dict[str, _Tensor]) -> None:
+        self.frame = frame
+        self.tensors = tensors
+
+    def tensor(self, name: str) -> NDArray[Any]:
+        tensor = self.tensors[name]
+        array = np.frombuffer(self.frame, tensor.dtype, math.prod(tensor.shape), tensor.start)
+        return array.reshape(tensor.shape)
+
+    def encoded(self, image: ImageInfo) -> memoryview:
+        tensor = self.tensors[image.tensor]
+        return memoryview(self.frame)[tensor.start : tensor.start + math.prod(tensor.shape)]
+
+
 def _sibling(image: ImageInfo, output: str) -> str:
     """Name of another tensor of an image: `camera/front/rgb` and `depth` give `camera/front/depth`."""
     return image.tensor.removesuffix("rgb") + output
 
 
-def _decode_image(observation: Observation, image: ImageInfo) -> NDArray[np.uint8]:
+def _decode_image(content: _Content, image: ImageInfo) -> NDArray[np.uint8]:
     if image.encoding == "raw":
-        return observation.tensor(image.tensor)
-    file = BytesIO(observation.encoded(image))
+        return content.tensor(image.tensor)
+    file = BytesIO(content.encoded(image))
     try:
         with Image.open(file, formats=[image.encoding.upper()]) as opened:
             # Checked before decoding, so that a small file cannot cause a large allocation.

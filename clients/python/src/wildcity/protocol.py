@@ -807,11 +807,36 @@ class ManyMetadata:
     answers: tuple[SessionAnswer, ...]
 
 
+@dataclass(frozen=True)
+class SharedMemoryOffer:
+    """Memory of the server for observations, and how to open it."""
+
+    seq: int
+    path: str
+    target: str
+    """Target of the symbolic link `path`. If it has another one, the path is of another machine or container."""
+    proof_bytes: int
+    slots: int
+    slot_bytes: int
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """Where in the shared memory an answer is."""
+
+    seq: int
+    slot: int
+    offset: int
+    bytes: int
+
+
 ANSWERS: dict[str, type[Any]] = {
     "welcome": Welcome,
     "opened": Opened,
     "resumed": Resumed,
     "ok": Ok,
+    "shared_memory": SharedMemoryOffer,
+    "in_memory": InMemory,
     "switched": Switched,
     "closed": Closed,
     "error": Refusal,

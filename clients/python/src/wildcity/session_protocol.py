@@ -1,13 +1,15 @@
-"""The client's side of the protocol without any I/O: it numbers requests and matches answers to them.
+"""The client's side of the protocol without the connection: it numbers requests and matches answers to them.
 
 Each method of `SessionProtocol` is a generator. It yields the text of one request, receives the answering message
-through `send`, and returns the decoded answer. `sync` and `aio` only transfer the messages.
+through `send`, and returns the decoded answer. `sync` and `aio` only transfer the messages. Answers in shared memory are
+read here.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import warnings
 from collections.abc import Generator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, TypeVar
@@ -24,6 +26,7 @@ from .protocol import (
     Closed,
     DriveSection,
     Dynamics,
+    InMemory,
     Model,
     Ok,
     Opened,
@@ -36,6 +39,7 @@ from .protocol import (
     Resumed,
     Rig,
     Sensors,
+    SharedMemoryOffer,
     SnapshotPoint,
     Station,
     Step,
@@ -46,6 +50,7 @@ from .protocol import (
     decode_answer,
     encode,
 )
+from .shared_memory import SharedMemory
 
 T = TypeVar("T")
 Message = str | bytes
@@ -57,20 +62,36 @@ class SessionProtocol:
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self.first_seq = 1
+        """Number of the next request of a connection without a session."""
         self.next_seq = 1
         self.sessions: list[str] = []
         """Names of the open sessions."""
+        self.memory: SharedMemory | None = None
+        """Where observations are, if not in messages."""
 
     def hello(self) -> Exchange[Welcome]:
         """Starts a connection."""
+        self.memory = None
         client = {"name": self.name, "version": version("wildcity")}
         fields = {"client": client, "protocols": [PROTOCOL]}
         welcome = yield from self._ask("hello", 0, Welcome, fields)
         if welcome.protocol != PROTOCOL:
             raise ProtocolError(f"the server chose protocol {welcome.protocol!r}")
-        if not self.sessions:
-            self.next_seq = 1
+        self._begin(1)
         return welcome
+
+    def ask_for_memory(self) -> Exchange[SharedMemoryOffer]:
+        """Asks for observations in shared memory, directly after `hello`."""
+        offer = yield from self._ask("share_memory", self.first_seq, SharedMemoryOffer, {})
+        self._begin(self.first_seq + 1)
+        return offer
+
+    def use_memory(self, memory: SharedMemory) -> Exchange[None]:
+        """Proves that the memory was opened: the observations come in it from then on."""
+        yield from self._ask("share_memory", self.first_seq, Ok, {"proof": memory.proof})
+        self._begin(self.first_seq + 1)
+        self.memory = memory
 
     def open(
         self,
@@ -196,18 +217,18 @@ class SessionProtocol:
         return closed.summary
 
     def resume(self, session: str, last_seq: int, also: Sequence[str] = ()) -> Exchange[Resumed]:
-        """Continues sessions on a new connection, on which `hello` had number 0 and this request has 1."""
+        """Continues sessions on a new connection, of which this is the first request after those that begin it."""
         fields: dict[str, Any] = {"session": session, "last_seq": last_seq}
         if also:
             fields["also"] = list(also)
         try:
-            resumed = yield from self._ask("resume", 1, Resumed, fields)
+            resumed = yield from self._ask("resume", self.first_seq, Resumed, fields)
         except Refused as refused:
             if refused.code == "unknown_session":
                 # A session is over. A new one can be opened on this connection, and its request takes
                 # the number of this refused one.
                 self.sessions = []
-                self.next_seq = 1
+                self.next_seq = self.first_seq
             raise
         # One request is under way at a time, so the session has carried out either request `last_seq` or
         # the one after it.
@@ -224,6 +245,11 @@ class SessionProtocol:
         first, *also = self.sessions
         return (yield from self.resume(first, self.next_seq - 1, also))
 
+    def _begin(self, first_seq: int) -> None:
+        self.first_seq = first_seq
+        if not self.sessions:
+            self.next_seq = first_seq
+
     def _add(self, session: str) -> None:
         if session not in self.sessions:
             self.sessions.append(session)
@@ -239,12 +265,10 @@ class SessionProtocol:
     def _ask(self, kind: str, seq: int, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
         # Raises ValueError for NaN and infinity, which JSON cannot represent.
         request = json.dumps({"type": kind, "seq": seq, **fields}, allow_nan=False)
+        if self.memory is not None and answer in (Observation, Many):
+            self.memory.check_next_slot()
         message = yield request
-        got: Any
-        if isinstance(message, bytes):
-            got = Many(message) if answer is Many else Observation(message)
-        else:
-            got = decode_answer(message)
+        got = self._decode(message, answer)
         got_seq = got.metadata.seq if isinstance(got, Observation) else got.seq
         # An error has no number if the server could not read the request.
         if got_seq != seq and not (isinstance(got, Refusal) and got_seq is None):
@@ -254,6 +278,28 @@ class SessionProtocol:
         if not isinstance(got, answer):
             raise ProtocolError(f"{kind} was answered with {type(got).__name__}")
         return got
+
+    def _decode(self, message: Message, answer: type[Any]) -> Any:
+        """The answer in a message, or in the shared memory. `answer` is what is expected."""
+        if isinstance(message, bytes):
+            if self.memory is not None:
+                warnings.warn(
+                    "the server had no room in shared memory: an observation came over the socket",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+            return Many(message) if answer is Many else Observation(message)
+        got = decode_answer(message)
+        if not isinstance(got, InMemory):
+            return got
+        if self.memory is None:
+            raise ProtocolError("the server uses shared memory, which was not asked for")
+        frame = self.memory.read(got)
+        read = Many(frame) if answer is Many else Observation(frame)
+        seq = read.seq if isinstance(read, Many) else read.metadata.seq
+        if seq != got.seq:
+            raise ProtocolError(f"the shared memory has the answer to request {seq}, not to {got.seq}")
+        return read
 
 
 CONNECT_OPTIONS: dict[str, Any] = {
