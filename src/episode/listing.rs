@@ -5,6 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::export::mcap_of;
 use crate::limits;
 
 /// A file of an episode.
@@ -16,6 +17,8 @@ pub struct Listed {
     pub path: PathBuf,
     /// Its size, in bytes.
     pub bytes: u64,
+    /// Size of the MCAP file beside it, in bytes; none without one.
+    pub mcap_bytes: Option<u64>,
     /// When it was last written.
     pub modified: Option<SystemTime>,
 }
@@ -42,6 +45,10 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
         listed.push(Listed {
             name: name.unwrap_or_default(),
             bytes: metadata.len(),
+            mcap_bytes: fs::metadata(mcap_of(&path))
+                .ok()
+                .filter(fs::Metadata::is_file)
+                .map(|mcap| mcap.len()),
             modified: metadata.modified().ok(),
             path,
         });
