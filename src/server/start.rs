@@ -88,6 +88,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         origins,
         tls,
         audit,
+        mcap,
         backend,
         repairs,
         profile,
@@ -112,6 +113,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         backend,
         step_timeout: limits.step,
         repairs,
+        mcap,
     })?;
 
     // The socket.
