@@ -171,8 +171,8 @@ enum Line {
 }
 
 impl Frame {
-    /// The agent's plan, if that was its command: times in microseconds since the begin of the step, and poses in the rig's
-    /// frame of then.
+    /// The agent's plan, if that was its command: times in microseconds since the begin of the step, and poses in the
+    /// rig's frame of then.
     pub fn plan(&self) -> Option<Vec<(i64, Pose)>> {
         let poses = self.command.as_ref()?.get("trajectory")?.as_array()?;
         let read = |value: &serde_json::Value| {

@@ -1,8 +1,9 @@
 //! What AlpaSim scores of an agent's plans, with its faults.
 //!
-//! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/plan_deviation.py`, `minADE.py`, `open_loop_collision.py`,
-//! and `src/wizard/configs/base_config.yaml` for the parameters. Distances are between centres of the ego's box, without
-//! height. What comes after a collision, off the road or 4 m off the recording is cut, as in the scene score.
+//! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/plan_deviation.py`, `minADE.py`,
+//! `open_loop_collision.py`, and `src/wizard/configs/base_config.yaml` for the parameters. Distances are between
+//! centres of the ego's box, without height. What comes after a collision, off the road or 4 m off the recording is
+//! cut, as in the scene score.
 //!
 //! A plan that AlpaSim interpolates beyond its end raises an error there; here the plan says nothing of that time. Its
 //! minimum over sampled plans is that of the one plan that an agent sends.
@@ -127,8 +128,8 @@ impl<'a> Input<'a> {
         )))
     }
 
-    /// Of one plan. The mean ends at the first step that is not before the time ahead; it is none if that step is later than
-    /// the longest of the times, the end of the episode, of the plan or of the recorded drive.
+    /// Of one plan. The mean ends at the first step that is not before the time ahead; it is none if that step is later
+    /// than the longest of the times, the end of the episode, of the plan or of the recorded drive.
     fn ade_of(&self, plan: &Plan, reference: &ReferenceDrive, delta_us: i64) -> Option<f64> {
         let dt_us = self.record.dt_us;
         let now_us = plan.decided_us();

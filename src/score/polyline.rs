@@ -52,8 +52,8 @@ impl Polyline {
         self.stations_m[self.stations_m.len() - 1]
     }
 
-    /// The point at a station, and the unit vector along the line there; at its ends beyond them. The vector is zero on a line
-    /// of one point.
+    /// The point at a station, and the unit vector along the line there; at its ends beyond them. The vector is zero on
+    /// a line of one point.
     pub fn at(&self, station_m: f64) -> (DVec2, DVec2) {
         let last = self.points_m.len() - 1;
         let after =

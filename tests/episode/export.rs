@@ -49,6 +49,7 @@ fn the_file_is_indexed_and_small() {
     let episode = Made { steps: 200, actors: 30, plan_poses: 64, ..Made::default() }.read();
     let bytes = exported(&episode);
     assert!(bytes.len() < 1_000_000, "{} bytes", bytes.len());
+    eprintln!("{} bytes as MCAP", bytes.len());
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert!(summary.chunk_indexes.len() > 3, "{} chunks", summary.chunk_indexes.len());
     assert_eq!(summary.stats.unwrap().message_count, 201 * 4 + 200 + 3);

@@ -116,8 +116,8 @@ fn plans_deviate_by_the_decaying_mean_of_their_common_times() {
 #[test]
 fn plans_deviate_at_the_centre_of_the_box_and_between_their_poses() {
     let mut record = drive(100_000);
-    // The same rear axle at 0.2 s, a quarter turned: the centres are at (1, 0) and (0, 1) from it. The first plan is halfway
-    // between its poses then, where it has x = 2 m and a heading of 0.
+    // The same rear axle at 0.2 s, a quarter turned: the centres are at (1, 0) and (0, 1) from it. The first plan is
+    // halfway between its poses then, where it has x = 2 m and a heading of 0.
     record.plans = vec![
         plan(&[(0, [0.0, 0.0], 0.0), (1, [1.0, 0.0], 0.2), (3, [3.0, 0.0], -0.2)]),
         plan(&[(1, [1.0, 0.0], 0.0), (2, [2.0, 0.0], 0.5 * PI)]),
@@ -143,6 +143,12 @@ fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
     for (name, expected) in ADES.into_iter().zip([0.15, 0.275, 1.3, 2.55]) {
         assert_value(&record, name, expected);
     }
+    // An episode that ends at 6 s, before the recording: a decision at 4.5 s counts for 0.5 and 1 s.
+    let mut short = drive(100_000);
+    short.ego.truncate(61);
+    short.plans = vec![straight(45, 109, 9.0)];
+    assert_value(&short, ADES[1], 0.55);
+    assert_none(&short, ADES[2], "reach 2.5 s ahead");
     // A plan of 2 s says nothing of 2.5 s.
     record.plans = vec![straight(0, 20, 9.0)];
     assert_value(&record, ADES[1], 0.55);
@@ -159,8 +165,8 @@ fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
 
 #[test]
 fn steps_that_do_not_divide_a_horizon_go_beyond_it_and_lose_the_longest() {
-    // Steps of 0.3 s: 0.5 s is reached with the step at 0.6 s, 0.3 and 0.6 m behind. 5 s would be with the one at 5.1 s, which
-    // is later than the longest horizon.
+    // Steps of 0.3 s: 0.5 s is reached with the step at 0.6 s, 0.3 and 0.6 m behind. 5 s would be with the one at 5.1
+    // s, which is later than the longest horizon.
     let mut record = drive(300_000);
     record.plans = vec![straight(0, 64, 9.0)];
     assert_value(&record, ADES[0], 0.45);
@@ -188,8 +194,8 @@ fn track(samples: Vec<Option<TrackSample>>) -> Track {
 
 #[test]
 fn a_plan_hits_what_is_there_within_three_seconds() {
-    // At 3 s the front is at 30 + 1 + 1.96 m. The rear of a car at 34.9 m is at 32.9 m, of one at 35 m at 33 m, which the
-    // plan meets at 3.1 s.
+    // At 3 s the front is at 30 + 1 + 1.96 m. The rear of a car at 34.9 m is at 32.9 m, of one at 35 m at 33 m, which
+    // the plan meets at 3.1 s.
     for (x_m, expected) in [(34.9, 1.0), (35.0, 0.0)] {
         let mut record = drive(100_000);
         record.ego.iter_mut().for_each(|sample| sample.origin_m.x *= 0.1);
@@ -277,9 +283,9 @@ fn an_ego_is_off_the_road_where_it_crosses_the_edge_of_all_lanes() {
 
 #[test]
 fn the_corners_of_the_ego_are_round() {
-    // A standing ego reaches to x = 2.96 m and y = 0.98 m. Its corner has a radius of 0.49 m: the arc is 0.203 m from the corner
-    // of the box. A lane that lacks a triangle with legs of 0.2 m at that corner ends 0.141 m from it, one with legs of 0.4 m
-    // 0.283 m.
+    // A standing ego reaches to x = 2.96 m and y = 0.98 m. Its corner has a radius of 0.49 m: the arc is 0.203 m from
+    // the corner of the box. A lane that lacks a triangle with legs of 0.2 m at that corner ends 0.141 m from it, one
+    // with legs of 0.4 m 0.283 m.
     for (leg_m, expected) in [(0.2, 0.0), (0.4, 1.0)] {
         let lane = lane(
             &[[-5.0, -5.0], [2.97, -5.0], [2.97, 0.99 - leg_m], [2.97 - leg_m, 0.99], [-5.0, 0.99]],

@@ -45,8 +45,8 @@ pub(super) struct Serve {
     #[command(flatten)]
     directories: ServerDirectories,
 
-    /// Export each episode that ends as MCAP, beside its record: for Foxglove, Rerun and others. Takes half as much disk
-    /// again as the records, and no step waits for it.
+    /// Export each episode that ends as MCAP, beside its record: for Foxglove, Rerun and others. Takes half as much
+    /// disk again as the records, and no step waits for it.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
 

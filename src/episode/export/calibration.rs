@@ -1,8 +1,8 @@
 //! Lenses as Foxglove's calibrations describe them, and how far such a description is off.
 //!
-//! Foxglove knows OpenCV's models alone. A lens that is none of them gets the nearest one: f-theta gets OpenCV's fisheye with
-//! the focal length and the four coefficients that fit best. Windshields and thin prisms are left out. The lens
-//! itself is in `/wildcity/episode`.
+//! Foxglove knows OpenCV's models alone. A lens that is none of them gets the nearest one: f-theta gets OpenCV's
+//! fisheye with the focal length and the four coefficients that fit best. Windshields and thin prisms are left out. The
+//! lens itself is in `/wildcity/episode`.
 
 use glam::{DMat4, DVec2, DVec3, DVec4};
 
@@ -79,8 +79,8 @@ impl Nearest {
         Self { model, focal_px }
     }
 
-    /// OpenCV's fisheye `r(θ) = f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)` that is nearest to an f-theta lens up to an angle,
-    /// by least squares. Angles are in units of the largest, so that all powers are at most 1.
+    /// OpenCV's fisheye `r(θ) = f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)` that is nearest to an f-theta lens up to an
+    /// angle, by least squares. Angles are in units of the largest, so that all powers are at most 1.
     fn fitted(lens: &FTheta, most_rad: f64) -> Self {
         // The normal equations of the linear coefficient, and of the four others.
         let [mut linear, mut linear_right] = [0.0, 0.0];

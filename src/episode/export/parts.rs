@@ -66,8 +66,8 @@ pub(super) fn event_text(episode: &EpisodeFile, event: &Event) -> (i32, String) 
     }
 }
 
-/// The command without what `/plan` has: of a trajectory, the times of its poses are left. Poses as text would be two thirds
-/// of a file.
+/// The command without what `/plan` has: of a trajectory, the times of its poses are left. Poses as text would be two
+/// thirds of a file.
 pub(super) fn command_of(frame: &Frame) -> Option<Value> {
     let command = frame.command.as_ref()?;
     let Some(poses) = command.get("trajectory").and_then(Value::as_array) else {
