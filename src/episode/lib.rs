@@ -35,6 +35,6 @@ pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list, read_text};
+pub use listing::{Listed, list, read_mcap, read_text, record_bytes};
 pub use outcome::result;
 pub use scenario::{DriveStart, pose_at, scenario_line};

@@ -58,6 +58,23 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
     Ok(listed)
 }
 
+/// The size of a record, in bytes; 0 if it cannot be read.
+pub fn record_bytes(record: &Path) -> u64 {
+    fs::metadata(record).map_or(0, |metadata| metadata.len())
+}
+
+/// The MCAP file beside a record; none if it has more than `most` bytes.
+///
+/// # Errors
+/// There is no such file, or it cannot be read.
+pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
+    let path = mcap_of(record);
+    match fs::metadata(&path)?.len() > most {
+        true => Ok(None),
+        false => fs::read(path).map(Some),
+    }
+}
+
 /// The text of an episode's file; none if it has more than `most` bytes. An incomplete last line, which a session may be
 /// writing, is left out.
 ///

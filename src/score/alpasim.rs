@@ -3,15 +3,12 @@
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/aggregation/scene_score.py`, `scorers/collision.py`,
 //! `scorers/plan_deviation.py`.
 
-use std::f64::consts::FRAC_PI_2;
-
-use glam::DVec2;
-
 use wildcity_sim::contact::Footprint;
 
+use super::alpasim_box::RoundedBox;
 use super::alpasim_plans;
 use super::alpasim_road::{is_in_wrong_lane, is_off_road};
-use super::record::{DriveRecord, EgoSample, EgoShape};
+use super::record::DriveRecord;
 use super::scored::{Missing, Score};
 
 /// The names of the scores of the scene and the road.
@@ -27,12 +24,6 @@ const FULL_PROGRESS: f64 = 0.8;
 const SHORT_RECORDING_M: f64 = 5.0;
 /// The episode is cut where the ego is farther from the recorded drive, in metres.
 const CUT_M: f64 = 4.0;
-/// Share of the rig's box that is tested.
-const BOX_SHARE: f64 = 0.98;
-/// Radius of its corners, as a share of the lesser side.
-const CORNER_SHARE: f64 = 0.25;
-/// Points of a corner's arc at which it is held against the lanes.
-const ARC_POINTS: usize = 5;
 
 /// Which side of the ego was hit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,6 +54,14 @@ pub fn side(ego: &Footprint, other: &Footprint) -> Option<Side> {
         return Some(Side::Front);
     }
     Some(if ego.rear_line().touches(other) { Side::Rear } else { Side::Lateral })
+}
+
+/// The side of the rounded ego that another box touches.
+fn side_of(ego: &RoundedBox, other: &Footprint) -> Option<Side> {
+    if ego.distance_m(other) > 0.0 {
+        return None;
+    }
+    side(ego.outline(), other)
 }
 
 impl Side {
@@ -110,15 +109,6 @@ pub fn scene_score(rollout: &Rollout) -> f64 {
     (rollout.progress.clamp(0.0, 1.0) / FULL_PROGRESS).min(1.0)
 }
 
-/// The mean of distances between successive plans, weighted by exp(-decay k); `None` of none.
-pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
-    let weight = |k: usize| (-decay * k as f64).exp();
-    let sum: f64 =
-        distances_m.iter().enumerate().map(|(k, distance_m)| weight(k) * distance_m).sum();
-    let weights: f64 = (0..distances_m.len()).map(weight).sum();
-    (weights > 0.0).then(|| sum / weights)
-}
-
 /// All of AlpaSim's scores of an episode.
 pub fn scores(record: &DriveRecord) -> Vec<Score> {
     let drive = Drive::of(record);
@@ -154,7 +144,7 @@ impl Drive {
             let others =
                 tracks.iter().filter_map(|track| track.samples.get(step).copied().flatten());
             let others: Vec<Footprint> = others.map(|other| other.footprint).collect();
-            let sides: Vec<Side> = others.iter().filter_map(|other| ego.side(other)).collect();
+            let sides: Vec<Side> = others.iter().filter_map(|other| side_of(&ego, other)).collect();
             let gaps_m = others.iter().map(|other| ego.distance_m(other));
             drive.least_gap_m = gaps_m.chain(drive.least_gap_m).reduce(f64::min);
             let map = record.map.as_ref();
@@ -201,60 +191,4 @@ fn wrong_lane(record: &DriveRecord, drive: &Result<Drive, Missing>) -> Score {
         wrong.ok_or(Missing::new("needs the middles of the lanes, which this record lacks"))
     });
     Score::new(WRONG_LANE, value.map(|wrong| f64::from(u8::from(wrong))), [])
-}
-
-/// The ego as AlpaSim tests it: 2 % smaller, with rounded corners.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RoundedBox {
-    outline: Footprint,
-    /// The box whose points are all within `radius_m` of the rounded one.
-    core: Footprint,
-    radius_m: f64,
-}
-
-impl RoundedBox {
-    /// The box of an ego at a sample.
-    pub fn of(shape: &EgoShape, sample: &EgoSample) -> Self {
-        let full = shape.footprint(sample);
-        let length_m = BOX_SHARE * full.length_m;
-        let width_m = BOX_SHARE * full.width_m;
-        let radius_m = CORNER_SHARE * length_m.min(width_m);
-        let outline = Footprint { length_m, width_m, ..full };
-        let core = Footprint {
-            length_m: length_m - 2.0 * radius_m,
-            width_m: width_m - 2.0 * radius_m,
-            ..full
-        };
-        Self { outline, core, radius_m }
-    }
-
-    /// Its centre, in metres.
-    pub fn center_m(&self) -> DVec2 {
-        self.outline.center_m
-    }
-
-    /// Points of its outline, in metres: five of each corner's arc, 22.5 degrees apart.
-    pub fn outline_m(&self) -> [DVec2; 4 * ARC_POINTS] {
-        let centers_m = self.core.corners_m();
-        std::array::from_fn(|k| {
-            let center_m = centers_m[k / ARC_POINTS];
-            let out = center_m - self.core.center_m;
-            let along = self.core.forward * out.dot(self.core.forward).signum();
-            let aside = self.core.left() * out.dot(self.core.left()).signum();
-            let angle_rad = FRAC_PI_2 * (k % ARC_POINTS) as f64 / (ARC_POINTS - 1) as f64;
-            center_m + self.radius_m * (angle_rad.cos() * along + angle_rad.sin() * aside)
-        })
-    }
-
-    /// Its distance from another box, in metres; 0 if they touch.
-    pub fn distance_m(&self, other: &Footprint) -> f64 {
-        (self.core.distance_m(other) - self.radius_m).max(0.0)
-    }
-
-    fn side(&self, other: &Footprint) -> Option<Side> {
-        if self.distance_m(other) > 0.0 {
-            return None;
-        }
-        side(&self.outline, other)
-    }
 }

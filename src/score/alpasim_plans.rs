@@ -12,7 +12,7 @@ use glam::DVec2;
 
 use wildcity_sim::contact::Footprint;
 
-use super::alpasim::{RoundedBox, plan_deviation};
+use super::alpasim_box::RoundedBox;
 use super::plan::{Plan, PlannedPose, turn_rad};
 use super::record::{DriveRecord, EgoSample, EgoShape, ReferenceDrive, Track};
 use super::scored::{Measured, Missing, Score};
@@ -33,6 +33,15 @@ const DECAY: f64 = 0.1;
 const HORIZON_US: i64 = 3_000_000;
 /// How far ahead plans are held against the recorded drive, in microseconds.
 const TIME_DELTAS_US: [i64; 4] = [500_000, 1_000_000, 2_500_000, 5_000_000];
+
+/// The mean of distances between successive plans, weighted by exp(-decay k); `None` of none.
+pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
+    let weight = |k: usize| (-decay * k as f64).exp();
+    let sum: f64 =
+        distances_m.iter().enumerate().map(|(k, distance_m)| weight(k) * distance_m).sum();
+    let weights: f64 = (0..distances_m.len()).map(weight).sum();
+    (weights > 0.0).then(|| sum / weights)
+}
 
 /// The scores of the plans, up to the time at which the episode is cut.
 pub(crate) fn scores(record: &DriveRecord, cut_us: &Result<i64, Missing>) -> Vec<Score> {

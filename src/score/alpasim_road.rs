@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 
 use glam::DVec2;
 
-use super::alpasim::RoundedBox;
+use super::alpasim_box::RoundedBox;
 use super::map::LaneMap;
 use super::plan::turn_rad;
 

@@ -19,6 +19,7 @@
 
 mod all;
 pub mod alpasim;
+mod alpasim_box;
 pub mod alpasim_plans;
 pub mod alpasim_road;
 pub mod bench2drive;
@@ -35,6 +36,7 @@ mod scored;
 pub mod statistics;
 
 pub use all::score;
+pub use alpasim_box::RoundedBox;
 pub use map::{Lane, LaneMap, RedArea};
 pub use plan::{Plan, PlannedPose};
 pub use polyline::Polyline;

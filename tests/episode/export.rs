@@ -4,7 +4,7 @@ use std::io::Cursor;
 
 use prost::Message as _;
 use serde_json::{Value, json};
-use wildcity_episode::{EpisodeExport, EpisodeFile, ExportedImage, export};
+use wildcity_episode::{EpisodeExport, EpisodeFile, ExportedImage, export, export_file, mcap_of};
 
 use crate::written::{self, Made};
 
@@ -79,6 +79,25 @@ fn a_plan_is_exported_once() {
     // It is in the rig of the begin of its step: the first one at the begin of the episode.
     let at_ns: Vec<u64> = of("/plan").iter().map(|message| message.log_time).collect();
     assert_eq!(at_ns, [1_000_000_000_000, 1_000_100_000_000, 1_000_200_000_000]);
+}
+
+#[test]
+fn a_full_disk_is_an_error_and_no_panic() {
+    for steps in [1, 400] {
+        let episode = Made { steps, actors: 30, ..Made::default() }.read();
+        let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let error = export(&episode, None, std::io::BufWriter::new(full)).unwrap_err().to_string();
+        assert!(error.contains("cannot write the MCAP file: No space left"), "{error}");
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let record = dir.path().join("made-1.jsonl");
+    written::write(&record, &Made { steps: 2, ..Made::default() }.lines());
+    let nowhere = dir.path().join("nowhere/made-1.mcap");
+    let error = export_file(&record, &nowhere).unwrap_err().to_string();
+    assert!(error.contains("nowhere/made-1.mcap"), "{error}");
+    let exported = export_file(&record, &mcap_of(&record)).unwrap();
+    let bytes = std::fs::read(dir.path().join("made-1.mcap")).unwrap();
+    assert_eq!(mcap::MessageStream::new(&bytes).unwrap().count() as u64, exported.messages);
 }
 
 #[test]

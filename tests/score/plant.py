@@ -85,7 +85,7 @@ WHOLE_FAULTS = [
     ('alpasim.rs', 'others.rs', 'sides.last().copied()', 'sides.first().copied()'),
     ('alpasim.rs', 'others.rs', 'if ego.front_line().touches(other)', 'if ego.rear_line().touches(other)'),
     ('alpasim.rs', 'others.rs', 'self != Self::Rear', 'self == Self::Front'),
-    ('alpasim.rs', 'others.rs', '(-decay * k as f64).exp()', '(-decay * (k * k) as f64).exp()'),
+    ('alpasim_plans.rs', 'others.rs', '(-decay * k as f64).exp()', '(-decay * (k * k) as f64).exp()'),
     ('alpasim_plans.rs', 'plans.rs', 'const DECAY: f64 = 0.1', 'const DECAY: f64 = 0.2'),
     ('alpasim_plans.rs', 'plans.rs', 'const HORIZON_US: i64 = 3_000_000', 'const HORIZON_US: i64 = 2_900_000'),
     ('alpasim_plans.rs', 'plans.rs', 'const HORIZON_US: i64 = 3_000_000', 'const HORIZON_US: i64 = 3_100_000'),
@@ -115,7 +115,7 @@ WHOLE_FAULTS = [
     ('alpasim_road.rs', 'plans.rs', 'lane.contains(center_m) && ', ''),
     ('alpasim_road.rs', 'plans.rs', 'if !inside.contains(&false)', 'if inside.contains(&true)'),
     ('alpasim_road.rs', 'plans.rs', 'turn_rad(0.0, yaw_rad)', 'yaw_rad'),
-    ('alpasim.rs', 'plans.rs', 'self.radius_m * (angle_rad', '0.0 * (angle_rad'),
+    ('alpasim_box.rs', 'plans.rs', 'self.radius_m * (angle_rad', '0.0 * (angle_rad'),
     ('alpasim.rs', 'plans.rs', 'record.dt_us * step as i64', 'record.dt_us * (step as i64 + 1)'),
     ('alpasim.rs', 'plans.rs', 'wrong || drive.wrong_lane == Some(true)', 'wrong'),
     ('map.rs', 'plans.rs', 'edges(&self.outline_m).any(on_edge) || self.contains(point_m)', 'self.outline_m.len() > 99'),
@@ -140,15 +140,15 @@ WHOLE_FAULTS = [
     ('bench2drive.rs', 'episodes.rs', '100.0 * mean(&ego_mps) / traffic', '100.0 * traffic / mean(&ego_mps)'),
     ('neuroncap.rs', 'episodes.rs', 'Ok(stars(impact_mps, reference_mps.unwrap_or(f64::INFINITY)))', 'Ok(stars(None, reference_mps.unwrap_or(f64::INFINITY)))'),
     ('alpasim.rs', 'episodes.rs', 'const CUT_M: f64 = 4.0', 'const CUT_M: f64 = 400.0'),
-    ('alpasim.rs', 'episodes.rs', 'const BOX_SHARE: f64 = 0.98', 'const BOX_SHARE: f64 = 1.0'),
-    ('alpasim.rs', 'episodes.rs', 'const CORNER_SHARE: f64 = 0.25', 'const CORNER_SHARE: f64 = 0.0'),
+    ('alpasim_box.rs', 'episodes.rs', 'const BOX_SHARE: f64 = 0.98', 'const BOX_SHARE: f64 = 1.0'),
+    ('alpasim_box.rs', 'episodes.rs', 'const CORNER_SHARE: f64 = 0.25', 'const CORNER_SHARE: f64 = 0.0'),
     ('record.rs', 'episodes.rs', 'let t = (time_us - before_us) as f64 / (after_us - before_us) as f64;', 'let t = 0.0;'),
     ('record.rs', 'episodes.rs', 'station_m - 5.0, station_m + 50.0', 'station_m - 5.0, station_m + 1e9'),
     ('polyline.rs', 'navsim.rs', 'let station_m = self.stations_m[k - 1] + ahead_m;', 'let station_m = self.stations_m[k - 1] + 0.9 * ahead_m;'),
     ('polyline.rs', 'navsim.rs', '(start + ahead_m * along).distance(point_m)', '(start + 0.5 * ahead_m * along).distance(point_m)'),
     ('map.rs', 'navsim.rs', 'lanes_with_corners > 1 && !one_holds_all', 'lanes_with_corners > 1'),
     ('map.rs', 'navsim.rs', 'in_any.contains(&false)', '!in_any.contains(&true)'),
-    ('map.rs', 'navsim.rs', '(across > 0.0) == (b.y > a.y)', '(across > 0.0) != (b.y > a.y)'),
+    ('map.rs', 'navsim.rs', '(across > 0.0) == (b.y > a.y)', 'across > 0.0'),
     ('map.rs', 'navsim.rs', 'lane.is_on_route || lane.is_intersection', 'true'),
     ('map.rs', 'navsim.rs', 'corner_inside || edge_touches', 'false'),
     ('savgol.rs', 'navsim.rs', 'let samples_before = if window.is_multiple_of(2) { half - 1 } else { half };', 'let samples_before = half;'),
@@ -173,7 +173,8 @@ def family(fault: Fault, tests: str) -> Copy:
     text = re.sub(rf"\bwildcity_score::{name}\b", "super::mutant", source(f"tests/score/{tests}"))
     of_family = "super::mutant as neuroncap" if name == "neuroncap" else "wildcity_score::neuroncap"
     text = text.replace(
-        "use wildcity_score::{EgoSample, neuroncap};", f"use wildcity_score::EgoSample;\nuse {of_family};"
+        "use wildcity_score::{EgoSample, alpasim_plans, neuroncap};",
+        f"use wildcity_score::{{EgoSample, alpasim_plans}};\nuse {of_family};",
     )
     text = re.sub(r"use super::mutant::\{\s*self, ", f"use super::mutant as {name};\nuse super::mutant::{{", text)
     return Copy(files, text)

@@ -11,12 +11,14 @@ use serde::Serialize;
 use super::ExportError;
 use super::convert::nanoseconds;
 use super::descriptors::descriptor_set;
+use super::output::{Failure, Output};
 
 /// Bytes of a chunk before compression: about a second of 30 actors at 10 Hz.
 const CHUNK_BYTES: u64 = 64 << 10;
 
 pub(super) struct McapFile<W: Write + Seek> {
-    writer: Writer<W>,
+    writer: Writer<Output<W>>,
+    failure: Failure,
     /// Channel of each topic.
     channels: BTreeMap<String, u16>,
     /// Schema of each name.
@@ -33,10 +35,12 @@ impl<W: Write + Seek> McapFile<W> {
             // Without threads of its own: a record is small.
             .compression_threads(0)
             .library(concat!("wildcity ", env!("CARGO_PKG_VERSION")));
+        let failure = Failure::default();
+        let writer = options.create(Output::new(out, failure.clone()))?;
         let descriptors = descriptor_set();
         let channels = BTreeMap::new();
         let schemas = BTreeMap::new();
-        Ok(Self { writer: options.create(out)?, channels, schemas, descriptors, messages: 0 })
+        Ok(Self { writer, failure, channels, schemas, descriptors, messages: 0 })
     }
 
     /// Writes a message of Foxglove's.
@@ -66,7 +70,13 @@ impl<W: Write + Seek> McapFile<W> {
     /// Writes the index. Returns the number of messages.
     pub(super) fn finish(mut self) -> Result<u64, ExportError> {
         self.writer.finish()?;
+        self.check()?;
         Ok(self.messages)
+    }
+
+    /// Ends the export after a failure of the output.
+    fn check(&self) -> Result<(), ExportError> {
+        self.failure.take().map_or(Ok(()), |cause| Err(ExportError::Output(cause)))
     }
 
     /// The channel of a topic, created with its first message.
@@ -101,6 +111,6 @@ impl<W: Write + Seek> McapFile<W> {
         let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
         self.writer.write_to_known_channel(&header, data)?;
         self.messages += 1;
-        Ok(())
+        self.check()
     }
 }

@@ -21,6 +21,7 @@ mod convert;
 mod descriptors;
 mod file;
 mod messages;
+mod output;
 mod parts;
 mod write;
 

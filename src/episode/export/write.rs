@@ -36,6 +36,9 @@ pub enum ExportError {
     },
     /// The file cannot be written.
     #[error("cannot write the MCAP file: {0}")]
+    Output(io::Error),
+    /// The file cannot be written.
+    #[error("cannot write the MCAP file: {0}")]
     Mcap(#[from] mcap::McapError),
     /// A line cannot be written as JSON.
     #[error("cannot write a line as JSON: {0}")]

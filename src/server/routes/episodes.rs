@@ -1,6 +1,6 @@
 //! Recorded episodes over HTTP.
 
-use std::path::{Path as FilePath, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use axum::extract::{Path, State};
@@ -8,7 +8,7 @@ use axum::http::header;
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
-use wildcity_episode::{EpisodeFile, list as list_dir, mcap_of, read_text};
+use wildcity_episode::{EpisodeFile, list as list_dir, read_mcap, read_text};
 use wildcity_scene::rig::is_name;
 
 use crate::auth::{Grant, Role};
@@ -71,8 +71,8 @@ pub(super) async fn mcap(
     let record = blocking(move || record_of(&checked, &grant, &its_name)).await?;
     let is_over = state.engine.wait_for_exports(Some(name.clone()), limits::MCAP_WAIT).await;
     let bytes = blocking(move || {
-        if let Some(bytes) = read_mcap(&mcap_of(&record))? {
-            return Ok(bytes);
+        if let Ok(bytes) = read_mcap(&record, limits::EPISODE_BYTES) {
+            return bytes.ok_or_else(too_large);
         }
         let reason = match state.engine.export_failure(&name) {
             Some(reason) => reason,
@@ -97,18 +97,6 @@ fn record_of(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf, 
     let file = EpisodeFile::read(&path).map_err(|_| unknown())?;
     grant.require_twin(&file.header.twin)?;
     Ok(path)
-}
-
-/// An MCAP file; none if there is no such file.
-fn read_mcap(path: &FilePath) -> Result<Option<Vec<u8>>, Fault> {
-    let Ok(metadata) = std::fs::metadata(path) else { return Ok(None) };
-    if !metadata.is_file() {
-        return Ok(None);
-    }
-    if metadata.len() > limits::EPISODE_BYTES {
-        return Err(too_large());
-    }
-    Ok(std::fs::read(path).ok())
 }
 
 fn too_large() -> Fault {

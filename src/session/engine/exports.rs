@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use parking_lot::{Condvar, Mutex};
 
-use wildcity_episode::{EpisodeFile, export_file, mcap_of};
+use wildcity_episode::{EpisodeFile, export_file, mcap_of, record_bytes};
 
 use crate::error::SessionError;
 use crate::limits;
@@ -118,7 +118,7 @@ impl State {
 }
 
 fn export(record: &Path) -> Result<(), String> {
-    let bytes = std::fs::metadata(record).map_or(0, |metadata| metadata.len());
+    let bytes = record_bytes(record);
     if bytes > limits::EXPORTED_RECORD_BYTES {
         let most = limits::EXPORTED_RECORD_BYTES;
         return Err(format!(
