@@ -466,6 +466,12 @@ pub struct EpisodeInfo {
     pub time_us: i64,
     /// Size of the record, in bytes.
     pub bytes: u64,
+    /// Size of the MCAP file of the record, in bytes; absent without one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mcap_bytes: Option<u64>,
+    /// Why there is no MCAP file, if its export failed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mcap_error: Option<String>,
     /// When the record was last written, in microseconds since 1970.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub modified_us: Option<u64>,

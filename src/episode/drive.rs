@@ -6,13 +6,13 @@ use glam::{DVec2, DVec3};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_score::{
-    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
-    Track, TrackSample,
+    DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Plan, PlannedPose, Polyline, ReferenceDrive,
+    StaticContact, Track, TrackSample,
 };
 use wildcity_sim::contact::Body;
 use wildcity_sim::ego::EgoModel;
 
-use crate::file::EpisodeFile;
+use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, Event, ScenarioLine};
 
 /// The numbers of an episode that scores are made of; `None` if it has no frame, or if a request followed a plan for
@@ -44,9 +44,10 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
             width_m: scenario.ego.size[1],
             center_x_m: scenario.ego.center_x,
         }),
-        ego: samples(&poses, episode.header.dt_us as f64 * 1e-6),
+        ego: ego_samples(&poses, episode.header.dt_us as f64 * 1e-6),
         is_driven: episode.header.dynamics.model != EgoModel::Teleport,
         tracks: scenario.map(|scenario| tracks(scenario, &episode.actors, &steps)),
+        plans: plans(&frames),
         contacts: contacts.collect(),
         static_contacts: checks_static.then(|| with_twin.collect()),
         reference: scenario.and_then(reference),
@@ -67,7 +68,7 @@ pub fn off_model_us(episode: &EpisodeFile) -> Option<i64> {
 }
 
 /// The ego from its poses: velocities and accelerations are differences over two steps, at the ends over one.
-fn samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
+pub(crate) fn ego_samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
     let places: Vec<DVec2> = poses.iter().map(|pose| pose.position_m.truncate()).collect();
     let mut turned = 0.0;
     let mut before: Option<f64> = None;
@@ -116,6 +117,27 @@ where
     (0..values.len()).map(slope).collect()
 }
 
+/// The plans of the agent, each decided at the frame before the one that its step ends with.
+fn plans(frames: &[&Frame]) -> Vec<Plan> {
+    let Some(begin_us) = frames.first().map(|first| first.time_us) else { return Vec::new() };
+    let of_pair = |pair: &[&Frame]| {
+        let decided_us = pair[0].time_us - begin_us;
+        let world_from_start = pair[0].poses.last()?;
+        let own = std::iter::once((0, Pose::IDENTITY)).chain(pair[1].plan()?);
+        let poses = own.map(|(time_us, start_from_rig)| {
+            let world_from_rig = *world_from_start * start_from_rig;
+            let forward = world_from_rig.rotation * DVec3::X;
+            PlannedPose {
+                time_us: decided_us + time_us,
+                origin_m: world_from_rig.position_m.truncate(),
+                yaw_rad: forward.y.atan2(forward.x),
+            }
+        });
+        Plan::new(poses.collect())
+    };
+    frames.windows(2).filter_map(of_pair).collect()
+}
+
 fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<Track> {
     // Where a session went back, and in a warm-up, the last line of a step holds.
     let of_step: BTreeMap<u64, &ActorsLine> = lines.iter().map(|line| (line.step, line)).collect();
@@ -157,6 +179,7 @@ fn lanes(scenario: &ScenarioLine) -> Option<LaneMap> {
     }
     let centerline = reference(scenario)?.line;
     let lanes = scenario.lanes.iter().map(|lane| Lane {
+        center: Polyline::new(lane.center.iter().map(|&point| DVec2::from_array(point)).collect()),
         outline_m: lane.outline.iter().map(|&point| DVec2::from_array(point)).collect(),
         is_on_route: lane.route,
         is_intersection: lane.intersection,

@@ -170,6 +170,19 @@ enum Line {
     Other,
 }
 
+impl Frame {
+    /// The agent's plan, if that was its command: times in microseconds since the begin of the step, and poses in the
+    /// rig's frame of then.
+    pub fn plan(&self) -> Option<Vec<(i64, Pose)>> {
+        let poses = self.command.as_ref()?.get("trajectory")?.as_array()?;
+        let read = |value: &serde_json::Value| {
+            let pose = Pose::deserialize(value.get("start_from_rig")?).ok()?;
+            Some((value.get("time_us")?.as_i64()?, pose))
+        };
+        poses.iter().map(read).collect()
+    }
+}
+
 impl EpisodeFile {
     /// The format that this build reads.
     pub const FORMAT: u32 = 0;

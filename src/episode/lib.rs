@@ -27,12 +27,14 @@ mod scenario;
 
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
-pub use export::{ExportError, Exported, export};
+pub use export::{
+    EpisodeExport, ExportError, Exported, ExportedImage, export, export_file, mcap_of, write_whole,
+};
 pub use file::{CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead};
 pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,
 };
-pub use listing::{Listed, list, read_text};
+pub use listing::{Listed, list, read_mcap, read_text, record_bytes};
 pub use outcome::result;
 pub use scenario::{DriveStart, pose_at, scenario_line};

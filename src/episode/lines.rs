@@ -81,6 +81,9 @@ pub struct RoutePoint(pub i64, pub [f64; 3]);
 pub struct LaneLine {
     /// Its outline, in metres, without repeating the first point.
     pub outline: Vec<[f64; 2]>,
+    /// Its middle, in driving direction, in metres; none of an area.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub center: Vec<[f64; 2]>,
     /// Whether it belongs to the route.
     #[serde(default)]
     pub route: bool,

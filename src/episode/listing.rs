@@ -5,6 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::export::mcap_of;
 use crate::limits;
 
 /// A file of an episode.
@@ -16,6 +17,8 @@ pub struct Listed {
     pub path: PathBuf,
     /// Its size, in bytes.
     pub bytes: u64,
+    /// Size of the MCAP file beside it, in bytes; none without one.
+    pub mcap_bytes: Option<u64>,
     /// When it was last written.
     pub modified: Option<SystemTime>,
 }
@@ -42,6 +45,10 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
         listed.push(Listed {
             name: name.unwrap_or_default(),
             bytes: metadata.len(),
+            mcap_bytes: fs::metadata(mcap_of(&path))
+                .ok()
+                .filter(fs::Metadata::is_file)
+                .map(|mcap| mcap.len()),
             modified: metadata.modified().ok(),
             path,
         });
@@ -49,6 +56,23 @@ pub fn list(dir: &Path) -> io::Result<Vec<Listed>> {
     listed.sort_by(|a, b| b.modified.cmp(&a.modified).then_with(|| a.name.cmp(&b.name)));
     listed.truncate(limits::LISTED);
     Ok(listed)
+}
+
+/// The size of a record, in bytes; 0 if it cannot be read.
+pub fn record_bytes(record: &Path) -> u64 {
+    fs::metadata(record).map_or(0, |metadata| metadata.len())
+}
+
+/// The MCAP file beside a record; none if it has more than `most` bytes.
+///
+/// # Errors
+/// There is no such file, or it cannot be read.
+pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
+    let path = mcap_of(record);
+    match fs::metadata(&path)?.len() > most {
+        true => Ok(None),
+        false => fs::read(path).map(Some),
+    }
 }
 
 /// The text of an episode's file; none if it has more than `most` bytes. An incomplete last line, which a session may be

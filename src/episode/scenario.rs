@@ -135,7 +135,9 @@ fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
             let place_m = glam::DVec2::new(point.1[0], point.1[1]);
             map.lanes_at(place_m).any(|at| at == index)
         };
-        LaneLine { outline, route: route.iter().any(is_on), intersection: lane.intersection }
+        let center = lane.center.iter().map(flat).collect();
+        let route = route.iter().any(is_on);
+        LaneLine { outline, center, route, intersection: lane.intersection }
     });
     let of_areas = file.areas.iter().filter_map(|area| {
         let intersection = match area.kind {
@@ -144,7 +146,7 @@ fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
             _ => return None,
         };
         let outline = area.outline.iter().map(flat).collect();
-        Some(LaneLine { outline, route: false, intersection })
+        Some(LaneLine { outline, center: Vec::new(), route: false, intersection })
     });
     of_lanes.chain(of_areas).filter(|lane| near(&lane.outline)).collect()
 }

@@ -1,15 +1,22 @@
-//! AlpaSim's scene score, with its faults.
+//! AlpaSim's scene score, with its faults; `alpasim_plans` and `alpasim_road` have its other scores.
 //!
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/aggregation/scene_score.py`, `scorers/collision.py`,
 //! `scorers/plan_deviation.py`.
 
 use wildcity_sim::contact::Footprint;
 
-use super::record::{DriveRecord, EgoSample, EgoShape};
-use super::scored::{Measured, Missing, Score};
+use super::alpasim_box::RoundedBox;
+use super::alpasim_plans;
+use super::alpasim_road::{is_in_wrong_lane, is_off_road};
+use super::record::DriveRecord;
+use super::scored::{Missing, Score};
 
-/// The name of the score.
+/// The names of the scores of the scene and the road.
 pub const NAME: &str = "alpasim.scene@3032e0c";
+/// 1 if the ego was off the road.
+pub const OFF_ROAD: &str = "alpasim.offroad@3032e0c";
+/// 1 if the ego was in a lane of another direction.
+pub const WRONG_LANE: &str = "alpasim.wrong_lane@3032e0c";
 
 /// Progress at which the score saturates.
 const FULL_PROGRESS: f64 = 0.8;
@@ -17,10 +24,6 @@ const FULL_PROGRESS: f64 = 0.8;
 const SHORT_RECORDING_M: f64 = 5.0;
 /// The episode is cut where the ego is farther from the recorded drive, in metres.
 const CUT_M: f64 = 4.0;
-/// Share of the rig's box that is tested.
-const BOX_SHARE: f64 = 0.98;
-/// Radius of its corners, as a share of the lesser side.
-const CORNER_SHARE: f64 = 0.25;
 
 /// Which side of the ego was hit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,6 +54,14 @@ pub fn side(ego: &Footprint, other: &Footprint) -> Option<Side> {
         return Some(Side::Front);
     }
     Some(if ego.rear_line().touches(other) { Side::Rear } else { Side::Lateral })
+}
+
+/// The side of the rounded ego that another box touches.
+fn side_of(ego: &RoundedBox, other: &Footprint) -> Option<Side> {
+    if ego.distance_m(other) > 0.0 {
+        return None;
+    }
+    side(ego.outline(), other)
 }
 
 impl Side {
@@ -98,91 +109,86 @@ pub fn scene_score(rollout: &Rollout) -> f64 {
     (rollout.progress.clamp(0.0, 1.0) / FULL_PROGRESS).min(1.0)
 }
 
-/// The mean of distances between successive plans, weighted by exp(-decay k); `None` of none.
-pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
-    let weight = |k: usize| (-decay * k as f64).exp();
-    let sum: f64 =
-        distances_m.iter().enumerate().map(|(k, distance_m)| weight(k) * distance_m).sum();
-    let weights: f64 = (0..distances_m.len()).map(weight).sum();
-    (weights > 0.0).then(|| sum / weights)
+/// All of AlpaSim's scores of an episode.
+pub fn scores(record: &DriveRecord) -> Vec<Score> {
+    let drive = Drive::of(record);
+    let cut_us = drive.as_ref().map(|drive| drive.cut_us).map_err(Clone::clone);
+    let mut scores = vec![scene(&drive), off_road(record, &drive), wrong_lane(record, &drive)];
+    scores.extend(alpasim_plans::scores(record, &cut_us));
+    scores
 }
 
-/// The scene score of an episode. Without a map off-road counts as 0, as AlpaSim fills it in.
-pub fn scene(record: &DriveRecord) -> Score {
-    let rollout = rollout(record);
-    let value: Measured =
-        rollout.as_ref().map(|(rollout, _)| scene_score(rollout)).map_err(Clone::clone);
-    let part = |value: &dyn Fn(&Rollout) -> f64| rollout.as_ref().ok().map(|(r, _)| value(r));
+/// An episode up to where it is cut: after a collision, off the road, or too far off the recorded drive.
+struct Drive {
+    rollout: Rollout,
+    least_gap_m: Option<f64>,
+    /// Whether the ego was in a lane of another direction; `None` if the lanes have none.
+    wrong_lane: Option<bool>,
+    /// The time of the last sample that counts, in microseconds.
+    cut_us: i64,
+}
+
+impl Drive {
+    fn of(record: &DriveRecord) -> Result<Self, Missing> {
+        let tracks =
+            record.tracks.as_ref().ok_or(Missing::new("needs the actors of a scenario"))?;
+        let shape = record.shape.ok_or(Missing::new("needs the size of the ego"))?;
+        let no_drive = Missing::new("needs the recorded drive");
+        let stations_m = record.stations_m().ok_or(no_drive.clone())?;
+        let recorded_m = record.recorded_way_m().ok_or(no_drive)?;
+        let rollout =
+            Rollout { progress: 0.0, recorded_m, collision_at_fault: false, offroad: false };
+        let mut drive = Self { rollout, least_gap_m: None, wrong_lane: None, cut_us: 0 };
+        for (step, (sample, (station_m, off_m))) in record.ego.iter().zip(stations_m).enumerate() {
+            let ego = RoundedBox::of(&shape, sample);
+            let others =
+                tracks.iter().filter_map(|track| track.samples.get(step).copied().flatten());
+            let others: Vec<Footprint> = others.map(|other| other.footprint).collect();
+            let sides: Vec<Side> = others.iter().filter_map(|other| side_of(&ego, other)).collect();
+            let gaps_m = others.iter().map(|other| ego.distance_m(other));
+            drive.least_gap_m = gaps_m.chain(drive.least_gap_m).reduce(f64::min);
+            let map = record.map.as_ref();
+            let off_road = map.is_some_and(|map| is_off_road(map, &ego));
+            let wrong = map.and_then(|map| is_in_wrong_lane(map, ego.center_m(), sample.yaw_rad));
+            drive.wrong_lane = wrong.map(|wrong| wrong || drive.wrong_lane == Some(true));
+            let rollout = &mut drive.rollout;
+            rollout.progress = (station_m / recorded_m.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
+            rollout.collision_at_fault |= Collision::of(&sides).is_at_fault();
+            rollout.offroad |= off_road;
+            drive.cut_us = record.dt_us * step as i64;
+            if !sides.is_empty() || off_road || off_m > CUT_M {
+                break;
+            }
+        }
+        Ok(drive)
+    }
+}
+
+/// Without a map off-road counts as 0, as AlpaSim fills it in.
+fn scene(drive: &Result<Drive, Missing>) -> Score {
+    let value = drive.as_ref().map(|drive| scene_score(&drive.rollout)).map_err(Clone::clone);
+    let part = |value: &dyn Fn(&Rollout) -> f64| Some(value(&drive.as_ref().ok()?.rollout));
     let parts = [
         ("progress_clipped_rel", part(&|rollout| rollout.progress)),
         ("gt_dist_traveled_m", part(&|rollout| rollout.recorded_m)),
         ("collision_at_fault", part(&|rollout| f64::from(u8::from(rollout.collision_at_fault)))),
         ("offroad", part(&|rollout| f64::from(u8::from(rollout.offroad)))),
-        ("least_gap_m", rollout.as_ref().ok().and_then(|(_, least_gap_m)| *least_gap_m)),
+        ("least_gap_m", drive.as_ref().ok().and_then(|drive| drive.least_gap_m)),
     ];
     Score::new(NAME, value, parts)
 }
 
-fn rollout(record: &DriveRecord) -> Result<(Rollout, Option<f64>), Missing> {
-    let tracks = record.tracks.as_ref().ok_or(Missing::new("needs the actors of a scenario"))?;
-    let shape = record.shape.ok_or(Missing::new("needs the size of the ego"))?;
-    let stations_m = record.stations_m().ok_or(Missing::new("needs the recorded drive"))?;
-    let recorded_m = record.recorded_way_m().ok_or(Missing::new("needs the recorded drive"))?;
-    let mut rollout =
-        Rollout { progress: 0.0, recorded_m, collision_at_fault: false, offroad: false };
-    let mut least_gap_m: Option<f64> = None;
-    for (step, (sample, (station_m, off_m))) in record.ego.iter().zip(stations_m).enumerate() {
-        let ego = RoundedBox::of(&shape, sample);
-        let others = tracks.iter().filter_map(|track| track.samples.get(step).copied().flatten());
-        let others: Vec<Footprint> = others.map(|other| other.footprint).collect();
-        let sides: Vec<Side> = others.iter().filter_map(|other| ego.side(other)).collect();
-        let gaps_m = others.iter().map(|other| ego.distance_m(other));
-        least_gap_m = gaps_m.chain(least_gap_m).reduce(f64::min);
-        let off_road = record
-            .map
-            .as_ref()
-            .is_some_and(|map| map.position(&shape.footprint(sample)).off_drivable);
-        rollout.progress = (station_m / recorded_m.max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-        rollout.collision_at_fault |= Collision::of(&sides).is_at_fault();
-        rollout.offroad |= off_road;
-        if !sides.is_empty() || off_road || off_m > CUT_M {
-            break;
-        }
-    }
-    Ok((rollout, least_gap_m))
+fn off_road(record: &DriveRecord, drive: &Result<Drive, Missing>) -> Score {
+    let map = record.map.as_ref().ok_or(Missing::new("needs a map of the lanes"));
+    let value = map.and_then(|_| Ok(drive.as_ref().map_err(Clone::clone)?.rollout.offroad));
+    Score::new(OFF_ROAD, value.map(|off| f64::from(u8::from(off))), [])
 }
 
-/// The ego as AlpaSim tests it: 2 % smaller, with rounded corners.
-struct RoundedBox {
-    outline: Footprint,
-    /// The box whose points are all within `radius_m` of the rounded one.
-    core: Footprint,
-    radius_m: f64,
-}
-
-impl RoundedBox {
-    fn of(shape: &EgoShape, sample: &EgoSample) -> Self {
-        let full = shape.footprint(sample);
-        let length_m = BOX_SHARE * full.length_m;
-        let width_m = BOX_SHARE * full.width_m;
-        let radius_m = CORNER_SHARE * length_m.min(width_m);
-        let outline = Footprint { length_m, width_m, ..full };
-        let core = Footprint {
-            length_m: length_m - 2.0 * radius_m,
-            width_m: width_m - 2.0 * radius_m,
-            ..full
-        };
-        Self { outline, core, radius_m }
-    }
-
-    fn distance_m(&self, other: &Footprint) -> f64 {
-        (self.core.distance_m(other) - self.radius_m).max(0.0)
-    }
-
-    fn side(&self, other: &Footprint) -> Option<Side> {
-        if self.distance_m(other) > 0.0 {
-            return None;
-        }
-        side(&self.outline, other)
-    }
+fn wrong_lane(record: &DriveRecord, drive: &Result<Drive, Missing>) -> Score {
+    let map = record.map.as_ref().ok_or(Missing::new("needs a map of the lanes"));
+    let value = map.and_then(|_| {
+        let wrong = drive.as_ref().map_err(Clone::clone)?.wrong_lane;
+        wrong.ok_or(Missing::new("needs the middles of the lanes, which this record lacks"))
+    });
+    Score::new(WRONG_LANE, value.map(|wrong| f64::from(u8::from(wrong))), [])
 }

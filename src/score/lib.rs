@@ -6,25 +6,29 @@
 //!
 //! | module | source |
 //! |---|---|
-//! | [`alpasim`] | NVlabs/alpasim 3032e0c |
+//! | [`alpasim`], [`alpasim_plans`], [`alpasim_road`] | NVlabs/alpasim 3032e0c |
 //! | [`navsim`] | autonomousvision/navsim 0a380a9, motional/nuplan-devkit e924167 |
 //! | [`hugsim`] | hyzhou404/HUGSIM 62c690d |
 //! | [`neuroncap`] | atonderski/neuro-ncap ecdcf28 |
 //! | [`bench2drive`] | Thinklab-SJTU/Bench2Drive 7ec25d1 |
 //! | [`own`] | the verdict of this project |
 //! | [`statistics`] | rates and means over many episodes, with their confidence intervals |
-//! | `record` | what an episode is to a score |
+//! | `record`, `plan` | what an episode is to a score |
 //! | `map`, `polyline` | lanes and lines on the ground |
 //! | `savgol` | the Savitzky-Golay filter of the comfort scores |
 
 mod all;
 pub mod alpasim;
+mod alpasim_box;
+pub mod alpasim_plans;
+pub mod alpasim_road;
 pub mod bench2drive;
 pub mod hugsim;
 mod map;
 pub mod navsim;
 pub mod neuroncap;
 pub mod own;
+mod plan;
 mod polyline;
 mod record;
 mod savgol;
@@ -32,7 +36,9 @@ mod scored;
 pub mod statistics;
 
 pub use all::score;
+pub use alpasim_box::RoundedBox;
 pub use map::{Lane, LaneMap, RedArea};
+pub use plan::{Plan, PlannedPose};
 pub use polyline::Polyline;
 pub use record::{
     DriveRecord, EgoSample, EgoShape, ReferenceDrive, StaticContact, Track, TrackSample,

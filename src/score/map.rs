@@ -11,6 +11,8 @@ use super::polyline::Polyline;
 pub struct Lane {
     /// Its outline, without repeating the first point. An open set: what lies on the outline is not in it.
     pub outline_m: Vec<DVec2>,
+    /// Its middle, in driving direction; `None` of an area, and if the record does not have it.
+    pub center: Option<Polyline>,
     /// Whether it belongs to the ego's route.
     pub is_on_route: bool,
     /// Whether it is an intersection.
@@ -41,6 +43,17 @@ impl Lane {
     /// Whether a point lies within the lane.
     pub fn contains(&self, point_m: DVec2) -> bool {
         contains(&self.outline_m, point_m)
+    }
+
+    /// Whether a point lies within the lane or on its outline.
+    pub(crate) fn holds(&self, point_m: DVec2) -> bool {
+        let on_edge = |(a, b)| is_on_edge(a, b, point_m);
+        edges(&self.outline_m).any(on_edge) || self.contains(point_m)
+    }
+
+    /// The edges of its outline, as boxes without width.
+    pub(crate) fn edges(&self) -> impl Iterator<Item = Footprint> {
+        edges(&self.outline_m).map(|(a, b)| edge(a, b))
     }
 }
 
@@ -88,11 +101,10 @@ impl LaneMap {
 fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
     let mut inside = false;
     for (a, b) in edges(outline_m) {
-        let across = (b - a).perp_dot(point_m - a);
-        let beside = (point_m - a).dot(point_m - b);
-        if across == 0.0 && beside <= 0.0 {
+        if is_on_edge(a, b, point_m) {
             return false;
         }
+        let across = (b - a).perp_dot(point_m - a);
         let crosses = (a.y > point_m.y) != (b.y > point_m.y);
         if crosses && (across > 0.0) == (b.y > a.y) {
             inside = !inside;
@@ -104,17 +116,25 @@ fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
 /// Whether a box and an outline have a point in common; both are closed sets.
 fn touches(outline_m: &[DVec2], ego: &Footprint) -> bool {
     let corner_inside = ego.corners_m().into_iter().any(|corner| contains(outline_m, corner));
-    let edge_touches = edges(outline_m).any(|(a, b)| {
-        let way = b - a;
-        let edge = Footprint {
-            center_m: 0.5 * (a + b),
-            forward: way.try_normalize().unwrap_or(DVec2::X),
-            length_m: way.length(),
-            width_m: 0.0,
-        };
-        ego.touches(&edge)
-    });
+    let edge_touches = edges(outline_m).any(|(a, b)| ego.touches(&edge(a, b)));
     corner_inside || edge_touches
+}
+
+fn is_on_edge(a: DVec2, b: DVec2, point_m: DVec2) -> bool {
+    let across = (b - a).perp_dot(point_m - a);
+    let beside = (point_m - a).dot(point_m - b);
+    across == 0.0 && beside <= 0.0
+}
+
+/// An edge as a box without width.
+fn edge(a: DVec2, b: DVec2) -> Footprint {
+    let way = b - a;
+    Footprint {
+        center_m: 0.5 * (a + b),
+        forward: way.try_normalize().unwrap_or(DVec2::X),
+        length_m: way.length(),
+        width_m: 0.0,
+    }
 }
 
 fn edges(outline_m: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {

@@ -52,6 +52,25 @@ impl Polyline {
         self.stations_m[self.stations_m.len() - 1]
     }
 
+    /// The point at a station, and the unit vector along the line there; at its ends beyond them. The vector is zero on
+    /// a line of one point.
+    pub fn at(&self, station_m: f64) -> (DVec2, DVec2) {
+        let last = self.points_m.len() - 1;
+        let after =
+            self.stations_m.partition_point(|&at_m| at_m < station_m).clamp(1.min(last), last);
+        // Points that coincide have no direction between them: that of the next ones holds, or of those before.
+        let differs = |k: &usize| self.stations_m[*k] > self.stations_m[*k - 1];
+        let onward = (after.max(1)..=last).find(differs);
+        let Some(to) = onward.or_else(|| (1..=after).rev().find(differs)) else {
+            return (self.points_m[0], DVec2::ZERO);
+        };
+        let from = to - 1;
+        let length_m = self.stations_m[to] - self.stations_m[from];
+        let t = ((station_m - self.stations_m[from]) / length_m).clamp(0.0, 1.0);
+        let [a, b] = [self.points_m[from], self.points_m[to]];
+        (a.lerp(b, t), (b - a) / length_m)
+    }
+
     /// The nearest point of the line.
     pub fn project(&self, point_m: DVec2) -> Projection {
         self.project_between(point_m, f64::NEG_INFINITY, f64::INFINITY)

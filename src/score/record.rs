@@ -6,6 +6,7 @@ use wildcity_scene::ActorClass;
 use wildcity_sim::contact::{Contact, Footprint};
 
 use super::map::LaneMap;
+use super::plan::Plan;
 use super::polyline::Polyline;
 
 /// The size of the ego, and where its reference point is.
@@ -87,6 +88,8 @@ pub struct DriveRecord {
     pub is_driven: bool,
     /// The actors; `None` for an episode without a scenario, which says nothing of what was around.
     pub tracks: Option<Vec<Track>>,
+    /// The agent's plans, in order of their decisions; none if it sent actions or poses.
+    pub plans: Vec<Plan>,
     /// Contacts with actors, in order.
     pub contacts: Vec<Contact>,
     /// Contacts with the twin; `None` if they were not looked for.

@@ -48,6 +48,8 @@ pub struct Config {
     pub tls: Option<TlsFiles>,
     /// File of the audit log; without it there is none.
     pub audit: Option<PathBuf>,
+    /// Whether an episode that ends becomes an MCAP file beside its record.
+    pub mcap: bool,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
     /// The models that can repair images, by name. Each is loaded when a session asks for it.
@@ -72,6 +74,7 @@ impl Config {
             origins: Origins::default(),
             tls: None,
             audit: None,
+            mcap: true,
             backend,
             repairs: Arc::default(),
             profile: ProfileOverrides::default(),
@@ -184,6 +187,7 @@ impl std::fmt::Debug for Config {
             origins,
             tls,
             audit,
+            mcap,
             backend,
             repairs,
             profile,
@@ -198,6 +202,7 @@ impl std::fmt::Debug for Config {
             .field("origins", origins)
             .field("tls", tls)
             .field("audit", audit)
+            .field("mcap", mcap)
             .field("backend", &backend.name())
             .field("repairs", &repairs.names().collect::<Vec<_>>())
             .field("profile", profile)

@@ -214,6 +214,16 @@ pub(crate) enum Fault {
         /// The name asked for.
         name: String,
     },
+    /// The episode has no MCAP file.
+    #[error(
+        "episode {name:?} has no MCAP file: {reason}; `wildcity episode export {name}` makes one of its record"
+    )]
+    NoMcap {
+        /// The name of the episode.
+        name: String,
+        /// Why.
+        reason: String,
+    },
     /// The token's role or twins do not allow the request.
     #[error("this token may not do that: {reason}")]
     Forbidden {

@@ -114,8 +114,12 @@ pub const WATCH_PERIOD: Duration = Duration::from_millis(100);
 /// Recorded episodes that are listed over HTTP: each file is read for it.
 pub const LISTED_EPISODES: usize = 100;
 
-/// Largest file of an episode that is sent over HTTP: an hour at 10 Hz with six cameras has 30 MB.
+/// Largest file of an episode that is sent over HTTP, as JSONL or MCAP: an hour at 10 Hz with six cameras has 30 MB as
+/// JSONL.
 pub const EPISODE_BYTES: u64 = 64 << 20;
+
+/// How long a request for the MCAP file of an episode that just ended waits for it.
+pub const MCAP_WAIT: Duration = Duration::from_secs(20);
 
 // A client accepts every answer of a session, and waits for it long enough.
 const _: () = {

@@ -105,7 +105,7 @@ impl Running {
     }
 
     /// Stops accepting connections, lets running steps finish, notifies every client, and ends every
-    /// session.
+    /// session. What is being exported is finished.
     pub async fn stop(self) {
         // An error means that no task waits for the signal any more.
         let _ = self.stop.send(true);
@@ -119,6 +119,12 @@ impl Running {
             tracing::warn!("some clients did not leave within {:?}", limits.drain);
         }
         sessions.end_all_parked().await;
+        if !self.state.engine.wait_for_exports(None, limits.drain).await {
+            tracing::warn!(
+                "MCAP files of some episodes were not written within {:?}",
+                limits.drain
+            );
+        }
     }
 }
 

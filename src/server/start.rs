@@ -88,6 +88,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         origins,
         tls,
         audit,
+        mcap,
         backend,
         repairs,
         profile,
@@ -113,6 +114,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         backend,
         step_timeout: limits.step,
         repairs,
+        mcap,
     })?;
 
     // The socket.

@@ -180,8 +180,8 @@ pub enum SessionError {
     /// A bug of the program: a worker thread panicked.
     #[error("a worker thread of the server crashed; see the server's log")]
     Crashed,
-    /// A render thread could not be started.
-    #[error("cannot start a render thread: {reason}")]
+    /// A thread could not be started.
+    #[error("cannot start a thread: {reason}")]
     Thread {
         /// What the operating system says.
         reason: String,

@@ -12,6 +12,17 @@ pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
 /// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
 pub const ACTOR_HEADER_BYTES: usize = 640;
 
+/// Most episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work. What comes on top is not exported, and
+/// the listing says so.
+pub const WAITING_EXPORTS: usize = 1024;
+
+/// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times its size. A day at
+/// 10 Hz has 720 MB; `wildcity episode export` reads it.
+pub const EXPORTED_RECORD_BYTES: u64 = 256 << 20;
+
+/// Episodes whose failed export is remembered: more than a listing has.
+pub const FAILED_EXPORTS: usize = 1024;
+
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 

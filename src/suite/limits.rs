@@ -23,6 +23,9 @@ pub const AGENT_POLL: Duration = Duration::from_millis(20);
 /// How long the server waits for the connection of an agent to close after its command has ended.
 pub const CLOSE_WAIT: Duration = Duration::from_secs(5);
 
+/// How long a run waits at its end for the MCAP files of its episodes.
+pub const EXPORT_WAIT: Duration = Duration::from_secs(60);
+
 /// Share of episodes that may end off the model.
 pub const OFF_MODEL_SHARE: f64 = 0.1;
 

@@ -1,13 +1,15 @@
 //! The result of a run, `result.json`.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use serde::Serialize;
 use serde_json::Value;
 
-use wildcity_episode::{FaultLine, ScoreLine};
+use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
 use wildcity_score::own;
 use wildcity_score::statistics::{Mean, wilson};
+use wildcity_session::Engine;
 
 use crate::case::Case;
 use crate::finish::Finished;
@@ -115,6 +117,12 @@ pub struct EpisodeEntry {
     pub frames_hash: String,
     /// The file of its record, below `episodes`; empty if nothing was driven.
     pub record: String,
+    /// The MCAP file of its record, below `episodes`; absent if there is none.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub mcap: String,
+    /// Why there is no MCAP file; absent if there is one, or none was asked for.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub mcap_error: String,
     /// Technical failures, of every attempt.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub errors: Vec<TechnicalEntry>,
@@ -275,6 +283,8 @@ impl EpisodeEntry {
             distance_m: 0.0,
             frames_hash: String::new(),
             record: String::new(),
+            mcap: String::new(),
+            mcap_error: String::new(),
             errors: errors.collect(),
         };
         if let Some(Finished { record, end, result, frames_hash }) = finished {
@@ -297,6 +307,19 @@ impl EpisodeEntry {
 }
 
 impl EpisodeEntry {
+    /// Says where the MCAP file of the record is, or why there is none.
+    pub(crate) fn add_mcap(&mut self, episodes: &Path, engine: &Engine) {
+        if self.record.is_empty() {
+            return;
+        }
+        let mcap = mcap_of(Path::new(&self.record));
+        match engine.export_failure(&EpisodeFile::name_of(&mcap)) {
+            Some(reason) => self.mcap_error = reason,
+            None if episodes.join(&mcap).is_file() => self.mcap = mcap.display().to_string(),
+            None => self.mcap_error = "it was not ready at the end of the run".to_owned(),
+        }
+    }
+
     /// The faults in words, by time: `contact.pedestrian with walker at 4.615 s`.
     pub(crate) fn fault_texts(&self) -> Vec<String> {
         self.faults.iter().map(|fault| self.fault_text(fault)).collect()

@@ -64,6 +64,8 @@ pub struct RunSettings {
     pub backend: Arc<dyn Backend>,
     /// Where the episodes are recorded; must be empty.
     pub episodes: PathBuf,
+    /// Whether each record also becomes an MCAP file.
+    pub mcap: bool,
     /// Called after each episode.
     pub progress: Box<dyn Fn(&EpisodeEntry) + Send + Sync>,
 }
@@ -137,7 +139,13 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         entries.push(entry.map_err(|error| SuiteError::Task(error.to_string()))?);
     }
     if let Some(mut shared) = Arc::into_inner(shared) {
+        let engine = shared.host.engine();
+        // The server ends the sessions of agents that went away.
         shared.host.stop().await;
+        if let Some(engine) = engine {
+            engine.wait_for_exports(None, limits::EXPORT_WAIT).await;
+            entries.iter_mut().for_each(|entry| entry.add_mcap(&shared.episodes, &engine));
+        }
     }
     entries.sort_by(|a, b| a.name.cmp(&b.name));
     Ok(SuiteResult::new(settings.suite, agent_name, settings.latest, settings.at_least, entries))
@@ -161,6 +169,7 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
         repairs: Arc::default(),
+        mcap: settings.mcap,
     })?)
 }
 
@@ -173,6 +182,7 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
     };
     let config = Config {
         cache: settings.cache.clone(),
+        mcap: settings.mcap,
         ..Config::local(directories, settings.backend.clone())
     };
     let running = wildcity_server::start(config).await?;
@@ -181,6 +191,15 @@ async fn server(settings: &RunSettings) -> Result<Host, SuiteError> {
 }
 
 impl Host {
+    /// The engine that writes MCAP files; none if it does not.
+    fn engine(&self) -> Option<Arc<Engine>> {
+        let engine = match self {
+            Self::Engine(engine) => Some(engine),
+            Self::Server { running, .. } => running.as_ref().map(Running::engine),
+        };
+        engine.filter(|engine| engine.exports_mcap()).cloned()
+    }
+
     async fn stop(&mut self) {
         if let Self::Server { running, .. } = self
             && let Some(running) = running.take()

@@ -73,4 +73,48 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert!(exported.status.success(), "{}", String::from_utf8_lossy(&exported.stderr));
     let bytes = std::fs::read(dir.path().join("log.mcap")).unwrap();
     assert!(bytes.starts_with(b"\x89MCAP0\r\n") && bytes.ends_with(b"\x89MCAP0\r\n"));
+    let images = [
+        "export",
+        &files[0],
+        "--mcap",
+        "images.mcap",
+        "--images",
+        "--twins",
+        twins,
+        "--backend",
+        "cpu",
+    ];
+    let text = stdout(&wildcity(&images, dir.path()));
+    assert!(text.contains("images      ") && !text.contains("differs"), "{text}");
+    let with_images = std::fs::read(dir.path().join("images.mcap")).unwrap();
+    let count = |bytes: &[u8], topic: &str| {
+        let messages = mcap::MessageStream::new(bytes).unwrap().map(|message| message.unwrap());
+        let of_topic = messages.filter(|message| message.channel.topic == topic);
+        of_topic
+            .filter(|message| {
+                topic.contains("step") || message.data.windows(2).any(|two| two == [0xff, 0xd8])
+            })
+            .count()
+    };
+    assert_eq!((count(&with_images, "/camera/0/image"), count(&bytes, "/camera/0/image")), (9, 0));
+    assert_eq!(count(&with_images, "/wildcity/step"), count(&bytes, "/wildcity/step"));
+    let unknown = wildcity(&[&images[..], &["--camera", "roof"]].concat(), dir.path());
+    assert!(String::from_utf8(unknown.stderr).unwrap().contains("--camera roof: the episode has"));
+    // The run wrote the same beside the record; the order of the index differs from file to file.
+    let of_run = std::fs::read(dir.path().join("log/episodes/short-0-1.mcap")).unwrap();
+    assert_eq!((count(&of_run, "/wildcity/step"), of_run.len()), (9, bytes.len()));
+    let none = [
+        "run",
+        "short.json",
+        "--twins",
+        twins,
+        "--mcap",
+        "false",
+        "--out",
+        "none",
+        "--backend",
+        "cpu",
+    ];
+    assert_eq!(wildcity(&none, dir.path()).status.code(), Some(0));
+    assert!(!dir.path().join("none/episodes/short-0-1.mcap").exists());
 }

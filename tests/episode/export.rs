@@ -3,8 +3,8 @@
 use std::io::Cursor;
 
 use prost::Message as _;
-use serde_json::Value;
-use wildcity_episode::{EpisodeFile, export};
+use serde_json::{Value, json};
+use wildcity_episode::{EpisodeExport, EpisodeFile, ExportedImage, export, export_file, mcap_of};
 
 use crate::written::{self, Made};
 
@@ -36,6 +36,8 @@ fn a_reader_finds_every_message_with_its_schema() {
     assert_eq!(count("/tf", "foxglove.FrameTransforms"), 21);
     assert_eq!(count("/actors", "foxglove.SceneUpdate"), 21);
     assert_eq!(count("/route", "foxglove.PosesInFrame"), 1);
+    assert_eq!(count("/ego/path", "foxglove.PosesInFrame"), 1);
+    assert_eq!(count("/ego/odometry", "foxglove.Odometry"), 21);
     assert_eq!(count("/wildcity/step", "wildcity.Step"), 21);
     assert_eq!(count("/wildcity/episode", "wildcity.Episode"), 1);
     // 2 s after the begin, which is at 1,000 s.
@@ -47,9 +49,10 @@ fn the_file_is_indexed_and_small() {
     let episode = Made { steps: 200, actors: 30, plan_poses: 64, ..Made::default() }.read();
     let bytes = exported(&episode);
     assert!(bytes.len() < 1_000_000, "{} bytes", bytes.len());
+    eprintln!("{} bytes as MCAP", bytes.len());
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert!(summary.chunk_indexes.len() > 3, "{} chunks", summary.chunk_indexes.len());
-    assert_eq!(summary.stats.unwrap().message_count, 201 * 3 + 200 + 2);
+    assert_eq!(summary.stats.unwrap().message_count, 201 * 4 + 200 + 3);
     // A chunk that is damaged is noticed.
     let mut damaged = bytes;
     let at = summary.chunk_indexes[1].chunk_start_offset as usize + 200;
@@ -73,6 +76,28 @@ fn a_plan_is_exported_once() {
     assert_eq!(trajectory["poses"], "/plan");
     let times_us = trajectory["times_us"].as_array().unwrap();
     assert_eq!((times_us.len(), &times_us[63]), (64, &Value::from(6_400_000)));
+    // It is in the rig of the begin of its step: the first one at the begin of the episode.
+    let at_ns: Vec<u64> = of("/plan").iter().map(|message| message.log_time).collect();
+    assert_eq!(at_ns, [1_000_000_000_000, 1_000_100_000_000, 1_000_200_000_000]);
+}
+
+#[test]
+fn a_full_disk_is_an_error_and_no_panic() {
+    for steps in [1, 400] {
+        let episode = Made { steps, actors: 30, ..Made::default() }.read();
+        let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let error = export(&episode, None, std::io::BufWriter::new(full)).unwrap_err().to_string();
+        assert!(error.contains("cannot write the MCAP file: No space left"), "{error}");
+    }
+    let dir = tempfile::tempdir().unwrap();
+    let record = dir.path().join("made-1.jsonl");
+    written::write(&record, &Made { steps: 2, ..Made::default() }.lines());
+    let nowhere = dir.path().join("nowhere/made-1.mcap");
+    let error = export_file(&record, &nowhere).unwrap_err().to_string();
+    assert!(error.contains("nowhere/made-1.mcap"), "{error}");
+    let exported = export_file(&record, &mcap_of(&record)).unwrap();
+    let bytes = std::fs::read(dir.path().join("made-1.mcap")).unwrap();
+    assert_eq!(mcap::MessageStream::new(&bytes).unwrap().count() as u64, exported.messages);
 }
 
 #[test]
@@ -81,4 +106,115 @@ fn an_episode_without_frames_is_refused() {
     lines.truncate(2);
     let error = export(&written::read(&lines), None, Cursor::new(Vec::new())).unwrap_err();
     assert!(error.to_string().contains("no frame"), "{error}");
+}
+
+/// As a reader without this package sees it.
+#[derive(Clone, PartialEq, prost::Message)]
+struct Xyz {
+    #[prost(double, tag = "1")]
+    x: f64,
+    #[prost(double, tag = "2")]
+    y: f64,
+    #[prost(double, tag = "3")]
+    z: f64,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+struct Odometry {
+    #[prost(string, tag = "2")]
+    frame_id: String,
+    #[prost(string, tag = "3")]
+    child_frame_id: String,
+    #[prost(message, optional, tag = "5")]
+    linear_velocity: Option<Xyz>,
+    #[prost(message, optional, tag = "6")]
+    angular_velocity: Option<Xyz>,
+}
+
+fn messages(bytes: &[u8], topic: &str) -> Vec<mcap::Message<'static>> {
+    let all = mcap::MessageStream::new(bytes).unwrap().map(|message| message.unwrap());
+    let of_topic = all.filter(|message| message.channel.topic == topic);
+    let owned = of_topic.map(|message| mcap::Message {
+        data: std::borrow::Cow::Owned(message.data.into_owned()),
+        ..message
+    });
+    owned.collect()
+}
+
+#[test]
+fn odometry_has_the_motion_of_the_ego() {
+    let episode = Made { steps: 20, ..Made::default() }.read();
+    let bytes = exported(&episode);
+    let odometry = Odometry::decode(&*messages(&bytes, "/ego/odometry")[10].data).unwrap();
+    assert_eq!((odometry.frame_id.as_str(), odometry.child_frame_id.as_str()), ("world", "rig"));
+    let [velocity, turning] = [odometry.linear_velocity, odometry.angular_velocity];
+    let [velocity, turning] = [velocity.unwrap(), turning.unwrap()];
+    // 10 m/s along x, while the heading is 0.01 rad at 10 m and turns by 0.01 rad/s.
+    assert!((velocity.x - 10.0 * 0.01_f64.cos()).abs() < 1e-9, "{velocity:?}");
+    assert!((velocity.y + 10.0 * 0.01_f64.sin()).abs() < 1e-9, "{velocity:?}");
+    assert!((turning.z - 0.01).abs() < 1e-9, "{turning:?}");
+
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    lines.remove(7);
+    let bytes = exported(&written::read(&lines));
+    let odometry = Odometry::decode(&*messages(&bytes, "/ego/odometry")[1].data).unwrap();
+    assert_eq!(odometry.linear_velocity, None, "a record that skips a step says no speed");
+}
+
+#[test]
+fn the_map_has_the_outline_of_each_lane() {
+    #[derive(Clone, PartialEq, prost::Message)]
+    struct Update {
+        #[prost(message, repeated, tag = "2")]
+        entities: Vec<Entity>,
+    }
+    #[derive(Clone, PartialEq, prost::Message)]
+    struct Entity {
+        #[prost(string, tag = "2")]
+        frame_id: String,
+        #[prost(message, repeated, tag = "11")]
+        lines: Vec<Line>,
+    }
+    #[derive(Clone, PartialEq, prost::Message)]
+    struct Line {
+        #[prost(int32, tag = "1")]
+        kind: i32,
+        #[prost(message, repeated, tag = "5")]
+        points: Vec<Xyz>,
+    }
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    lines[1]["lanes"] = json!([
+        { "outline": [[0, -2], [90, -2], [90, 2]], "route": true },
+        { "outline": [[0, 2], [90, 2], [90, 6], [0, 6]] },
+    ]);
+    let bytes = exported(&written::read(&lines));
+    let found = messages(&bytes, "/map");
+    assert_eq!(found.len(), 1);
+    let update = Update::decode(&*found[0].data).unwrap();
+    let [entity] = &update.entities[..] else { panic!("{update:?}") };
+    assert_eq!(entity.frame_id, "world");
+    let points: Vec<usize> = entity.lines.iter().map(|line| line.points.len()).collect();
+    assert_eq!((points, entity.lines[0].kind), (vec![3, 4], 1));
+    // At the height of the route.
+    assert_eq!(entity.lines[0].points[2], Xyz { x: 90.0, y: 2.0, z: 0.1 });
+}
+
+#[test]
+fn images_are_between_the_steps_in_the_order_of_time() {
+    let episode = Made { steps: 3, ..Made::default() }.read();
+    let mut bytes = Cursor::new(Vec::new());
+    let mut writing = EpisodeExport::begin(&episode, None, &mut bytes).unwrap();
+    for time_us in [0, 100_000, 300_000] {
+        let jpeg = [0xff, 0xd8, 0xff];
+        writing.image(&ExportedImage { camera: 1, time_us, jpeg: &jpeg }).unwrap();
+    }
+    writing.finish().unwrap();
+    let bytes = bytes.into_inner();
+    let images = messages(&bytes, "/camera/1/image");
+    assert_eq!(images.len(), 3);
+    let schema = images[0].channel.schema.as_ref().unwrap();
+    assert_eq!(schema.name, "foxglove.CompressedImage");
+    let stream = mcap::MessageStream::new(&bytes).unwrap();
+    let times: Vec<u64> = stream.map(|message| message.unwrap().log_time).collect();
+    assert!(times.is_sorted(), "{times:?}");
 }

@@ -124,6 +124,13 @@ fn two_hundred_steps_with_thirty_actors_stay_below_a_megabyte() {
     written::write(&path, &Made { steps: 200, actors: 30, ..Made::default() }.lines());
     let bytes = fs::metadata(&path).unwrap().len();
     assert!(bytes < 1_000_000, "{bytes} bytes");
+    // Plans have all their digits, since a replay needs them: docs/suites.md has the figures.
+    let with_plans = dir.path().join("plans-1.jsonl");
+    let made = Made { steps: 200, actors: 30, plan_poses: 64, ..Made::default() };
+    written::write(&with_plans, &made.lines());
+    let plans_bytes = fs::metadata(&with_plans).unwrap().len() - bytes;
+    assert!((1_500_000..2_500_000).contains(&plans_bytes), "{bytes} and {plans_bytes} bytes");
+    eprintln!("{bytes} bytes, and {plans_bytes} of plans");
     assert_eq!(EpisodeFile::read(&path).unwrap().actors.len(), 201);
 }
 

@@ -1,5 +1,9 @@
 //! Episodes' files: reading them whole and cut, comparing and scoring them.
 
+#[path = "../support/root.rs"]
+mod root;
+
+mod calibration;
 mod diff;
 mod export;
 mod files;

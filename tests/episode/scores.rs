@@ -73,6 +73,32 @@ fn speeds_and_turns_come_from_the_poses() {
 }
 
 #[test]
+fn plans_of_the_record_are_scored() {
+    let without = result(&Made::default().read()).unwrap();
+    let reason = without.scores["alpasim.plan_deviation@3032e0c"].reason.clone().unwrap();
+    assert!(reason.contains("needs a plan"), "{reason}");
+
+    let made = Made { plan_poses: 64, ..Made::default() };
+    let record = wildcity_episode::drive_record(&made.read()).unwrap();
+    assert_eq!(record.plans.len(), 50);
+    let plan = &record.plans[20];
+    assert_eq!((plan.decided_us(), plan.end_us()), (2_000_000, 8_400_000));
+    // The plan is along the rig of the decision, at 20 m, which heads 0.02 rad to the left.
+    let start_m = plan.at(2_000_000).unwrap().origin_m;
+    let along = plan.at(2_100_000).unwrap().origin_m - start_m;
+    assert_eq!(start_m, DVec2::new(20.0, 0.0));
+    assert!(
+        (along.length() - 1.0).abs() < 1e-3 && (along.to_angle() - 0.02).abs() < 1e-3,
+        "{along}"
+    );
+    let scored = result(&made.read()).unwrap();
+    let value = |name: &str| scored.scores[name].value.unwrap();
+    assert!((0.01..1.0).contains(&value("alpasim.plan_deviation@3032e0c")), "{scored:?}");
+    assert!((0.01..1.0).contains(&value("alpasim.min_ade_1s@3032e0c")), "{scored:?}");
+    assert_eq!(value("alpasim.open_loop_collision@3032e0c"), 0.0);
+}
+
+#[test]
 fn a_record_of_thirty_seconds_is_read_and_scored_in_50_ms() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("long-1.jsonl");
@@ -86,7 +112,7 @@ fn a_record_of_thirty_seconds_is_read_and_scored_in_50_ms() {
         let start = Instant::now();
         let scored = result(&EpisodeFile::read(&path).unwrap()).unwrap();
         best = best.min(start.elapsed());
-        assert_eq!(scored.scores.len(), 9);
+        assert_eq!(scored.scores.len(), 17);
         if best < Duration::from_millis(50) {
             return;
         }

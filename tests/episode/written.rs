@@ -113,7 +113,8 @@ impl Made {
         let pose = |k: u32| {
             let time_s = 0.1 * f64::from(k);
             let turned = 0.037 * (0.31 * step as f64).sin() * time_s;
-            let position_m = DVec3::new(self.speed_mps * time_s, 0.5 * turned * time_s, 0.0);
+            let ahead_m = self.speed_mps * time_s * (0.5 * turned).cos();
+            let position_m = DVec3::new(ahead_m, 0.5 * turned * time_s, 1e-3 * turned);
             let start_from_rig = Pose { position_m, rotation: DQuat::from_rotation_z(turned) };
             json!({ "time_us": 100_000 * k, "start_from_rig": start_from_rig })
         };

@@ -174,6 +174,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
         backend: server.painter.clone(),
         step_timeout: TEST_TIMEOUT,
         repairs: Arc::default(),
+        mcap: false,
     });
     let engine = engine.unwrap();
     let latest = async || {

@@ -341,6 +341,7 @@ async fn a_recommended_profile_holds_for_sessions_elsewhere() {
         backend: Arc::new(Cpu::new(2, Simd::Best).unwrap()),
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
         repairs: Arc::default(),
+        mcap: false,
     });
     let engine = engine.unwrap();
     for wanted_db in [35.0, 45.0] {

@@ -36,6 +36,7 @@ fn drive(speed_mps: f64) -> DriveRecord {
         ego,
         is_driven: true,
         tracks: Some(vec![track]),
+        plans: Vec::new(),
         contacts: Vec::new(),
         static_contacts: Some(Vec::new()),
         reference: Some(ReferenceDrive {
@@ -79,7 +80,7 @@ fn drive_with(speed_mps: f64, other: Footprint, other_mps: f64) -> DriveRecord {
 fn lane(x_m: [f64; 2], y_m: [f64; 2], is_on_route: bool) -> Lane {
     let corner = |x: usize, y: usize| DVec2::new(x_m[x], y_m[y]);
     let outline_m = vec![corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
-    Lane { outline_m, is_on_route, is_intersection: false }
+    Lane { outline_m, center: None, is_on_route, is_intersection: false }
 }
 
 fn map(lanes: Vec<Lane>) -> LaneMap {
@@ -355,7 +356,7 @@ fn thirty_seconds_are_scored_in_milliseconds() {
     // The best of five: other tests run beside this one.
     let took = (0..5).map(|_| {
         let start = std::time::Instant::now();
-        assert_eq!(score(&record).len(), 9);
+        assert_eq!(score(&record).len(), 17);
         start.elapsed()
     });
     let took = took.min().unwrap();

@@ -12,4 +12,5 @@ mod episodes;
 mod hugsim;
 mod navsim;
 mod others;
+mod plans;
 mod statistics;

@@ -64,6 +64,7 @@ fn rectangle(x_m: [f64; 2], y_m: [f64; 2]) -> Vec<DVec2> {
 
 fn map(input: &Value) -> LaneMap {
     let lane = |row: &Value| Lane {
+        center: None,
         outline_m: rectangle(
             [number(&row[1]), number(&row[2])],
             [number(&row[3]), number(&row[4])],
@@ -184,6 +185,7 @@ fn extended_comfort_is_as_in_the_vectors() {
 #[test]
 fn a_lane_of_its_own_is_one_that_holds_all_corners() {
     let lane = |y_m: [f64; 2]| Lane {
+        center: None,
         outline_m: rectangle([-10.0, 10.0], y_m),
         is_on_route: false,
         is_intersection: false,

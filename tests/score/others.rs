@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 
 use wildcity_score::alpasim::{self, Collision, Rollout, Side};
 use wildcity_score::bench2drive::{self, Infraction, MotionSample};
-use wildcity_score::{EgoSample, neuroncap};
+use wildcity_score::{EgoSample, alpasim_plans, neuroncap};
 use wildcity_sim::contact::Footprint;
 
 use crate::vectors::{assert_near, cases, number, numbers};
@@ -171,7 +171,7 @@ fn plan_deviation_is_as_in_the_vector() {
     let Some(cases) = cases("alpasim", "plan deviation") else { return };
     for case in cases {
         let distances_m = numbers(&case.input["distances"]);
-        let found = alpasim::plan_deviation(&distances_m, number(&case.input["decay"])).unwrap();
+        let found = alpasim_plans::plan_deviation(&distances_m, number(&case.input["decay"])).unwrap();
         assert_near(found, &case.expected["deviation"], &case.name);
     }
 }

@@ -25,6 +25,7 @@ mod ego;
 mod http;
 mod leases;
 mod many;
+mod mcap;
 mod memory;
 mod mutations;
 mod observation;

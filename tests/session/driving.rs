@@ -35,6 +35,7 @@ pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend
         backend,
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
         repairs: Arc::default(),
+        mcap: false,
     });
     Bench { engine: engine.unwrap(), episodes }
 }

@@ -52,6 +52,19 @@ fn times_to_contact_are_as_in_the_vectors() {
 }
 
 #[test]
+fn boxes_that_part_touch_no_more() {
+    let at = |x_m: f64, x_mps: f64| Moving {
+        footprint: Footprint::new(DVec2::new(x_m, 0.0), 0.0, 4.0, 2.0),
+        velocity_mps: DVec2::new(x_mps, 0.0),
+    };
+    // They overlapped until 1 s ago: 6 m apart, 2 m of it between them, at 2 m/s.
+    let (ego, other) = (at(0.0, 5.0), at(6.0, 7.0));
+    assert_eq!(time_to_contact_s(&ego, &other), None);
+    assert_eq!(time_to_contact_s(&other, &ego), None);
+    assert_eq!(time_to_contact_s(&ego, &at(6.0, 4.0)).map(|s| (s - 2.0).abs() < 1e-6), Some(true));
+}
+
+#[test]
 fn static_contacts_are_as_in_the_vectors() {
     let Some(cases) = cases("own", "static") else { return };
     for case in cases {

@@ -1,6 +1,6 @@
 //! Runs with the built-in agents, and what is written about them.
 
-use wildcity_episode::{EpisodeFile, diff, result};
+use wildcity_episode::{EpisodeFile, diff, export_file, result};
 use wildcity_suite::{AgentChoice, BuiltIn, ExitCode, Status, junit, page, pictures, verify};
 
 use crate::street::{Bench, cpu};
@@ -60,6 +60,41 @@ async fn records_are_whole_and_score_to_the_same_result() {
     let [car_3, car_4] = ["car-3-1.jsonl", "car-4-1.jsonl"].map(read);
     assert_eq!(diff(&car_3, &car_3), None);
     assert!(diff(&car_3, &car_4).unwrap().how.contains("scenario"));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn each_record_becomes_an_mcap_file_beside_it() {
+    let bench = Bench::new();
+    let run = bench.run_built_in(BuiltIn::Log, "log").await;
+    for entry in &run.episodes {
+        let record = bench.path("log").join(&entry.record);
+        assert_eq!(entry.mcap, entry.record.replace(".jsonl", ".mcap"));
+        assert_eq!(entry.mcap_error, "");
+        let by_hand = bench.path("by-hand.mcap");
+        export_file(&record, &by_hand).unwrap();
+        // With its end and result. The order of the index differs from file to file, its size does not.
+        let bytes = [by_hand, bench.path("log").join(&entry.mcap)]
+            .map(|path| std::fs::metadata(path).unwrap().len());
+        assert_eq!(bytes[0], bytes[1], "{}", entry.name);
+    }
+    let mut settings = bench.settings(AgentChoice::BuiltIn(BuiltIn::Log), 2, "without");
+    settings.mcap = false;
+    let cases = bench.cases(&bench.suite()).unwrap();
+    let without = wildcity_suite::run(settings, cases).await.unwrap();
+    assert!(!without.to_json().contains("mcap"), "{}", without.to_json());
+    assert!(!bench.path("without").join("car-3-1.mcap").exists());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_export_that_fails_is_in_the_result_and_fails_no_episode() {
+    let bench = Bench::new();
+    std::fs::create_dir_all(bench.path("log").join("car-3-1.mcap")).unwrap();
+    let run = bench.run_built_in(BuiltIn::Log, "log").await;
+    assert_eq!((run.counts.passed, run.exit_code()), (4, ExitCode::Passed), "{}", run.to_json());
+    let told: Vec<bool> = run.episodes.iter().map(|e| e.mcap.is_empty()).collect();
+    assert_eq!(told, [true, false, false, false]);
+    assert!(run.episodes[0].mcap_error.contains("cannot write"), "{:?}", run.episodes[0]);
+    assert!(run.to_json().contains("\"mcap_error\": \"cannot write"), "{}", run.to_json());
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -124,6 +124,7 @@ impl Bench {
             scenarios: self.dir.path().to_owned(),
             backend: Arc::new(cpu()),
             episodes: self.path(out),
+            mcap: true,
             progress: Box::new(|_| {}),
         }
     }

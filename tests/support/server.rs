@@ -226,7 +226,10 @@ impl TestServer {
     /// The recorded episodes, in order of name.
     pub(crate) fn recorded(&self) -> Vec<PathBuf> {
         let entries = std::fs::read_dir(self.episodes.path()).expect("episodes");
-        let mut paths: Vec<_> = entries.map(|entry| entry.expect("an entry").path()).collect();
+        let paths = entries.map(|entry| entry.expect("an entry").path());
+        let is_record =
+            |path: &PathBuf| path.extension().is_some_and(|extension| extension == "jsonl");
+        let mut paths: Vec<_> = paths.filter(is_record).collect();
         paths.sort();
         paths
     }

@@ -80,6 +80,7 @@ def driven(
     mcap = folder / "walk.mcap"
     command = ["wildcity", "episode", "export", str(record), "--mcap", str(mcap)]
     subprocess.run(command, env=reader, check=True, capture_output=True)
+    assert read(record.with_suffix(".mcap").read_bytes()) == read(mcap.read_bytes()), "the run wrote the same"
     return lines_of(record), mcap.read_bytes()
 
 
@@ -111,6 +112,8 @@ def test_an_export_is_read_by_the_mcap_package(
     assert counts == {
         ("/tf", "foxglove.FrameTransforms"): len(frames) + 1,
         ("/actors", "foxglove.SceneUpdate"): len(frames),
+        ("/ego/odometry", "foxglove.Odometry"): len(frames),
+        ("/ego/path", "foxglove.PosesInFrame"): 1,
         ("/plan", "foxglove.PosesInFrame"): len(frames) - 1,
         ("/route", "foxglove.PosesInFrame"): 1,
         ("/camera/0/calibration", "foxglove.CameraCalibration"): 1,
@@ -154,6 +157,26 @@ def test_an_export_is_indexed(driven: tuple[list[dict[str, Any]], bytes]) -> Non
     part = read(data, topics=["/tf"], starting_at=begin, ending_before=begin + 500_000_000)
     wanted = [one[2] for one in everything if one[0] == "/tf" and begin <= one[2] < begin + 500_000_000]
     assert [one[2] for one in part] == wanted and len(wanted) == 5
+
+
+def test_images_of_an_export_are_those_of_the_record(
+    driven: tuple[list[dict[str, Any]], bytes], reader: dict[str, str], tmp_path: Path
+) -> None:
+    lines, without = driven
+    record = tmp_path / "walk-0-1.jsonl"
+    record.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    mcap = tmp_path / "walk.mcap"
+    command = ["wildcity", "episode", "export", str(record), "--mcap", str(mcap), "--images"]
+    done = subprocess.run(command, env=reader, check=True, capture_output=True, text=True)
+    assert "differs" not in done.stdout, done.stdout
+    images = [one for one in read(mcap.read_bytes()) if one[1] == "foxglove.CompressedImage"]
+    frames = [line for line in lines if line["kind"] == "frame"]
+    assert [time for _, _, time, _ in images] == [(1_000_000_000 + frame["time_us"]) * 1000 for frame in frames]
+    for topic, _, _, image in images:
+        assert (topic, image.format, image.frame_id) == ("/camera/0/image", "jpeg", "camera/0")
+        assert image.data.startswith(b"\xff\xd8") and image.data.endswith(b"\xff\xd9")
+    others = [one[:3] for one in read(mcap.read_bytes()) if one[1] != "foxglove.CompressedImage"]
+    assert Counter(others) == Counter(one[:3] for one in read(without))
 
 
 def test_damage_of_an_export_is_noticed(driven: tuple[list[dict[str, Any]], bytes]) -> None:

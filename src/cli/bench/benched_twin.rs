@@ -44,6 +44,7 @@ impl BenchedTwin {
             backend: Arc::from(self.backend.backend()?),
             step_timeout: wildcity_protocol::limits::STEP_TIMEOUT,
             repairs: Arc::default(),
+            mcap: false,
         })?;
         Ok(engine)
     }

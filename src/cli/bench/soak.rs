@@ -93,6 +93,7 @@ impl Soak {
         let config = Config {
             cache: self.twin.twins.cache(),
             limits,
+            mcap: false,
             ..Config::local(directories, backend)
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

@@ -1,16 +1,26 @@
 //! `wildcity episode export`.
 
-use std::fs::File;
-use std::io::{self, BufWriter, Write};
-use std::path::PathBuf;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
+use wildcity_episode::{
+    EpisodeExport, EpisodeFile, ExportError, Exported, ExportedImage, export_file, write_whole,
+};
+use wildcity_session::{
+    RecordedEpisode, ReplayReport, ReplayUntil, ReplayedImage, jpeg, limits as session,
+};
+use wildcity_twin::residency::Cache;
 
-use wildcity_episode::{EpisodeFile, export};
+use crate::cli::backend_options::BackendOptions;
+use crate::cli::directories::{Episodes, Twins};
+use crate::cli::progress;
 
-use crate::cli::directories::Episodes;
+use super::kept::{camera_of, driven, keep_cameras};
 
 /// Export an episode as MCAP, for Foxglove, Rerun and others: indexed, compressed, with schemas.
+///
+/// Runs and servers export each episode when it ends, without images. With --images the episode is driven and rendered
+/// again, and compared with its record.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Export {
@@ -22,43 +32,106 @@ pub(super) struct Export {
     #[arg(long, value_name = "FILE")]
     mcap: PathBuf,
 
+    /// Render the images again, and add them as JPEG.
+    #[arg(long)]
+    images: bool,
+
+    /// A camera whose images are added; may be given several times [default: all cameras of the episode]
+    #[arg(long, value_name = "NAME", requires = "images")]
+    camera: Vec<String>,
+
     #[command(flatten)]
     episodes: Episodes,
+
+    #[command(flatten)]
+    twins: Twins,
+
+    #[command(flatten)]
+    backend: BackendOptions,
 }
 
 const EXAMPLES: &str = "\
 Examples:
   wildcity episode export agent-1 --mcap agent-1.mcap
-  wildcity episode export run/episodes/straight-0-1.jsonl --mcap straight.mcap";
+  wildcity episode export agent-1 --mcap agent-1.mcap --images
+  wildcity episode export run/episodes/straight-0-1.jsonl --mcap straight.mcap --images --camera front";
+
+/// A calibration that is farther off its lens is worth a note, in pixels.
+const NOTED_ERROR_PX: f64 = 0.1;
 
 impl Export {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let path = super::file_of(&self.episode, &self.episodes)?;
-        let episode = super::read(&self.episode, &self.episodes)?;
-        let rig = EpisodeFile::rig(&path)?;
-        // A reader never finds half a file: it has its name only when it is whole.
-        let temporary = self.mcap.with_extension("mcap.tmp");
-        let cannot = || format!("cannot write {}", self.mcap.display());
-        let file = BufWriter::new(File::create(&temporary).with_context(cannot)?);
-        let exported = export(&episode, rig.as_ref(), file);
-        let renamed = exported.map_err(anyhow::Error::from).and_then(|exported| {
-            std::fs::rename(&temporary, &self.mcap).with_context(cannot)?;
-            Ok(exported)
-        });
-        if renamed.is_err() {
-            // The first error is the one to report.
-            let _ = std::fs::remove_file(&temporary);
-        }
-        let exported = renamed?;
+        let (exported, report) = match self.images {
+            true => self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?,
+            false => (export_file(&path, &self.mcap)?, None),
+        };
         let mut out = io::stdout().lock();
         writeln!(out, "exported    {} messages to {}", exported.messages, self.mcap.display())?;
-        if exported.without_calibration > 0 {
-            let count = exported.without_calibration;
+        if let Some(report) = &report {
+            writeln!(out, "images      {}", report.images)?;
+        }
+        if let Some(difference) = report.and_then(|report| report.difference) {
+            writeln!(out, "differs     {difference}")?;
+        }
+        let error_px = exported.calibration_error_px;
+        if error_px > NOTED_ERROR_PX {
             writeln!(
                 out,
-                "note        {count} cameras have lenses that a calibration cannot describe"
+                "note        calibrations differ from the lenses by up to {error_px:.1} px"
             )?;
         }
         Ok(())
     }
+
+    fn with_images(&self, path: &Path) -> anyhow::Result<(Exported, ReplayReport)> {
+        let episode = EpisodeFile::read(path)?;
+        let rig = EpisodeFile::rig(path)?;
+        let mut recording = RecordedEpisode::read(path)?;
+        let count = recording.header.rig.cameras.len();
+        let wanted = self.camera.iter().map(|name| camera_of(&recording, name));
+        let mut wanted = wanted.collect::<anyhow::Result<Vec<usize>>>()?;
+        if wanted.is_empty() {
+            wanted = (0..count).collect();
+        }
+        let shown = driven(&recording.frames);
+        for (index, frame) in recording.frames.iter_mut().enumerate() {
+            let cameras = if shown.contains(&index) { &wanted[..] } else { &[] };
+            keep_cameras(frame, cameras, count);
+        }
+        let cache = Cache::new(self.twins.catalog()?);
+        let backend = self.backend.backend_of(&recording.header.backend)?;
+        let bar = progress::count("rendering");
+        bar.set_length(recording.frames.iter().map(|frame| frame.images.len() as u64).sum());
+        let written = write_whole(&self.mcap, |out| {
+            let mut export = EpisodeExport::begin(&episode, rig.as_ref(), out)?;
+            let mut add = |image: &ReplayedImage<'_>| {
+                bar.inc(1);
+                add_image(&mut export, &recording, image)
+            };
+            let report = recording.replay(&cache, &*backend, ReplayUntil::End, &mut add);
+            let report = report.map_err(|error| ExportError::Images(error.to_string()))?;
+            Ok((export.finish()?, report))
+        });
+        bar.finish_and_clear();
+        Ok(written?)
+    }
+}
+
+/// Adds an image, unless it is of a warm-up whose times the record does not have.
+fn add_image<W: io::Write + io::Seek>(
+    export: &mut EpisodeExport<'_, W>,
+    recording: &RecordedEpisode,
+    image: &ReplayedImage<'_>,
+) -> Result<(), String> {
+    let frame = &recording.frames[image.frame];
+    let has_time = !frame.times_us.is_empty() || image.pose + 1 == frame.poses.len();
+    let cameras = &recording.header.rig.cameras;
+    let camera = cameras.iter().position(|camera| camera.name == image.camera.name);
+    let (true, Some(camera)) = (has_time, camera) else { return Ok(()) };
+    let size = &image.camera.camera;
+    let jpeg = jpeg(image.rgb8, size.width_px, size.height_px, session::JPEG_QUALITY)?;
+    let time_us = frame.taken_us(image.pose);
+    let added = export.image(&ExportedImage { camera, time_us, jpeg: &jpeg });
+    added.map_err(|error| error.to_string())
 }

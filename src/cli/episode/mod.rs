@@ -2,6 +2,7 @@
 
 mod diff;
 mod export;
+mod kept;
 mod list;
 mod run;
 mod score;

@@ -61,6 +61,10 @@ pub(super) struct Run {
     #[arg(long, value_name = "RATE")]
     at_least: Option<f64>,
 
+    /// Export the record of each episode as MCAP, beside it: for Foxglove, Rerun and others.
+    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
+    mcap: bool,
+
     /// Render every episode again afterwards, and compare all images with the records.
     #[arg(long)]
     verify: bool,
@@ -120,6 +124,7 @@ impl Run {
             scenarios: self.suite.parent().unwrap_or(Path::new(".")).to_owned(),
             backend: backend.clone(),
             episodes: episodes.clone(),
+            mcap: self.mcap,
             progress: Box::new(move |_| counted.inc(1)),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;

@@ -3,14 +3,14 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
-
-use wildcity_session::{FrameRecord, FrameRequest, RecordedEpisode, ReplayUntil, ReplayedImage};
+use wildcity_session::{RecordedEpisode, ReplayUntil, ReplayedImage};
 use wildcity_twin::residency::Cache;
 
 use crate::cli::backend_options::BackendOptions;
 use crate::cli::directories::{Episodes, Twins};
 use crate::cli::{output, progress};
+
+use super::kept::{camera_of, keep_cameras};
 
 /// Write the frames of an episode as numbered pictures, for a video.
 ///
@@ -50,9 +50,12 @@ impl Video {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let path = super::file_of(&self.episode, &self.episodes)?;
         let mut recording = RecordedEpisode::read(&path)?;
-        let camera = self.camera_of(&recording)?;
+        let camera = match &self.camera {
+            Some(name) => camera_of(&recording, name)?,
+            None => 0,
+        };
         for frame in &mut recording.frames {
-            keep_camera(frame, camera, recording.header.rig.cameras.len());
+            keep_cameras(frame, &[camera], recording.header.rig.cameras.len());
         }
         output::create_dir(&self.out)?;
         let cache = Cache::new(self.twins.catalog()?);
@@ -85,37 +88,6 @@ impl Video {
         )?;
         Ok(())
     }
-
-    /// Index of the wanted camera.
-    fn camera_of(&self, recording: &RecordedEpisode) -> anyhow::Result<usize> {
-        let cameras = &recording.header.rig.cameras;
-        let Some(wanted) = &self.camera else { return Ok(0) };
-        cameras.iter().position(|camera| camera.name == *wanted).with_context(|| {
-            let known: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
-            format!("--camera {wanted}: the episode has {}", known.join(", "))
-        })
-    }
-}
-
-/// Leaves of a frame the images of one camera; none of poses that were only looked at.
-fn keep_camera(frame: &mut FrameRecord, camera: usize, rig_cameras: usize) {
-    let is_driven = matches!(frame.request, FrameRequest::Reset | FrameRequest::Step);
-    let mut images = std::mem::take(&mut frame.images).into_iter();
-    let mut kept = Vec::new();
-    let mut cameras = Vec::new();
-    for pose in 0..frame.poses.len() {
-        let mut of_pose = Vec::new();
-        for rendered in frame.cameras_of(pose, rig_cameras) {
-            let image = images.next();
-            if rendered == camera && is_driven {
-                of_pose.push(camera);
-                kept.extend(image);
-            }
-        }
-        cameras.push(of_pose);
-    }
-    frame.images = kept;
-    frame.cameras = cameras;
 }
 
 fn write_png(path: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {

@@ -45,6 +45,11 @@ pub(super) struct Serve {
     #[command(flatten)]
     directories: ServerDirectories,
 
+    /// Export each episode that ends as MCAP, beside its record: for Foxglove, Rerun and others. Takes half as much
+    /// disk again as the records, and no step waits for it.
+    #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
+    mcap: bool,
+
     /// JSON file of tokens and what each allows (see below); without it the server only listens on a
     /// loopback address.
     #[arg(long, value_name = "FILE")]
@@ -209,6 +214,7 @@ impl Serve {
             origins: self.origin.unwrap_or_default(),
             tls,
             audit: self.audit_log,
+            mcap: self.mcap,
             backend: Arc::from(self.backend.backend()?),
             repairs: self.repair.models()?,
             profile: self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default(),

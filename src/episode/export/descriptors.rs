@@ -1,7 +1,7 @@
 //! The protobuf descriptors of Foxglove's messages, which an MCAP file has beside them.
 //!
 //! Source of names and numbers: foxglove/schemas, `schemas/proto/foxglove`. All fields are there, since a viewer may
-//! look for those that episodes leave empty.
+//! look for those that episodes leave empty; of an image not the identifier and the lineage.
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};
@@ -16,6 +16,7 @@ type Fields = &'static [(&'static str, i32, &'static str)];
 
 const MESSAGES: &[(&str, Fields)] = &[
     ("Vector3", &[("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")]),
+    ("Velocity3", &[("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")]),
     ("Point3", &[("x", 1, "double"), ("y", 2, "double"), ("z", 3, "double")]),
     (
         "Quaternion",
@@ -140,6 +141,28 @@ const MESSAGES: &[(&str, Fields)] = &[
         &[
             ("deletions", 1, "[].foxglove.SceneEntityDeletion"),
             ("entities", 2, "[].foxglove.SceneEntity"),
+        ],
+    ),
+    (
+        "Odometry",
+        &[
+            ("timestamp", 1, TIMESTAMP),
+            ("frame_id", 2, "string"),
+            ("child_frame_id", 3, "string"),
+            ("pose", 4, ".foxglove.Pose"),
+            ("linear_velocity", 5, ".foxglove.Velocity3"),
+            ("angular_velocity", 6, ".foxglove.Velocity3"),
+            ("pose_covariance", 7, "[]double"),
+            ("velocity_covariance", 8, "[]double"),
+        ],
+    ),
+    (
+        "CompressedImage",
+        &[
+            ("timestamp", 1, TIMESTAMP),
+            ("frame_id", 4, "string"),
+            ("data", 2, "bytes"),
+            ("format", 3, "string"),
         ],
     ),
     (

@@ -91,6 +91,36 @@ pub(super) struct CubePrimitive {
     pub(super) color: Option<Color>,
 }
 
+/// A value of `LinePrimitive::kind`: the last point is joined to the first.
+pub(super) const LINE_LOOP: i32 = 1;
+
+#[derive(Clone, Copy, PartialEq, prost::Message)]
+pub(super) struct Point3 {
+    #[prost(double, tag = "1")]
+    pub(super) x: f64,
+    #[prost(double, tag = "2")]
+    pub(super) y: f64,
+    #[prost(double, tag = "3")]
+    pub(super) z: f64,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct LinePrimitive {
+    #[prost(int32, tag = "1")]
+    pub(super) kind: i32,
+    #[prost(message, optional, tag = "2")]
+    pub(super) pose: Option<Pose>,
+    /// In pixels, if it does not depend on the distance.
+    #[prost(double, tag = "3")]
+    pub(super) thickness: f64,
+    #[prost(bool, tag = "4")]
+    pub(super) scale_invariant: bool,
+    #[prost(message, repeated, tag = "5")]
+    pub(super) points: Vec<Point3>,
+    #[prost(message, optional, tag = "6")]
+    pub(super) color: Option<Color>,
+}
+
 #[derive(Clone, PartialEq, prost::Message)]
 pub(super) struct SceneEntity {
     #[prost(message, optional, tag = "1")]
@@ -103,6 +133,8 @@ pub(super) struct SceneEntity {
     pub(super) frame_locked: bool,
     #[prost(message, repeated, tag = "8")]
     pub(super) cubes: Vec<CubePrimitive>,
+    #[prost(message, repeated, tag = "11")]
+    pub(super) lines: Vec<LinePrimitive>,
 }
 
 #[derive(Clone, PartialEq, prost::Message)]
@@ -122,6 +154,37 @@ pub(super) struct SceneUpdate {
     pub(super) deletions: Vec<SceneEntityDeletion>,
     #[prost(message, repeated, tag = "2")]
     pub(super) entities: Vec<SceneEntity>,
+}
+
+/// Velocities are along the axes of the child.
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct Odometry {
+    #[prost(message, optional, tag = "1")]
+    pub(super) timestamp: Option<Timestamp>,
+    #[prost(string, tag = "2")]
+    pub(super) frame_id: String,
+    #[prost(string, tag = "3")]
+    pub(super) child_frame_id: String,
+    #[prost(message, optional, tag = "4")]
+    pub(super) pose: Option<Pose>,
+    /// In m/s.
+    #[prost(message, optional, tag = "5")]
+    pub(super) linear_velocity: Option<Vector3>,
+    /// In rad/s.
+    #[prost(message, optional, tag = "6")]
+    pub(super) angular_velocity: Option<Vector3>,
+}
+
+#[derive(Clone, PartialEq, prost::Message)]
+pub(super) struct CompressedImage {
+    #[prost(message, optional, tag = "1")]
+    pub(super) timestamp: Option<Timestamp>,
+    #[prost(bytes = "vec", tag = "2")]
+    pub(super) data: Vec<u8>,
+    #[prost(string, tag = "3")]
+    pub(super) format: String,
+    #[prost(string, tag = "4")]
+    pub(super) frame_id: String,
 }
 
 #[derive(Clone, PartialEq, prost::Message)]

@@ -3,16 +3,27 @@
 //! | topic | message |
 //! |---|---|
 //! | `/tf` | `foxglove.FrameTransforms`: world to rig at each step, rig to each camera at the begin |
+//! | `/camera/N/image` | `foxglove.CompressedImage`: JPEG, if the caller renders the images |
+//! | `/camera/N/calibration` | `foxglove.CameraCalibration`; `/wildcity/episode` says how far it is off the lens |
 //! | `/actors` | `foxglove.SceneUpdate`: a box for each actor, and the ego's |
-//! | `/route`, `/plan` | `foxglove.PosesInFrame`: the recorded drive in the world, the agent's trajectory in the rig |
-//! | `/camera/N/calibration` | `foxglove.CameraCalibration`; not of f-theta lenses, which it cannot describe |
+//! | `/map` | `foxglove.SceneUpdate`: the outlines of the lanes |
+//! | `/ego/odometry` | `foxglove.Odometry`: pose, velocity, yaw rate |
+//! | `/ego/path`, `/route` | `foxglove.PosesInFrame` in the world: all that was driven, and the recorded drive |
+//! | `/plan` | `foxglove.PosesInFrame` in the rig: the agent's trajectory, when it was decided |
 //! | `/log` | `foxglove.Log`: events |
 //! | `/wildcity/episode`, `step`, `event`, `result` | JSON: the lines of the record |
 //!
 //! Times are those of the episode plus 1,000 s, since MCAP has no times below 0 and a warm-up has.
 
+mod calibration;
+mod container;
+mod convert;
 mod descriptors;
+mod file;
 mod messages;
+mod output;
+mod parts;
 mod write;
 
-pub use write::{ExportError, Exported, export};
+pub use file::{export_file, mcap_of, write_whole};
+pub use write::{EpisodeExport, ExportError, Exported, ExportedImage, export};

@@ -1,53 +1,77 @@
 //! Writes an episode as MCAP.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{Seek, Write};
+use std::io::{self, Seek, Write};
+use std::iter::Peekable;
+use std::path::PathBuf;
+use std::slice::Iter;
 
-use mcap::records::MessageHeader;
-use mcap::{Compression, WriteOptions, Writer};
-use prost::Message;
-use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::geometry::camera::Lens;
+use wildcity_score::EgoSample;
 
-use super::descriptors::descriptor_set;
+use super::calibration::Calibration;
+use super::container::McapFile;
+use super::convert::{color, cube, entity, frame_of, place, pose, timestamp, transform};
 use super::messages as foxglove;
-use crate::file::{EpisodeFile, Frame};
-use crate::lines::{ActorsLine, Event, EventLine};
-
-/// What is added to the times of an episode, in microseconds.
-const TIME_OFFSET_US: i64 = 1_000_000_000;
-
-/// Bytes of a chunk before compression: about a second of 30 actors at 10 Hz.
-const CHUNK_BYTES: u64 = 64 << 10;
+use super::parts::{command_of, event_text, motions, odometry, plan_of};
+use crate::file::{EpisodeFile, Frame, ReadError};
+use crate::lines::{ActorsLine, EventLine, ScenarioLine};
 
 /// Why an episode could not be exported.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
+    /// The record cannot be read.
+    #[error("{0}")]
+    Read(#[from] ReadError),
+    /// The file cannot be written.
+    #[error("cannot write {}: {cause}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// The file cannot be written.
+    #[error("cannot write the MCAP file: {0}")]
+    Output(io::Error),
     /// The file cannot be written.
     #[error("cannot write the MCAP file: {0}")]
     Mcap(#[from] mcap::McapError),
     /// A line cannot be written as JSON.
     #[error("cannot write a line as JSON: {0}")]
     Json(#[from] serde_json::Error),
+    /// The images of the episode cannot be made.
+    #[error("{0}")]
+    Images(String),
     /// The episode has no frame.
     #[error("the episode has no frame: nothing was driven")]
     Empty,
 }
 
 /// What an export wrote.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exported {
     /// Messages.
     pub messages: u64,
-    /// Cameras whose lens Foxglove's calibration cannot describe.
-    pub without_calibration: usize,
+    /// How far the calibrations are off the lenses at most, in pixels.
+    pub calibration_error_px: f64,
 }
 
-/// Writes an episode. `rig` is that of its header; without one there are no calibrations.
+/// An image of an episode.
+#[derive(Clone, Copy, Debug)]
+pub struct ExportedImage<'a> {
+    /// Index of its camera in the rig.
+    pub camera: usize,
+    /// When it was taken, in microseconds.
+    pub time_us: i64,
+    /// It as JPEG.
+    pub jpeg: &'a [u8],
+}
+
+/// Writes an episode without images. `rig` is that of its header; without one there are no calibrations.
 ///
 /// # Errors
 /// The file cannot be written, or the episode has no frame.
@@ -56,97 +80,194 @@ pub fn export<W: Write + Seek>(
     rig: Option<&Rig>,
     out: W,
 ) -> Result<Exported, ExportError> {
-    let frames = episode.driven();
-    let first = frames.first().ok_or(ExportError::Empty)?;
-    let mut file = McapFile::create(out)?;
-    let without_calibration = file.begin(episode, rig, first.time_us)?;
-    let mut shown = BTreeSet::new();
-    for frame in &frames {
-        let actors = episode.actors.iter().rev().find(|line| line.step == frame.step);
-        file.step(episode, frame)?;
-        file.boxes(episode, frame, actors, &mut shown)?;
-    }
-    for line in &episode.events {
-        file.event(episode, line)?;
-    }
-    if let Some(result) = &episode.result {
-        let end_us = frames.last().map_or(0, |frame| frame.time_us);
-        file.json("/wildcity/result", "wildcity.Result", end_us, result)?;
-    }
-    let messages = file.messages;
-    file.writer.finish()?;
-    Ok(Exported { messages, without_calibration })
+    EpisodeExport::begin(episode, rig, out)?.finish()
 }
 
-struct McapFile<W: Write + Seek> {
-    writer: Writer<W>,
-    /// Channel of each topic.
-    channels: BTreeMap<String, u16>,
-    /// Schema of each name.
-    schemas: BTreeMap<&'static str, u16>,
-    descriptors: Vec<u8>,
-    messages: u64,
+/// An MCAP file that is being written: messages in the order of time, as far as images are added in that order.
+pub struct EpisodeExport<'a, W: Write + Seek> {
+    file: McapFile<W>,
+    episode: &'a EpisodeFile,
+    /// The frames that are not written yet, each with the ego's motion.
+    frames: Peekable<std::vec::IntoIter<(&'a Frame, Option<EgoSample>)>>,
+    events: Peekable<Iter<'a, EventLine>>,
+    /// The actors at each step.
+    actors: BTreeMap<u64, &'a ActorsLine>,
+    /// Those that have a box now.
+    shown: BTreeSet<u16>,
+    end_us: i64,
+    calibration_error_px: f64,
 }
 
-impl<W: Write + Seek> McapFile<W> {
-    fn create(out: W) -> Result<Self, ExportError> {
-        let options = WriteOptions::new()
-            .compression(Some(Compression::Zstd))
-            .chunk_size(Some(CHUNK_BYTES))
-            // Without threads of its own: a record is small.
-            .compression_threads(0)
-            .library(concat!("wildcity ", env!("CARGO_PKG_VERSION")));
-        let descriptors = descriptor_set();
-        let channels = BTreeMap::new();
-        let schemas = BTreeMap::new();
-        Ok(Self { writer: options.create(out)?, channels, schemas, descriptors, messages: 0 })
+impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
+    /// Begins a file, with what does not change: the header, the rig, the route and the map.
+    ///
+    /// # Errors
+    /// The file cannot be written, or the episode has no frame.
+    pub fn begin(episode: &'a EpisodeFile, rig: Option<&Rig>, out: W) -> Result<Self, ExportError> {
+        let frames = episode.driven();
+        let begin_us = frames.first().ok_or(ExportError::Empty)?.time_us;
+        let end_us = frames.last().map_or(begin_us, |last| last.time_us);
+        let cameras = rig.map_or(&[][..], |rig| &rig.cameras);
+        let calibrations: Vec<Calibration> = cameras
+            .iter()
+            .enumerate()
+            .map(|(k, camera)| Calibration::of(k, camera, begin_us))
+            .collect();
+        let errors_px = calibrations.iter().map(|calibration| calibration.error_px);
+        let motions = motions(&frames, episode.header.dt_us);
+        let mut export = Self {
+            file: McapFile::create(out)?,
+            episode,
+            frames: frames.iter().copied().zip(motions).collect::<Vec<_>>().into_iter().peekable(),
+            events: episode.events.iter().peekable(),
+            // Where a session went back, and in a warm-up, the last line of a step holds.
+            actors: episode.actors.iter().map(|line| (line.step, line)).collect(),
+            shown: BTreeSet::new(),
+            end_us,
+            calibration_error_px: errors_px.fold(0.0, f64::max),
+        };
+        export.about(rig, &calibrations, begin_us)?;
+        export.rig(rig, calibrations, begin_us)?;
+        export.path(&frames, begin_us)?;
+        if let Some(scenario) = &episode.scenario {
+            export.route(scenario, begin_us)?;
+            export.map(scenario, begin_us)?;
+        }
+        Ok(export)
     }
 
-    /// What does not change: the header, the route, where the cameras are.
-    fn begin(
+    /// Adds an image, behind all that happened before it.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn image(&mut self, image: &ExportedImage<'_>) -> Result<(), ExportError> {
+        self.write_until(image.time_us)?;
+        let message = foxglove::CompressedImage {
+            timestamp: Some(timestamp(image.time_us)),
+            frame_id: frame_of(image.camera),
+            data: image.jpeg.to_vec(),
+            format: "jpeg".to_owned(),
+        };
+        let topic = format!("/camera/{}/image", image.camera);
+        self.file.proto(&topic, "foxglove.CompressedImage", image.time_us, &message)
+    }
+
+    /// Writes what is left, and the index.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn finish(mut self) -> Result<Exported, ExportError> {
+        self.write_until(i64::MAX)?;
+        if let Some(result) = &self.episode.result {
+            self.file.json("/wildcity/result", "wildcity.Result", self.end_us, result)?;
+        }
+        let calibration_error_px = self.calibration_error_px;
+        Ok(Exported { messages: self.file.finish()?, calibration_error_px })
+    }
+
+    /// Writes frames and events before a time.
+    fn write_until(&mut self, time_us: i64) -> Result<(), ExportError> {
+        while let Some((frame, motion)) = self.frames.next_if(|(frame, _)| frame.time_us < time_us)
+        {
+            while let Some(event) = self.events.next_if(|event| event.time_us <= frame.time_us) {
+                self.event(event)?;
+            }
+            self.step(frame, motion)?;
+            self.boxes(frame)?;
+            // A plan is in the frame of the rig at the begin of its step.
+            if let Some(poses) = self.frames.peek().and_then(|(next, _)| plan_of(next)) {
+                self.poses("/plan", "rig", frame.time_us, poses)?;
+            }
+        }
+        if self.frames.peek().is_none() {
+            while let Some(event) = self.events.next() {
+                self.event(event)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn about(
         &mut self,
-        episode: &EpisodeFile,
         rig: Option<&Rig>,
+        calibrations: &[Calibration],
         time_us: i64,
-    ) -> Result<usize, ExportError> {
+    ) -> Result<(), ExportError> {
+        let episode = self.episode;
         let header = &episode.header;
+        let lenses = calibrations.iter().map(|calibration| {
+            let model = &calibration.message.distortion_model;
+            json!({ "model": model, "error_px": calibration.error_px })
+        });
         let about = json!({
             "build": header.build, "session": header.session, "twin": header.twin,
             "version": header.version, "version_hash": header.version_hash, "backend": header.backend,
             "seed": header.seed, "dynamics": header.dynamics, "start": header.start, "dt_us": header.dt_us,
-            "rig": rig, "scenario": episode.scenario, "end": episode.end.as_ref().map(|end| json!({
+            "rig": rig, "calibrations": lenses.collect::<Vec<_>>(), "scenario": episode.scenario,
+            "end": episode.end.as_ref().map(|end| json!({
                 "outcome": end.outcome, "steps": end.steps, "time_us": end.time_us,
                 "distance_m": end.distance_m, "least_trust": end.least_trust,
             })),
         });
-        self.json("/wildcity/episode", "wildcity.Episode", time_us, &about)?;
-        if let Some(scenario) =
-            episode.scenario.as_ref().filter(|scenario| !scenario.route.is_empty())
-        {
-            let at = |xyz_m: [f64; 3]| Pose { position_m: xyz_m.into(), ..Pose::IDENTITY };
-            let poses = scenario.route.iter().map(|point| pose(&at(point.1)));
-            self.poses("/route", "world", time_us, poses.collect())?;
-        }
-        let cameras = rig.map_or(&[][..], |rig| &rig.cameras);
+        self.file.json("/wildcity/episode", "wildcity.Episode", time_us, &about)
+    }
+
+    fn rig(
+        &mut self,
+        rig: Option<&Rig>,
+        calibrations: Vec<Calibration>,
+        time_us: i64,
+    ) -> Result<(), ExportError> {
+        let cameras = rig.map_or(&[][..], |rig| &rig.cameras).iter().enumerate();
         let transforms = cameras
-            .iter()
-            .enumerate()
             .map(|(k, camera)| transform("rig", &frame_of(k), time_us, &camera.rig_from_camera));
         let transforms: Vec<_> = transforms.collect();
         if !transforms.is_empty() {
             self.transforms(time_us, transforms)?;
         }
-        let mut without_calibration = 0;
-        for (k, camera) in cameras.iter().enumerate() {
-            match calibration(k, camera, time_us) {
-                Some(message) => {
-                    let topic = format!("/camera/{k}/calibration");
-                    self.proto(&topic, "foxglove.CameraCalibration", time_us, &message)?;
-                }
-                None => without_calibration += 1,
-            }
+        for (k, calibration) in calibrations.into_iter().enumerate() {
+            let topic = format!("/camera/{k}/calibration");
+            self.file.proto(&topic, "foxglove.CameraCalibration", time_us, &calibration.message)?;
         }
-        Ok(without_calibration)
+        Ok(())
+    }
+
+    /// All that the ego drove.
+    fn path(&mut self, frames: &[&Frame], time_us: i64) -> Result<(), ExportError> {
+        let poses = frames.iter().filter_map(|frame| frame.poses.last()).map(pose);
+        self.poses("/ego/path", "world", time_us, poses.collect())
+    }
+
+    fn route(&mut self, scenario: &ScenarioLine, time_us: i64) -> Result<(), ExportError> {
+        if scenario.route.is_empty() {
+            return Ok(());
+        }
+        let poses = scenario.route.iter().map(|point| place(point.1));
+        self.poses("/route", "world", time_us, poses.collect())
+    }
+
+    /// The outlines of the lanes, at the height of the route's begin: a map in a record is flat.
+    fn map(&mut self, scenario: &ScenarioLine, time_us: i64) -> Result<(), ExportError> {
+        if scenario.lanes.is_empty() {
+            return Ok(());
+        }
+        let z = scenario.route.first().map_or(0.0, |point| point.1[2]);
+        let outlines = scenario.lanes.iter().map(|lane| foxglove::LinePrimitive {
+            kind: foxglove::LINE_LOOP,
+            pose: Some(place([0.0; 3])),
+            thickness: 2.0,
+            scale_invariant: true,
+            points: lane.outline.iter().map(|&[x, y]| foxglove::Point3 { x, y, z }).collect(),
+            color: Some(match (lane.route, lane.intersection) {
+                (true, _) => color(0.0, 0.62, 0.45, 1.0),
+                (false, true) => color(0.94, 0.89, 0.26, 1.0),
+                (false, false) => color(0.6, 0.6, 0.6, 1.0),
+            }),
+        });
+        let lines = outlines.collect();
+        let entities = vec![foxglove::SceneEntity { lines, ..entity(time_us, "world", "lanes") }];
+        let update = foxglove::SceneUpdate { deletions: Vec::new(), entities };
+        self.file.proto("/map", "foxglove.SceneUpdate", time_us, &update)
     }
 
     fn transforms(
@@ -155,108 +276,7 @@ impl<W: Write + Seek> McapFile<W> {
         transforms: Vec<foxglove::FrameTransform>,
     ) -> Result<(), ExportError> {
         let message = foxglove::FrameTransforms { transforms };
-        self.proto("/tf", "foxglove.FrameTransforms", time_us, &message)
-    }
-
-    /// The ego and its plan at a step.
-    fn step(&mut self, episode: &EpisodeFile, frame: &Frame) -> Result<(), ExportError> {
-        let time_us = frame.time_us;
-        let Some(world_from_rig) = frame.poses.last() else { return Ok(()) };
-        self.transforms(time_us, vec![transform("world", "rig", time_us, world_from_rig)])?;
-        if let Some(poses) = plan_of(frame) {
-            self.poses("/plan", "rig", time_us, poses)?;
-        }
-        let line = json!({
-            "step": frame.step, "time_us": time_us, "request": frame.request, "command": command_of(frame),
-            "terminated": frame.terminated, "frame_hash": frame.frame_hash, "images": frame.images,
-            "cameras": episode.header.rig.cameras.iter().map(|camera| &camera.name).collect::<Vec<_>>(),
-        });
-        self.json("/wildcity/step", "wildcity.Step", time_us, &line)
-    }
-
-    /// A box for the ego and for each actor; those that left are deleted.
-    fn boxes(
-        &mut self,
-        episode: &EpisodeFile,
-        frame: &Frame,
-        actors: Option<&ActorsLine>,
-        shown: &mut BTreeSet<u16>,
-    ) -> Result<(), ExportError> {
-        let Some(scenario) = &episode.scenario else { return Ok(()) };
-        let time = Some(timestamp(frame.time_us));
-        let [length_m, width_m, height_m] = scenario.ego.size;
-        let center_m = [scenario.ego.center_x, 0.0, 0.5 * height_m];
-        let ego_center = Pose { position_m: center_m.into(), ..Pose::IDENTITY };
-        let blue = foxglove::Color { r: 0.0, g: 0.45, b: 0.7, a: 0.5 };
-        let mut entities = vec![entity(
-            frame.time_us,
-            "rig",
-            "ego",
-            &ego_center,
-            [length_m, width_m, height_m],
-            blue,
-        )];
-        let mut there = BTreeSet::new();
-        for state in actors.iter().flat_map(|line| &line.actors) {
-            let (Some(state), Some(actor)) =
-                (state.state(), scenario.actors.get(usize::from(state.0)))
-            else {
-                continue;
-            };
-            there.insert(state.index);
-            let up_m =
-                Pose { position_m: [0.0, 0.0, 0.5 * actor.size[2]].into(), ..Pose::IDENTITY };
-            let center = state.world_from_actor * up_m;
-            let orange = foxglove::Color { r: 0.84, g: 0.37, b: 0.0, a: 0.7 };
-            entities.push(entity(frame.time_us, "world", &actor.name, &center, actor.size, orange));
-        }
-        let name =
-            |index: &u16| scenario.actors.get(usize::from(*index)).map(|actor| actor.name.clone());
-        let deletions = shown
-            .difference(&there)
-            .filter_map(name)
-            .map(|id| foxglove::SceneEntityDeletion { timestamp: time, kind: 0, id });
-        let update = foxglove::SceneUpdate { deletions: deletions.collect(), entities };
-        *shown = there;
-        self.proto("/actors", "foxglove.SceneUpdate", frame.time_us, &update)
-    }
-
-    fn event(&mut self, episode: &EpisodeFile, line: &EventLine) -> Result<(), ExportError> {
-        const INFO: i32 = 2;
-        const WARNING: i32 = 3;
-        let name = |index: u16| {
-            let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
-            actors.get(usize::from(index)).map_or(index.to_string(), |actor| actor.name.clone())
-        };
-        let (level, message) = match &line.event {
-            Event::Contact(contact) => {
-                let fault = if contact.ego_at_fault { "at fault" } else { "not at fault" };
-                (
-                    WARNING,
-                    format!(
-                        "contact with {} at {:.2} m/s, {fault}",
-                        name(contact.actor),
-                        contact.impact_mps
-                    ),
-                )
-            }
-            Event::StaticContact { impact_mps, .. } => {
-                (WARNING, format!("contact with the twin at {impact_mps:.2} m/s"))
-            }
-            Event::OffModel { trust } => {
-                (WARNING, format!("left the trained area: trust {trust:.3}"))
-            }
-            Event::Triggered { actor, trigger } => {
-                (INFO, format!("{} fires trigger {trigger}", name(*actor)))
-            }
-            Event::Appeared { actor } => (INFO, format!("{} appears", name(*actor))),
-            Event::Left { actor } => (INFO, format!("{} leaves", name(*actor))),
-            Event::Ended { rule } => (INFO, format!("ended by the rule {rule}")),
-        };
-        let timestamp = Some(timestamp(line.time_us));
-        let log = foxglove::Log { timestamp, level, message, name: "wildcity".to_owned() };
-        self.proto("/log", "foxglove.Log", line.time_us, &log)?;
-        self.json("/wildcity/event", "wildcity.Event", line.time_us, line)
+        self.file.proto("/tf", "foxglove.FrameTransforms", time_us, &message)
     }
 
     fn poses(
@@ -268,180 +288,62 @@ impl<W: Write + Seek> McapFile<W> {
     ) -> Result<(), ExportError> {
         let timestamp = Some(timestamp(time_us));
         let message = foxglove::PosesInFrame { timestamp, frame_id: frame.to_owned(), poses };
-        self.proto(topic, "foxglove.PosesInFrame", time_us, &message)
+        self.file.proto(topic, "foxglove.PosesInFrame", time_us, &message)
     }
 
-    fn proto(
-        &mut self,
-        topic: &str,
-        schema: &'static str,
-        time_us: i64,
-        message: &impl Message,
-    ) -> Result<(), ExportError> {
-        let channel = self.channel(topic, schema, "protobuf")?;
-        self.write(channel, time_us, &message.encode_to_vec())
+    /// The ego at a step.
+    fn step(&mut self, frame: &Frame, motion: Option<EgoSample>) -> Result<(), ExportError> {
+        let time_us = frame.time_us;
+        let Some(world_from_rig) = frame.poses.last() else { return Ok(()) };
+        self.transforms(time_us, vec![transform("world", "rig", time_us, world_from_rig)])?;
+        let odometry = odometry(time_us, world_from_rig, motion);
+        self.file.proto("/ego/odometry", "foxglove.Odometry", time_us, &odometry)?;
+        let cameras = &self.episode.header.rig.cameras;
+        let line = json!({
+            "step": frame.step, "time_us": time_us, "request": frame.request, "command": command_of(frame),
+            "terminated": frame.terminated, "frame_hash": frame.frame_hash, "images": frame.images,
+            "cameras": cameras.iter().map(|camera| &camera.name).collect::<Vec<_>>(),
+        });
+        self.file.json("/wildcity/step", "wildcity.Step", time_us, &line)
     }
 
-    fn json(
-        &mut self,
-        topic: &str,
-        schema: &'static str,
-        time_us: i64,
-        message: &impl Serialize,
-    ) -> Result<(), ExportError> {
-        let channel = self.channel(topic, schema, "json")?;
-        self.write(channel, time_us, &serde_json::to_vec(message)?)
-    }
-
-    /// The channel of a topic, created with its first message.
-    fn channel(
-        &mut self,
-        topic: &str,
-        schema: &'static str,
-        encoding: &str,
-    ) -> Result<u16, ExportError> {
-        if let Some(&channel) = self.channels.get(topic) {
-            return Ok(channel);
-        }
-        let schema = match self.schemas.get(schema) {
-            Some(&schema) => schema,
-            None => {
-                let id = match encoding {
-                    "protobuf" => self.writer.add_schema(schema, "protobuf", &self.descriptors)?,
-                    _ => self.writer.add_schema(schema, "jsonschema", br#"{"type":"object"}"#)?,
-                };
-                self.schemas.insert(schema, id);
-                id
-            }
+    /// A box for the ego and for each actor; those that left are deleted.
+    fn boxes(&mut self, frame: &Frame) -> Result<(), ExportError> {
+        let time_us = frame.time_us;
+        let Some(scenario) = &self.episode.scenario else { return Ok(()) };
+        let boxed = |frame: &str, id: &str, center: &Pose, size_m: [f64; 3], color| {
+            let cubes = vec![cube(center, size_m, color)];
+            foxglove::SceneEntity { cubes, ..entity(time_us, frame, id) }
         };
-        let channel = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
-        self.channels.insert(topic.to_owned(), channel);
-        Ok(channel)
-    }
-
-    fn write(&mut self, channel_id: u16, time_us: i64, data: &[u8]) -> Result<(), ExportError> {
-        let log_time = nanoseconds(time_us);
-        let sequence = u32::try_from(self.messages).unwrap_or(u32::MAX);
-        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
-        self.writer.write_to_known_channel(&header, data)?;
-        self.messages += 1;
-        Ok(())
-    }
-}
-
-/// The command without what `/plan` has: of a trajectory, the times of its poses are left. Poses as text would be two thirds
-/// of a file.
-fn command_of(frame: &Frame) -> Option<Value> {
-    let command = frame.command.as_ref()?;
-    let Some(poses) = command.get("trajectory").and_then(Value::as_array) else {
-        return Some(command.clone());
-    };
-    let times_us: Vec<&Value> = poses.iter().filter_map(|pose| pose.get("time_us")).collect();
-    Some(json!({ "trajectory": { "times_us": times_us, "poses": "/plan" } }))
-}
-
-/// The agent's trajectory in the rig's frame, if that was its command.
-fn plan_of(frame: &Frame) -> Option<Vec<foxglove::Pose>> {
-    let poses = frame.command.as_ref()?.get("trajectory")?.as_array()?;
-    let read =
-        |value: &Value| serde_json::from_value::<Pose>(value.get("start_from_rig")?.clone()).ok();
-    Some(poses.iter().filter_map(read).map(|read| pose(&read)).collect())
-}
-
-fn nanoseconds(time_us: i64) -> u64 {
-    u64::try_from(time_us.saturating_add(TIME_OFFSET_US)).unwrap_or(0).saturating_mul(1000)
-}
-
-fn timestamp(time_us: i64) -> foxglove::Timestamp {
-    let nanoseconds = nanoseconds(time_us);
-    foxglove::Timestamp {
-        seconds: (nanoseconds / 1_000_000_000) as i64,
-        nanos: (nanoseconds % 1_000_000_000) as i32,
-    }
-}
-
-fn vector([x, y, z]: [f64; 3]) -> foxglove::Vector3 {
-    foxglove::Vector3 { x, y, z }
-}
-
-fn pose(pose: &Pose) -> foxglove::Pose {
-    foxglove::Pose {
-        position: Some(vector(pose.position_m.to_array())),
-        orientation: Some(quaternion(pose)),
-    }
-}
-
-fn quaternion(pose: &Pose) -> foxglove::Quaternion {
-    let [w, x, y, z] = pose.q_wxyz();
-    foxglove::Quaternion { x, y, z, w }
-}
-
-fn transform(parent: &str, child: &str, time_us: i64, pose: &Pose) -> foxglove::FrameTransform {
-    foxglove::FrameTransform {
-        timestamp: Some(timestamp(time_us)),
-        parent_frame_id: parent.to_owned(),
-        child_frame_id: child.to_owned(),
-        translation: Some(vector(pose.position_m.to_array())),
-        rotation: Some(quaternion(pose)),
-    }
-}
-
-/// The frame of a camera.
-fn frame_of(camera: usize) -> String {
-    format!("camera/{camera}")
-}
-
-fn entity(
-    time_us: i64,
-    frame: &str,
-    id: &str,
-    center: &Pose,
-    size_m: [f64; 3],
-    color: foxglove::Color,
-) -> foxglove::SceneEntity {
-    let cube = foxglove::CubePrimitive {
-        pose: Some(pose(center)),
-        size: Some(vector(size_m)),
-        color: Some(color),
-    };
-    foxglove::SceneEntity {
-        timestamp: Some(timestamp(time_us)),
-        frame_id: frame.to_owned(),
-        id: id.to_owned(),
-        frame_locked: true,
-        cubes: vec![cube],
-    }
-}
-
-/// The calibration of a camera by a model that Foxglove knows; `None` for f-theta.
-fn calibration(
-    index: usize,
-    camera: &wildcity_scene::rig::RigCamera,
-    time_us: i64,
-) -> Option<foxglove::CameraCalibration> {
-    let size = &camera.camera;
-    let lens = &size.pinhole;
-    let (model, d) = match &size.lens {
-        Lens::Pinhole => ("plumb_bob", vec![0.0; 5]),
-        Lens::OpenCv(lens) => {
-            let [k1, k2, k3, k4, k5, k6] = lens.k();
-            let [p1, p2] = lens.p();
-            ("rational_polynomial", vec![k1, k2, p1, p2, k3, k4, k5, k6])
+        let size_m = scenario.ego.size;
+        let center_m = [scenario.ego.center_x, 0.0, 0.5 * size_m[2]];
+        let center = Pose { position_m: center_m.into(), ..Pose::IDENTITY };
+        let mut entities = vec![boxed("rig", "ego", &center, size_m, color(0.0, 0.45, 0.7, 0.5))];
+        let mut there = BTreeSet::new();
+        let states = self.actors.get(&frame.step).map_or(&[][..], |line| &line.actors);
+        for state in states.iter().filter_map(|state| state.state()) {
+            let Some(actor) = scenario.actors.get(usize::from(state.index)) else { continue };
+            there.insert(state.index);
+            let up_m = [0.0, 0.0, 0.5 * actor.size[2]];
+            let center =
+                state.world_from_actor * Pose { position_m: up_m.into(), ..Pose::IDENTITY };
+            let orange = color(0.84, 0.37, 0.0, 0.7);
+            entities.push(boxed("world", &actor.name, &center, actor.size, orange));
         }
-        Lens::Fisheye(lens) => ("kannala_brandt", lens.k().to_vec()),
-        Lens::FTheta(_) => return None,
-    };
-    let k = vec![lens.fx, 0.0, lens.cx, 0.0, lens.fy, lens.cy, 0.0, 0.0, 1.0];
-    let p = vec![lens.fx, 0.0, lens.cx, 0.0, 0.0, lens.fy, lens.cy, 0.0, 0.0, 0.0, 1.0, 0.0];
-    Some(foxglove::CameraCalibration {
-        timestamp: Some(timestamp(time_us)),
-        width: size.width_px,
-        height: size.height_px,
-        distortion_model: model.to_owned(),
-        d,
-        k,
-        r: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        p,
-        frame_id: frame_of(index),
-    })
+        let name = |index: &u16| Some(scenario.actors.get(usize::from(*index))?.name.clone());
+        let deletions = self.shown.difference(&there).filter_map(name).map(|id| {
+            foxglove::SceneEntityDeletion { timestamp: Some(timestamp(time_us)), kind: 0, id }
+        });
+        let update = foxglove::SceneUpdate { deletions: deletions.collect(), entities };
+        self.shown = there;
+        self.file.proto("/actors", "foxglove.SceneUpdate", time_us, &update)
+    }
+
+    fn event(&mut self, line: &EventLine) -> Result<(), ExportError> {
+        let (level, message) = event_text(self.episode, &line.event);
+        let timestamp = Some(timestamp(line.time_us));
+        let log = foxglove::Log { timestamp, level, message, name: "wildcity".to_owned() };
+        self.file.proto("/log", "foxglove.Log", line.time_us, &log)?;
+        self.file.json("/wildcity/event", "wildcity.Event", line.time_us, line)
+    }
 }

@@ -219,7 +219,7 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::NothingToWatch { .. } => at(Code::UnknownSession, "session"),
         Fault::SessionEnded => plain(Code::UnknownSession),
         Fault::WatcherSent => plain(Code::InvalidRequest),
-        Fault::NoEpisode { .. } => at(Code::UnknownState, "episode"),
+        Fault::NoEpisode { .. } | Fault::NoMcap { .. } => at(Code::UnknownState, "episode"),
         Fault::Forbidden { field, .. } => at(Code::Forbidden, field),
         Fault::ForbiddenOrigin { .. } => at(Code::Forbidden, "origin"),
         Fault::NoUpgrade => at(Code::InvalidRequest, "upgrade"),

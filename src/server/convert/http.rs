@@ -277,11 +277,13 @@ pub(crate) fn ticket(ticket: String) -> Value {
 pub(crate) struct ListedEpisode {
     pub(crate) listed: Listed,
     pub(crate) file: EpisodeFile,
+    /// Why it has no MCAP file.
+    pub(crate) mcap_error: Option<String>,
 }
 
 /// Recorded episodes.
 pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
-    let episode = |ListedEpisode { listed, file }: &ListedEpisode| {
+    let episode = |ListedEpisode { listed, file, mcap_error }: &ListedEpisode| {
         let driven = file.driven();
         let last = driven.last();
         let since_1970 = listed.modified.and_then(|time| time.duration_since(UNIX_EPOCH).ok());
@@ -292,6 +294,8 @@ pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
             steps: last.map_or(0, |frame| frame.step),
             time_us: last.map_or(0, |frame| frame.time_us),
             bytes: listed.bytes,
+            mcap_bytes: listed.mcap_bytes,
+            mcap_error: mcap_error.clone().filter(|_| listed.mcap_bytes.is_none()),
             modified_us: since_1970.map(|time| time.as_micros() as u64),
             scenario: file.scenario.as_ref().map(|scenario| scenario.name.clone()),
             outcome: file.end.as_ref().map(|end| end.outcome.clone()),

@@ -1,5 +1,6 @@
 //! Recorded episodes over HTTP.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use axum::extract::{Path, State};
@@ -7,7 +8,7 @@ use axum::http::header;
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
-use wildcity_episode::{EpisodeFile, list as list_dir, read_text};
+use wildcity_episode::{EpisodeFile, list as list_dir, read_mcap, read_text};
 use wildcity_scene::rig::is_name;
 
 use crate::auth::{Grant, Role};
@@ -32,7 +33,9 @@ pub(super) async fn list(
         // Files of other builds, and those whose first line is not written yet, are left out.
         let read = newest.filter_map(|listed| {
             let file = EpisodeFile::read(&listed.path).ok()?;
-            grant.allows_twin(&file.header.twin).then_some(ListedEpisode { listed, file })
+            let mcap_error = state.engine.export_failure(&listed.name);
+            let is_allowed = grant.allows_twin(&file.header.twin);
+            is_allowed.then_some(ListedEpisode { listed, file, mcap_error })
         });
         Ok::<_, Fault>(read.collect::<Vec<_>>())
     });
@@ -47,23 +50,58 @@ pub(super) async fn show(
 ) -> HttpResult {
     grant.require(Role::Admin)?;
     let text = blocking(move || {
-        // A name, and so no path to another file.
-        let unknown = || Fault::NoEpisode { name: name.clone() };
-        let stem = name.rsplit_once('-').map_or(name.as_str(), |(session, _)| session);
-        if !is_name(stem) || name.contains(['/', '\\']) {
-            return Err(unknown());
-        }
-        let path = state.episodes.join(format!("{name}.jsonl"));
-        let file = EpisodeFile::read(&path).map_err(|_| unknown())?;
-        grant.require_twin(&file.header.twin)?;
+        let path = record_of(&state, &grant, &name)?;
         match read_text(&path, limits::EPISODE_BYTES) {
             Ok(Some(text)) => Ok(text),
-            Ok(None) => Err(Fault::OutOfRange {
-                field: "episode".to_owned(),
-                must: format!("larger than {} bytes: read its file", limits::EPISODE_BYTES),
-            }),
-            Err(_) => Err(unknown()),
+            Ok(None) => Err(too_large()),
+            Err(_) => Err(Fault::NoEpisode { name }),
         }
     });
     Ok(([(header::CONTENT_TYPE, "application/x-ndjson")], text.await?).into_response())
+}
+
+/// `GET /v1/episodes/{episode}/mcap`: the record as MCAP. Waits for an export that is under way.
+pub(super) async fn mcap(
+    State(state): State<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+) -> HttpResult {
+    grant.require(Role::Admin)?;
+    let (checked, its_name) = (state.clone(), name.clone());
+    let record = blocking(move || record_of(&checked, &grant, &its_name)).await?;
+    let is_over = state.engine.wait_for_exports(Some(name.clone()), limits::MCAP_WAIT).await;
+    let bytes = blocking(move || {
+        if let Ok(bytes) = read_mcap(&record, limits::EPISODE_BYTES) {
+            return bytes.ok_or_else(too_large);
+        }
+        let reason = match state.engine.export_failure(&name) {
+            Some(reason) => reason,
+            None if !is_over => "it waits for others to be exported".to_owned(),
+            None if !state.engine.exports_mcap() => "this server writes none (--mcap)".to_owned(),
+            None => "it has not ended, or the server that drove it was killed".to_owned(),
+        };
+        Err(Fault::NoMcap { name, reason })
+    });
+    Ok(([(header::CONTENT_TYPE, "application/vnd.mcap")], bytes.await?).into_response())
+}
+
+/// The file of an episode whose twin the token may use.
+fn record_of(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf, Fault> {
+    // A name, and so no path to another file.
+    let unknown = || Fault::NoEpisode { name: name.to_owned() };
+    let stem = name.rsplit_once('-').map_or(name, |(session, _)| session);
+    if !is_name(stem) || name.contains(['/', '\\']) {
+        return Err(unknown());
+    }
+    let path = state.episodes.join(format!("{name}.jsonl"));
+    let file = EpisodeFile::read(&path).map_err(|_| unknown())?;
+    grant.require_twin(&file.header.twin)?;
+    Ok(path)
+}
+
+fn too_large() -> Fault {
+    Fault::OutOfRange {
+        field: "episode".to_owned(),
+        must: format!("larger than {} bytes: read its file", limits::EPISODE_BYTES),
+    }
 }

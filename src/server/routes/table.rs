@@ -223,6 +223,9 @@ pub(super) fn guarded() -> Vec<Row> {
         op(Get, "/v1/episodes/{episode}", ADMIN, "The record of an episode, a JSON object a line.")
             .answers(200, Other("application/x-ndjson"))
             .does(episodes::show),
+        op(Get, "/v1/episodes/{episode}/mcap", ADMIN, "An episode that ended as MCAP.")
+            .answers(200, Other("application/vnd.mcap"))
+            .does(episodes::mcap),
         op(Get, "/v1/twins", ANY, "The latest version of every twin.")
             .answers(200, List("twins", "answer#TwinInfo"))
             .does(twins::list),

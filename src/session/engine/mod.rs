@@ -1,6 +1,7 @@
 //! What all sessions share: the twins in memory, the render queue, and the budget for answers.
 
 pub(crate) mod answer_budget;
+mod exports;
 mod leases;
 pub(crate) mod render_queue;
 pub(crate) mod twin_summaries;
@@ -23,6 +24,7 @@ use wildcity_twin::residency::{
 use wildcity_twin::store::Catalog;
 
 use self::answer_budget::{AnswerBudget, BudgetShare};
+use self::exports::Exports;
 use self::leases::Leases;
 use self::render_queue::{FrameCost, RenderQueue, Scratch};
 use self::twin_summaries::{SummaryCache, TwinSummaries};
@@ -48,6 +50,8 @@ pub struct EngineSettings {
     pub step_timeout: Duration,
     /// The models that can repair images, by name. Each is loaded when a session asks for it.
     pub repairs: Arc<Models>,
+    /// Whether an episode that ends becomes an MCAP file beside its record.
+    pub mcap: bool,
 }
 
 /// The renderer and the twins, shared by all sessions.
@@ -62,6 +66,8 @@ pub struct Engine {
     queue: RenderQueue,
     session_numbers: AtomicU64,
     answer_budget: AnswerBudget,
+    /// MCAP files of episodes that ended; none if no episode becomes one.
+    exports: Option<Exports>,
     /// By twin: the version that counts as its latest while a newer one is loaded.
     pins: Mutex<BTreeMap<String, u64>>,
 }
@@ -79,8 +85,9 @@ impl Engine {
     /// # Errors
     /// [`SessionError::Thread`] if a thread cannot be started.
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
-        let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs } =
+        let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs, mcap } =
             settings;
+        let exports = mcap.then(Exports::start).transpose()?;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),
@@ -92,6 +99,7 @@ impl Engine {
             queue: RenderQueue::start(backend)?,
             session_numbers: AtomicU64::new(PUSHES + 1),
             answer_budget: AnswerBudget::default(),
+            exports,
             pins: Mutex::default(),
         }))
     }
@@ -318,6 +326,38 @@ impl Engine {
 
     pub(crate) fn answer_budget(&self) -> &AnswerBudget {
         &self.answer_budget
+    }
+
+    /// Lets a record that ended become an MCAP file. Returns at once.
+    pub(crate) fn export(&self, record: PathBuf) {
+        if let Some(exports) = &self.exports {
+            exports.add(record);
+        }
+    }
+
+    /// Whether episodes that end become MCAP files.
+    pub fn exports_mcap(&self) -> bool {
+        self.exports.is_some()
+    }
+
+    /// Waits until no MCAP file of an episode is being written, or of none of this name; at most `longest`. Returns
+    /// whether that is so.
+    pub async fn wait_for_exports(
+        self: &Arc<Self>,
+        episode: Option<String>,
+        longest: Duration,
+    ) -> bool {
+        let engine = self.clone();
+        let wait = move || {
+            let exports = engine.exports.as_ref();
+            exports.is_none_or(|exports| exports.wait(episode.as_deref(), longest))
+        };
+        run_blocking(wait).await.unwrap_or(false)
+    }
+
+    /// Why an episode of this engine has no MCAP file; none if that is not known.
+    pub fn export_failure(&self, episode: &str) -> Option<String> {
+        self.exports.as_ref()?.failure(episode)
     }
 
     pub(crate) fn episodes(&self) -> &Path {

@@ -260,7 +260,7 @@ fn is_one(steps: &u64) -> bool {
 
 impl FrameRecord {
     /// When the frames at a pose were taken, in microseconds; those of a warm-up are at any time below 0.
-    pub(crate) fn taken_us(&self, pose: usize) -> i64 {
+    pub fn taken_us(&self, pose: usize) -> i64 {
         let is_now = self.request == FrameRequest::Observe || pose + 1 == self.poses.len();
         let otherwise = if is_now { self.time_us } else { -1 };
         self.times_us.get(pose).copied().unwrap_or(otherwise)

@@ -57,6 +57,11 @@ impl Recorder {
         Ok(NewFile { recorder, number })
     }
 
+    /// The file.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// Removes the file, which must be new.
     pub(crate) fn discard(self) {
         if let Err(error) = fs::remove_file(&self.path) {

@@ -161,8 +161,8 @@ impl Session {
         Ok(created.await??)
     }
 
-    /// Writes the last line of the episode's file. A failure is only logged: the episode is over either
-    /// way.
+    /// Writes the last line of the episode's file, and lets it be exported. A failure is only logged: the episode is
+    /// over either way.
     pub(super) async fn end_recording(&mut self, outcome: Outcome) {
         let Some(recorder) = self.recorder.take() else { return };
         let summary = self.state.episode.summary(outcome);
@@ -175,9 +175,12 @@ impl Session {
             }
         }
         lines.push(Line::End(summary));
+        let record = recorder.path().to_owned();
         if let Err(error) = append(recorder, lines).await {
             tracing::warn!(session = self.name, "the episode's summary was not recorded: {error}");
         }
+        // A record without an end is exported as well: it is as whole as it will be.
+        self.engine.export(record);
     }
 }
 

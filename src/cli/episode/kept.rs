@@ -1,0 +1,51 @@
+//! Which images of a record are rendered again.
+
+use std::collections::BTreeSet;
+
+use anyhow::Context as _;
+
+use wildcity_session::{FrameRecord, FrameRequest, RecordedEpisode};
+
+/// Index of the camera of a name.
+pub(super) fn camera_of(recording: &RecordedEpisode, wanted: &str) -> anyhow::Result<usize> {
+    let cameras = &recording.header.rig.cameras;
+    cameras.iter().position(|camera| camera.name == wanted).with_context(|| {
+        let known: Vec<&str> = cameras.iter().map(|camera| &*camera.name).collect();
+        format!("--camera {wanted}: the episode has {}", known.join(", "))
+    })
+}
+
+/// Leaves of a frame the images of some cameras; none of poses that were only looked at.
+pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_cameras: usize) {
+    let is_driven = matches!(frame.request, FrameRequest::Reset | FrameRequest::Step);
+    let mut images = std::mem::take(&mut frame.images).into_iter();
+    let mut repairs = std::mem::take(&mut frame.repairs).into_iter();
+    let mut cameras = Vec::new();
+    for pose in 0..frame.poses.len() {
+        let mut of_pose = Vec::new();
+        for rendered in frame.cameras_of(pose, rig_cameras) {
+            let (image, repair) = (images.next(), repairs.next());
+            if kept_cameras.contains(&rendered) && is_driven {
+                of_pose.push(rendered);
+                frame.images.extend(image);
+                frame.repairs.extend(repair);
+            }
+        }
+        cameras.push(of_pose);
+    }
+    frame.cameras = cameras;
+}
+
+/// Indices of the frames that the ego drove last: where a session went back, the later frames replace the earlier ones.
+pub(super) fn driven(frames: &[FrameRecord]) -> BTreeSet<usize> {
+    let mut driven: Vec<usize> = Vec::new();
+    for (index, frame) in frames.iter().enumerate() {
+        if frame.request == FrameRequest::Observe || frame.poses.is_empty() {
+            continue;
+        }
+        let kept = driven.partition_point(|&before| frames[before].step < frame.step);
+        driven.truncate(kept);
+        driven.push(index);
+    }
+    driven.into_iter().collect()
+}

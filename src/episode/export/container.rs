@@ -1,0 +1,116 @@
+//! An MCAP file with a channel for each topic and a schema for each kind of message.
+
+use std::collections::BTreeMap;
+use std::io::{Seek, Write};
+
+use mcap::records::MessageHeader;
+use mcap::{Compression, WriteOptions, Writer};
+use prost::Message;
+use serde::Serialize;
+
+use super::ExportError;
+use super::convert::nanoseconds;
+use super::descriptors::descriptor_set;
+use super::output::{Failure, Output};
+
+/// Bytes of a chunk before compression: about a second of 30 actors at 10 Hz.
+const CHUNK_BYTES: u64 = 64 << 10;
+
+pub(super) struct McapFile<W: Write + Seek> {
+    writer: Writer<Output<W>>,
+    failure: Failure,
+    /// Channel of each topic.
+    channels: BTreeMap<String, u16>,
+    /// Schema of each name.
+    schemas: BTreeMap<&'static str, u16>,
+    descriptors: Vec<u8>,
+    messages: u64,
+}
+
+impl<W: Write + Seek> McapFile<W> {
+    pub(super) fn create(out: W) -> Result<Self, ExportError> {
+        let options = WriteOptions::new()
+            .compression(Some(Compression::Zstd))
+            .chunk_size(Some(CHUNK_BYTES))
+            // Without threads of its own: a record is small.
+            .compression_threads(0)
+            .library(concat!("wildcity ", env!("CARGO_PKG_VERSION")));
+        let failure = Failure::default();
+        let writer = options.create(Output::new(out, failure.clone()))?;
+        let descriptors = descriptor_set();
+        let channels = BTreeMap::new();
+        let schemas = BTreeMap::new();
+        Ok(Self { writer, failure, channels, schemas, descriptors, messages: 0 })
+    }
+
+    /// Writes a message of Foxglove's.
+    pub(super) fn proto(
+        &mut self,
+        topic: &str,
+        schema: &'static str,
+        time_us: i64,
+        message: &impl Message,
+    ) -> Result<(), ExportError> {
+        let channel = self.channel(topic, schema, "protobuf")?;
+        self.write(channel, time_us, &message.encode_to_vec())
+    }
+
+    /// Writes a message of this project.
+    pub(super) fn json(
+        &mut self,
+        topic: &str,
+        schema: &'static str,
+        time_us: i64,
+        message: &impl Serialize,
+    ) -> Result<(), ExportError> {
+        let channel = self.channel(topic, schema, "json")?;
+        self.write(channel, time_us, &serde_json::to_vec(message)?)
+    }
+
+    /// Writes the index. Returns the number of messages.
+    pub(super) fn finish(mut self) -> Result<u64, ExportError> {
+        self.writer.finish()?;
+        self.check()?;
+        Ok(self.messages)
+    }
+
+    /// Ends the export after a failure of the output.
+    fn check(&self) -> Result<(), ExportError> {
+        self.failure.take().map_or(Ok(()), |cause| Err(ExportError::Output(cause)))
+    }
+
+    /// The channel of a topic, created with its first message.
+    fn channel(
+        &mut self,
+        topic: &str,
+        schema: &'static str,
+        encoding: &str,
+    ) -> Result<u16, ExportError> {
+        if let Some(&channel) = self.channels.get(topic) {
+            return Ok(channel);
+        }
+        let schema = match self.schemas.get(schema) {
+            Some(&schema) => schema,
+            None => {
+                let id = match encoding {
+                    "protobuf" => self.writer.add_schema(schema, "protobuf", &self.descriptors)?,
+                    _ => self.writer.add_schema(schema, "jsonschema", br#"{"type":"object"}"#)?,
+                };
+                self.schemas.insert(schema, id);
+                id
+            }
+        };
+        let channel = self.writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
+        self.channels.insert(topic.to_owned(), channel);
+        Ok(channel)
+    }
+
+    fn write(&mut self, channel_id: u16, time_us: i64, data: &[u8]) -> Result<(), ExportError> {
+        let log_time = nanoseconds(time_us);
+        let sequence = u32::try_from(self.messages).unwrap_or(u32::MAX);
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time: log_time };
+        self.writer.write_to_known_channel(&header, data)?;
+        self.messages += 1;
+        self.check()
+    }
+}

@@ -1,0 +1,70 @@
+//! An output whose first failure is kept, and told at the end.
+//!
+//! The crate `mcap` panics when a writer is dropped after some failures, such as of a full disk. So it never sees one.
+
+use std::cell::Cell;
+use std::io::{self, Seek, SeekFrom, Write};
+use std::rc::Rc;
+
+/// Where an output keeps its failure.
+pub(super) type Failure = Rc<Cell<Option<io::Error>>>;
+
+pub(super) struct Output<W> {
+    inner: W,
+    /// Where the next byte goes.
+    position: u64,
+    has_failed: bool,
+    failure: Failure,
+}
+
+impl<W> Output<W> {
+    pub(super) fn new(inner: W, failure: Failure) -> Self {
+        Self { inner, position: 0, has_failed: false, failure }
+    }
+
+    /// The value of a success; after a failure, `otherwise`.
+    fn keep<T>(&mut self, done: io::Result<T>, otherwise: T) -> T {
+        done.unwrap_or_else(|error| {
+            self.has_failed = true;
+            self.failure.set(Some(error));
+            otherwise
+        })
+    }
+}
+
+impl<W: Write> Write for Output<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if !self.has_failed {
+            let written = self.inner.write_all(bytes);
+            self.keep(written, ());
+        }
+        self.position += bytes.len() as u64;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        if !self.has_failed {
+            let flushed = self.inner.flush();
+            self.keep(flushed, ());
+        }
+        Ok(())
+    }
+}
+
+impl<W: Seek> Seek for Output<W> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let expected = match to {
+            SeekFrom::Start(at) => at,
+            SeekFrom::Current(by) => self.position.saturating_add_signed(by),
+            SeekFrom::End(by) => self.position.saturating_add_signed(by),
+        };
+        self.position = match self.has_failed {
+            true => expected,
+            false => {
+                let sought = self.inner.seek(to);
+                self.keep(sought, expected)
+            }
+        };
+        Ok(self.position)
+    }
+}

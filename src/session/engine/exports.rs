@@ -1,0 +1,132 @@
+//! MCAP files of episodes that ended, written beside their records by a thread of its own: no request waits for one.
+
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::{Duration, Instant};
+
+use parking_lot::{Condvar, Mutex};
+
+use wildcity_episode::{EpisodeFile, export_file, mcap_of, record_bytes};
+
+use crate::error::SessionError;
+use crate::limits;
+
+/// The exports of an engine, one at a time.
+pub(crate) struct Exports {
+    records: Sender<PathBuf>,
+    shared: Arc<Shared>,
+}
+
+#[derive(Default)]
+struct Shared {
+    state: Mutex<State>,
+    /// An export has ended.
+    ended: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// Names of the episodes that wait or are being exported, the oldest first.
+    waiting: VecDeque<String>,
+    /// The last episodes that were not exported, each with the reason, the oldest first.
+    failed: VecDeque<(String, String)>,
+}
+
+impl Exports {
+    /// Starts the thread. It ends after the last export when this is dropped.
+    ///
+    /// # Errors
+    /// [`SessionError::Thread`].
+    pub(crate) fn start() -> Result<Self, SessionError> {
+        let (records, to_export) = channel();
+        let shared = Arc::new(Shared::default());
+        let of_thread = shared.clone();
+        std::thread::Builder::new()
+            .name("export".to_owned())
+            .spawn(move || of_thread.run(&to_export))
+            .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        Ok(Self { records, shared })
+    }
+
+    /// Lets a record be exported, unless too many wait already.
+    pub(crate) fn add(&self, record: PathBuf) {
+        let name = EpisodeFile::name_of(&record);
+        let mut state = self.shared.state.lock();
+        if state.waiting.len() >= limits::WAITING_EXPORTS {
+            state.fail(name, format!("{} others waited", limits::WAITING_EXPORTS));
+            return;
+        }
+        state.waiting.push_back(name);
+        // The thread lives as long as this does.
+        let _ = self.records.send(record);
+    }
+
+    /// Waits until an episode is not being exported, or until none is; at most `longest`. Returns whether that is so.
+    pub(crate) fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
+        let until = Instant::now() + longest;
+        let mut state = self.shared.state.lock();
+        while state.is_waiting(episode) {
+            if self.shared.ended.wait_until(&mut state, until).timed_out() {
+                return !state.is_waiting(episode);
+            }
+        }
+        true
+    }
+
+    /// Why an episode was not exported.
+    pub(crate) fn failure(&self, episode: &str) -> Option<String> {
+        let state = self.shared.state.lock();
+        let found = state.failed.iter().rev().find(|(name, _)| name == episode);
+        found.map(|(_, reason)| reason.clone())
+    }
+}
+
+impl Shared {
+    fn run(&self, records: &Receiver<PathBuf>) {
+        for record in records {
+            let exported = catch_unwind(AssertUnwindSafe(|| export(&record)));
+            let exported = exported.unwrap_or_else(|_| Err("the export crashed".to_owned()));
+            let mut state = self.state.lock();
+            let name = state.waiting.pop_front().unwrap_or_default();
+            if let Err(reason) = exported {
+                state.fail(name, reason);
+            }
+            drop(state);
+            self.ended.notify_all();
+        }
+    }
+}
+
+impl State {
+    fn is_waiting(&self, episode: Option<&str>) -> bool {
+        match episode {
+            Some(episode) => self.waiting.iter().any(|name| name == episode),
+            None => !self.waiting.is_empty(),
+        }
+    }
+
+    fn fail(&mut self, episode: String, reason: String) {
+        tracing::error!(episode, "no MCAP file: {reason}");
+        if self.failed.len() >= limits::FAILED_EXPORTS {
+            self.failed.pop_front();
+        }
+        self.failed.push_back((episode, reason));
+    }
+}
+
+fn export(record: &Path) -> Result<(), String> {
+    let bytes = record_bytes(record);
+    if bytes > limits::EXPORTED_RECORD_BYTES {
+        let most = limits::EXPORTED_RECORD_BYTES;
+        return Err(format!(
+            "the record has {bytes} bytes; at most {most} are exported by themselves"
+        ));
+    }
+    match export_file(record, &mcap_of(record)) {
+        Ok(_) => Ok(()),
+        Err(error) => Err(error.to_string()),
+    }
+}
