@@ -10,9 +10,11 @@
 //! camera       lenses, windshields, shutters and exposures, to and from the wire
 //! drive        recorded drives
 //! http         bodies of HTTP requests and answers
+//! actor        those about assets of actors
 //! fault        the wire code and the HTTP status of each fault
 //! ```
 
+mod actor;
 mod answer;
 mod camera;
 mod drive;
@@ -26,6 +28,7 @@ mod request;
 mod rig;
 mod sensors;
 
+pub(crate) use actor::{actor, actors, new_actor};
 pub(crate) use answer::{AlsoResumed, closed, ok, opened, resumed, switched, twin, twins, welcome};
 pub(crate) use drive::{DriveRequest, drive_body, drive_query};
 pub(crate) use fault::{WireCode, close_status, code, http_status, refusal_body, refused};
