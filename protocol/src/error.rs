@@ -26,6 +26,8 @@ pub enum Code {
     SessionState,
     /// There is no twin of this name.
     UnknownTwin,
+    /// There is no asset of an actor of this name or hash, or several have the name.
+    UnknownActor,
     /// The twin has no such version.
     UnknownVersion,
     /// The twin could not be loaded or written.
@@ -88,7 +90,7 @@ pub enum Code {
     StorageFull,
     /// There is no push of this id.
     UnknownPush,
-    /// Another push changed the same cells since the base version.
+    /// Another push changed the same cells since the base version, or an asset of another content has the name.
     Conflict,
     /// The pushed Gaussians are invalid.
     PushRefused,

@@ -26,8 +26,3 @@ pub(super) const REPORT_WINDOW_PX: i64 = 256;
 
 /// Most Gaussians of a street of `wildcity bench gpu`: each takes 200 B while the street is made.
 pub(super) const BENCH_GAUSSIANS: i64 = 100_000_000;
-
-/// Gaussians for the triangles of an actor's mesh, unless the command says otherwise: the least with which edges of a
-/// lorry at 8 m are at most a tenth wider than those of its triangles (BENCHMARKS.md, "Actors"); `tests/actors/softness.py`
-/// measures it. It is one Gaussian every 18 mm, and as many as `wildcity import` takes.
-pub(super) const ACTOR_MESH_GAUSSIANS: u32 = 200_000;

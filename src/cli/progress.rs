@@ -1,5 +1,7 @@
 //! Progress bars on standard error. indicatif hides them if standard error is not a terminal.
 
+use std::time::Duration;
+
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// A bar that counts bytes.
@@ -15,6 +17,13 @@ pub(super) fn count(label: &'static str) -> ProgressBar {
 /// A bar with a label that names the item in progress.
 pub(super) fn state() -> ProgressBar {
     bar("waiting", "{msg:12} {wide_bar} {percent} %")
+}
+
+/// A sign that something runs of which no progress is known.
+pub(super) fn waiting(label: &'static str) -> ProgressBar {
+    let sign = ProgressBar::new_spinner().with_message(label);
+    sign.enable_steady_tick(Duration::from_millis(100));
+    sign
 }
 
 /// A callback that sets the bar to `done` of `total`.

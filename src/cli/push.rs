@@ -127,11 +127,9 @@ impl Push {
     ) -> anyhow::Result<Pushed> {
         let mut files = Vec::with_capacity(self.files.len());
         for path in &self.files {
-            let bar = progress::bytes("uploading");
-            let upload = client.upload(path, &mut progress::show(&bar)).await;
-            let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
-            bar.finish_and_clear();
-            files.push(PushFile { upload: upload.id, axes: self.axes.clone(), scale: self.scale });
+            let upload = upload(client, path).await?;
+            let name = name_beside(&self.files, path);
+            files.push(PushFile { upload, axes: self.axes.clone(), scale: self.scale, name });
         }
         let asked = NewPush {
             // One id for this run: if an answer is lost, the client sends the same push again under this id.
@@ -156,6 +154,23 @@ impl Push {
         bar.finish_and_clear();
         Ok(ended)
     }
+}
+
+/// Uploads a file, with a progress bar. Returns the id of the upload.
+pub(super) async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
+    let bar = progress::bytes("uploading");
+    let upload = client.upload(path, &mut progress::show(&bar)).await;
+    let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
+    bar.finish_and_clear();
+    Ok(upload.id)
+}
+
+/// The name by which the first of some files names another one, `textures/paint.png`, if that lies below its folder. A
+/// file beside it has its own name.
+pub(super) fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
+    let below = path.strip_prefix(files.first()?.parent()?).ok()?;
+    let steps: Option<Vec<&str>> = below.iter().map(|step| step.to_str()).collect();
+    steps.filter(|steps| steps.len() > 1).map(|steps| steps.join("/"))
 }
 
 impl Server {

@@ -1,4 +1,4 @@
-//! Pushes: trained scenes become a new version of a twin, all of their cells at once or none.
+//! Pushes: trained scenes become a new version of a twin, all of their cells at once or none; and assets of actors.
 //!
 //! ```text
 //! request   what a push asks for, and the checks that need neither files nor twin
@@ -10,13 +10,15 @@
 //! report    what the files hold, and which cells would change
 //! preview   compares small images before and after
 //! commit    writes the version
+//! asset     assets of actors from files; `wildcity actor import` makes them alike
 //! edit      the same Gaussians on level ground, with a drive and a rig
 //! publish   the pipeline: read, check, preview, commit, preload
 //! ```
 //!
-//! Nothing of a push is visible before its version is committed. This package knows neither HTTP nor
+//! Nothing of a push is visible before its version is committed, or its asset is stored. This package knows neither HTTP nor
 //! JSON: the server converts requests and answers.
 
+mod asset;
 mod base;
 mod blocking;
 mod commit;
@@ -32,6 +34,7 @@ mod request;
 mod source;
 mod status;
 
+pub use asset::{AssetRequest, AssetSettings, AssetSource, make_asset, publish_asset};
 pub use base::{check_base, default_id};
 pub use edit::{DriveRequest, EditRequest, Survey, publish_edit, survey};
 pub use error::PushError;

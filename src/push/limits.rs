@@ -1,5 +1,6 @@
 //! Limits and defaults of this package, with the arithmetic behind each.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 /// Default maximum of pushes that wait or run. A waiting push holds its request in memory, but not its
@@ -33,8 +34,24 @@ pub fn push_memory_bytes(file_bytes: u64) -> u64 {
 /// have about a hundred cells.
 pub const REMEMBERED_PUSHES: usize = 64;
 
+/// Gaussians for the triangles of an actor's mesh, unless the request says otherwise: the least with which edges of a
+/// lorry at 8 m are at most a tenth wider than those of its triangles (BENCHMARKS.md, "Actors"); `tests/actors/softness.py`
+/// measures it. It is one Gaussian every 18 mm, and as many as `wildcity import` takes.
+pub const ACTOR_MESH_GAUSSIANS: u32 = 200_000;
+
+/// Gaussians that may be asked for. With the most, small triangles add as many again, which is the most of an actor.
+pub const ACTOR_MESH_GAUSSIANS_RANGE: RangeInclusive<u32> = 1_000..=1_000_000;
+
+/// Bytes of memory that an asset takes per Gaussian that is asked for, beside [`push_memory_bytes`] of its files. Small
+/// triangles make two of each; each is 68 B as it is read and 68 B in level 0, the other levels are as much again, and
+/// all levels are encoded twice, at 68 B at most.
+pub const MEMORY_PER_MESH_GAUSSIAN: u64 = 2 * 7 * 68;
+
 /// Files of one push.
 pub const PUSH_FILES: usize = 256;
+
+/// Bytes of the name by which a scene names another file.
+pub const FILE_NAME_BYTES: usize = 1024;
 
 /// Gaussians of one push, all its files together: 248 B each in memory at SH degree 3 are 62 GB, and
 /// as much again while files are joined. The largest upload holds no more, unless it is compressed.

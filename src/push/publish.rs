@@ -29,7 +29,7 @@ use crate::error::PushError;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
 use crate::queue::{PushQueue, Turn};
-use crate::read::{PushedScene, read};
+use crate::read::{PushedScene, ReadBounds, read};
 use crate::report::{CellChanges, PushReport};
 use crate::request::{CellSelection, PushRequest};
 use crate::source::SourceFile;
@@ -107,7 +107,12 @@ async fn read_and_check(
         let push = push.clone();
         let request = request.clone();
         let turn = turn.clone();
-        run_blocking(move || read(&push, &request, &files, turn.memory_bytes())).await?
+        let bounds = ReadBounds::of_twin(turn.memory_bytes());
+        run_blocking(move || {
+            let _turn = turn;
+            read(&push, &request.files, &files, bounds)
+        })
+        .await?
     };
 
     push.enter(State::Validating)?;

@@ -4,7 +4,7 @@
 //! each other only while memory is short.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use parking_lot::Mutex;
@@ -54,6 +54,8 @@ struct TurnParts {
 struct Entries {
     /// By twin and id.
     pushes: BTreeMap<(String, String), Arc<Push>>,
+    /// Pushes of assets, which have no id, as long as their callers keep them.
+    actors: Vec<Weak<Push>>,
     /// Number of pushes ever begun.
     begun: u64,
 }
@@ -124,6 +126,24 @@ impl PushQueue {
         Ok(Begun::New { push, files })
     }
 
+    /// A new push of an asset. It counts among the open ones until it has ended.
+    ///
+    /// # Errors
+    /// [`PushError::Busy`].
+    pub fn begin_actor(&self) -> Result<Arc<Push>, PushError> {
+        let mut entries = self.entries.lock();
+        let limit = self.limits.open;
+        if entries.open_count() >= limit {
+            return Err(PushError::Busy { limit });
+        }
+        entries.begun += 1;
+        // No other request is this push, so that its hash is never compared.
+        let push = Arc::new(Push::new(blake3::hash(&[]), entries.begun));
+        entries.actors.retain(|actor| actor.strong_count() > 0);
+        entries.actors.push(Arc::downgrade(&push));
+        Ok(push)
+    }
+
     /// A push that was begun.
     ///
     /// # Errors
@@ -135,6 +155,11 @@ impl PushQueue {
 
     /// Waits for the turn of a push of files of so many bytes.
     pub(crate) async fn turn(&self, twin: &str, file_bytes: u64) -> Result<Turn, PushError> {
+        self.turn_with(twin, limits::push_memory_bytes(file_bytes)).await
+    }
+
+    /// Waits for the turn of a push that may take so many bytes of memory.
+    pub(crate) async fn turn_with(&self, twin: &str, memory_bytes: u64) -> Result<Turn, PushError> {
         let lock = {
             let mut twins = self.twins.lock();
             // Locks that no push holds or waits for are forgotten.
@@ -143,7 +168,7 @@ impl PushQueue {
         };
         // The twin first: a push that waits for its twin keeps no memory from other twins.
         let twin = lock.lock_owned().await;
-        let needed = limits::push_memory_bytes(file_bytes).min(self.limits.memory_bytes);
+        let needed = memory_bytes.min(self.limits.memory_bytes);
         let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;
         // The semaphore is never closed while the process runs.
         let memory = memory.map_err(|_| PushError::ShuttingDown)?;
@@ -166,7 +191,8 @@ fn memory_units(bytes: u64) -> u32 {
 
 impl Entries {
     fn open_count(&self) -> usize {
-        self.pushes.values().filter(|push| push.is_open()).count()
+        let actors = self.actors.iter().filter_map(Weak::upgrade).filter(|push| push.is_open());
+        self.pushes.values().filter(|push| push.is_open()).count() + actors.count()
     }
 
     /// Forgets the oldest pushes that ended while there are too many.
@@ -259,6 +285,20 @@ mod tests {
         }
         assert!(queue.get("city", "first").is_err(), "the oldest is forgotten");
         assert!(queue.get("city", "p0").is_ok());
+    }
+
+    #[test]
+    fn a_push_of_an_asset_counts_until_it_ends_or_is_dropped() {
+        let queue = queue(1);
+        let actor = queue.begin_actor().unwrap();
+        assert!(matches!(queue.begin_actor(), Err(PushError::Busy { limit: 1 })));
+        assert!(matches!(begin(&queue, "a", "x"), Err(PushError::Busy { limit: 1 })));
+        actor.close(Ok(()));
+        drop(queue.begin_actor().unwrap());
+        let push = new(begin(&queue, "a", "x"));
+        assert!(matches!(queue.begin_actor(), Err(PushError::Busy { limit: 1 })));
+        push.end(Err(PushError::Crashed));
+        assert!(queue.begin_actor().is_ok());
     }
 
     /// Whether a turn comes within a moment.

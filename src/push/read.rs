@@ -8,7 +8,7 @@ use wildcity_twin::ingest::{self, IngestError, ListedFiles, ReadLimits};
 use crate::error::PushError;
 use crate::limits;
 use crate::report::{FileReport, PushReport, Ranges};
-use crate::request::{PushRequest, RequestedFile};
+use crate::request::RequestedFile;
 use crate::source::{SourceFile, SourceScene, read_limited};
 use crate::status::Push;
 
@@ -22,21 +22,46 @@ pub(crate) struct PushedScene {
     pub(crate) report: PushReport,
 }
 
+/// What the files of one push may become.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ReadBounds {
+    /// Bytes that each scene may unpack to.
+    pub(crate) memory_bytes: u64,
+    /// As [`ReadLimits::mesh_gaussians`].
+    pub(crate) mesh_gaussians: u32,
+    /// Gaussians of all files together.
+    pub(crate) most_gaussians: u64,
+    /// What to do if there are more.
+    pub(crate) too_many_fix: &'static str,
+}
+
+impl ReadBounds {
+    /// The bounds of a push of a twin.
+    pub(crate) fn of_twin(memory_bytes: u64) -> Self {
+        Self {
+            memory_bytes,
+            mesh_gaussians: ReadLimits::of_own_file().mesh_gaussians,
+            most_gaussians: limits::PUSH_GAUSSIANS,
+            too_many_fix: "push the scene in parts, some cells each",
+        }
+    }
+}
+
 /// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A file that
 /// another one names, such as a buffer of a glTF, is a part of that scene and no scene of its own. The report of
 /// the push is set on success, and on failure if Gaussians are the reason.
 pub(crate) fn read(
     push: &Push,
-    request: &PushRequest,
+    requested: &[RequestedFile],
     files: &[SourceFile],
-    memory_bytes: u64,
+    bounds: ReadBounds,
 ) -> Result<PushedScene, PushError> {
-    let mut reader = Reader::new(push, files, memory_bytes);
+    let mut reader = Reader::new(push, files, bounds);
     // Scenes that may name others come first: what they name is known before it could be read as a scene.
     let names_others: Vec<bool> =
         files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
     for is_first in [true, false] {
-        for (index, requested) in request.files.iter().enumerate() {
+        for (index, requested) in requested.iter().enumerate() {
             if names_others[index] == is_first && !reader.parts.contains(&files[index].name) {
                 reader.read(index, requested)?;
             }
@@ -61,8 +86,7 @@ struct Reader<'a> {
     files: &'a [SourceFile],
     /// The files that a scene may name.
     listed: ListedFiles,
-    /// Bytes that each scene may unpack to.
-    memory_bytes: u64,
+    bounds: ReadBounds,
     total_bytes: u64,
     read_bytes: u64,
     /// Names of the files that are parts of a scene.
@@ -81,7 +105,7 @@ struct ReadFile {
 }
 
 impl<'a> Reader<'a> {
-    fn new(push: &'a Push, files: &'a [SourceFile], memory_bytes: u64) -> Self {
+    fn new(push: &'a Push, files: &'a [SourceFile], bounds: ReadBounds) -> Self {
         // A name of two different files stands for neither.
         let mut listed = ListedFiles::new();
         let mut ambiguous = BTreeSet::new();
@@ -96,7 +120,7 @@ impl<'a> Reader<'a> {
             push,
             files,
             listed,
-            memory_bytes,
+            bounds,
             total_bytes: files.iter().map(|file| file.bytes).sum(),
             read_bytes: 0,
             parts: BTreeSet::new(),
@@ -125,9 +149,9 @@ impl<'a> Reader<'a> {
         };
         let limits = ReadLimits {
             listed: Some(&self.listed),
-            memory_bytes: self.memory_bytes,
+            memory_bytes: self.bounds.memory_bytes,
             stop: push.stop_flag().clone(),
-            ..ReadLimits::of_own_file()
+            mesh_gaussians: self.bounds.mesh_gaussians,
         };
         let read = match read_limited(&file.path, &requested.axes, &limits, progress) {
             Ok(read) => read,
@@ -177,7 +201,8 @@ impl<'a> Reader<'a> {
                 first_bad: Vec::new(),
             });
             let total = scene.report.gaussians;
-            check_count(name, total).inspect_err(|_| self.push.set_report(scene.report.clone()))?;
+            check_count(name, total, &self.bounds)
+                .inspect_err(|_| self.push.set_report(scene.report.clone()))?;
             if scene.gaussians.is_empty() {
                 // The usual push has one file, which needs no copy.
                 scene.gaussians = gaussians;
@@ -193,14 +218,13 @@ impl<'a> Reader<'a> {
 }
 
 /// Refuses a push of too many Gaussians; `count` is how many it has with the file `name`.
-fn check_count(name: &str, count: u64) -> Result<(), PushError> {
-    let most = limits::PUSH_GAUSSIANS;
-    if count <= most {
+fn check_count(name: &str, count: u64, bounds: &ReadBounds) -> Result<(), PushError> {
+    let ReadBounds { most_gaussians: most, too_many_fix: fix, .. } = bounds;
+    if count <= *most {
         return Ok(());
     }
     let reason = format!(
-        "{name}: the push has {count} Gaussians with this file; at most {most} are accepted: push the \
-         scene in parts, some cells each"
+        "{name}: the push has {count} Gaussians with this file; at most {most} are accepted: {fix}"
     );
     Err(PushError::Content { reason, cells: Vec::new() })
 }
@@ -211,8 +235,9 @@ mod tests {
 
     #[test]
     fn a_push_has_a_largest_size() {
-        assert!(check_count("a.ply", limits::PUSH_GAUSSIANS).is_ok());
-        let error = check_count("b.ply", limits::PUSH_GAUSSIANS + 1).unwrap_err();
+        let bounds = ReadBounds::of_twin(1 << 30);
+        assert!(check_count("a.ply", limits::PUSH_GAUSSIANS, &bounds).is_ok());
+        let error = check_count("b.ply", limits::PUSH_GAUSSIANS + 1, &bounds).unwrap_err();
         assert!(error.is_refusal());
         let text = error.to_string();
         assert!(text.starts_with("b.ply") && text.contains("250000001"), "{text}");

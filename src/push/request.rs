@@ -47,6 +47,8 @@ pub struct RequestedFile {
     pub upload: String,
     /// The axes and unit of the file.
     pub axes: SourceAxes,
+    /// The name by which other files of the push name it, if that is not the upload's. It is never used as a path.
+    pub name: Option<String>,
 }
 
 /// Which cells a push replaces.
@@ -69,11 +71,7 @@ impl PushRequest {
         let out_of_range = |field: &str, must: String| {
             Err(PushError::OutOfRange { field: field.to_owned(), must })
         };
-        if !(1..=limits::PUSH_FILES).contains(&self.files.len()) {
-            let must =
-                format!("{} entries; 1 to {} are accepted", self.files.len(), limits::PUSH_FILES);
-            return out_of_range("files", must);
-        }
+        check_files(&self.files)?;
         if matches!(&self.cells, CellSelection::These(cells) if cells.is_empty()) {
             return out_of_range(
                 "cells",
@@ -103,6 +101,31 @@ impl PushRequest {
             }
         }
         Ok(())
+    }
+}
+
+/// Checks the number of files of one push, and their names.
+pub(crate) fn check_files(files: &[RequestedFile]) -> Result<(), PushError> {
+    if !(1..=limits::PUSH_FILES).contains(&files.len()) {
+        let must = format!("{} entries; 1 to {} are accepted", files.len(), limits::PUSH_FILES);
+        return Err(PushError::OutOfRange { field: "files".to_owned(), must });
+    }
+    let is_bad = |name: &String| {
+        !(1..=limits::FILE_NAME_BYTES).contains(&name.len()) || name.chars().any(char::is_control)
+    };
+    let names = files.iter().map(|file| file.name.as_ref());
+    match names
+        .enumerate()
+        .find_map(|(index, name)| name.filter(|name| is_bad(name)).map(|_| index))
+    {
+        None => Ok(()),
+        Some(index) => Err(PushError::OutOfRange {
+            field: format!("files[{index}].name"),
+            must: format!(
+                "no name of a file; 1 to {} bytes without control characters are accepted",
+                limits::FILE_NAME_BYTES
+            ),
+        }),
     }
 }
 

@@ -134,8 +134,9 @@ impl Push {
         status.state = State::Failed;
         status.error = Some(Arc::new(PushError::Cancelled));
         drop(status);
-        self.stop.stop();
+        // Before the reading ends because of it.
         self.cancelled.notify_one();
+        self.stop.stop();
         Ok(())
     }
 
@@ -165,6 +166,19 @@ impl Push {
                 status.state = if error.is_refusal() { State::Refused } else { State::Failed };
                 status.error = Some(Arc::new(error));
             }
+        }
+        status.state
+    }
+
+    /// Ends a push whose result is told elsewhere, unless it was cancelled before. Returns the state.
+    pub fn close(&self, result: Result<(), &PushError>) -> State {
+        let mut status = self.status.lock();
+        if status.state.is_open() {
+            status.state = match result {
+                Ok(()) => State::Ready,
+                Err(error) if error.is_refusal() => State::Refused,
+                Err(_) => State::Failed,
+            };
         }
         status.state
     }

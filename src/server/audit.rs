@@ -1,4 +1,4 @@
-//! The audit log: which token made which version of a twin, one JSON object a line.
+//! The audit log: which token made which version of a twin or which asset of an actor, one JSON object a line.
 //!
 //! A line is on disk before what it announces begins, and again when that ended: what cannot be logged is refused. At
 //! [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, in place of an older one, and a new file begins; if that
@@ -28,15 +28,24 @@ struct Log {
     limit_bytes: u64,
 }
 
-/// A change of a twin.
+/// A change of a twin, or of the assets of actors.
 #[derive(Clone, Debug)]
 pub(crate) struct Change<'a> {
-    /// `push`, `edit` or `rollback`.
+    /// `push`, `edit`, `rollback` or `actor`.
     pub(crate) what: &'static str,
-    /// The twin.
-    pub(crate) twin: &'a str,
+    /// What is changed.
+    pub(crate) target: Target<'a>,
     /// Id of the push.
     pub(crate) id: Option<&'a str>,
+}
+
+/// What a change changes.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Target<'a> {
+    /// The twin of this name.
+    Twin(&'a str),
+    /// The asset of this name.
+    Actor(&'a str),
 }
 
 /// How a change ended.
@@ -44,7 +53,9 @@ pub(crate) struct Change<'a> {
 pub(crate) enum Ended<'a> {
     /// With a version.
     Version(u64),
-    /// Without one.
+    /// With an asset of this hash.
+    Asset(&'a str),
+    /// Without either, for this reason.
     Not(&'a str),
 }
 
@@ -55,13 +66,18 @@ struct Line<'a> {
     /// Name of the token; empty on a server without tokens.
     token: &'a str,
     what: &'a str,
-    twin: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    twin: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    actor: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     id: Option<&'a str>,
     /// `begun`, `done` or `refused`.
     state: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     version: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    hash: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     reason: Option<&'a str>,
 }
@@ -83,7 +99,7 @@ impl Audit {
     /// Writes how a change ended. What is done is done: a line that cannot be written is an error in the server's log.
     pub(crate) fn end(&self, grant: &Grant, change: &Change<'_>, ended: Ended<'_>) {
         if let Err(fault) = self.write(grant, change, Some(ended)) {
-            tracing::error!(twin = change.twin, "{fault}");
+            tracing::error!(target = ?change.target, "{fault}");
         }
     }
 
@@ -94,15 +110,32 @@ impl Audit {
         ended: Option<Ended<'_>>,
     ) -> Result<(), Fault> {
         let Some(log) = &self.0 else { return Ok(()) };
-        let (state, version, reason) = match ended {
-            None => ("begun", None, None),
-            Some(Ended::Version(version)) => ("done", Some(version), None),
-            Some(Ended::Not(reason)) => ("refused", None, Some(reason)),
-        };
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let time_us = since_1970.as_micros() as u64;
-        let Change { what, twin, id } = *change;
-        let line = Line { time_us, token: &grant.name, what, twin, id, state, version, reason };
+        let Change { what, target, id } = *change;
+        let (twin, actor) = match target {
+            Target::Twin(name) => (Some(name), None),
+            Target::Actor(name) => (None, Some(name)),
+        };
+        let begun = Line {
+            time_us: since_1970.as_micros() as u64,
+            token: &grant.name,
+            what,
+            twin,
+            actor,
+            id,
+            state: "begun",
+            version: None,
+            hash: None,
+            reason: None,
+        };
+        let line = match ended {
+            None => begun,
+            Some(Ended::Version(version)) => {
+                Line { state: "done", version: Some(version), ..begun }
+            }
+            Some(Ended::Asset(hash)) => Line { state: "done", hash: Some(hash), ..begun },
+            Some(Ended::Not(reason)) => Line { state: "refused", reason: Some(reason), ..begun },
+        };
         let mut text = serde_json::to_vec(&line).map_err(|e| Fault::Internal(e.to_string()))?;
         text.push(b'\n');
         let mut log = log.lock();
@@ -170,7 +203,7 @@ mod tests {
     use super::*;
 
     fn change() -> Change<'static> {
-        Change { what: "push", twin: "street", id: Some("p1") }
+        Change { what: "push", target: Target::Twin("street"), id: Some("p1") }
     }
 
     fn lines(path: &Path) -> Vec<serde_json::Value> {
@@ -194,6 +227,7 @@ mod tests {
         assert_eq!((&lines[0]["state"], &lines[0]["id"]), (&"begun".into(), &"p1".into()));
         assert_eq!((&lines[1]["version"], &lines[1]["twin"]), (&3.into(), &"street".into()));
         assert_eq!(lines[2]["reason"], "too sparse");
+        assert!(lines[1].get("actor").is_none() && lines[1].get("hash").is_none());
         assert!(lines[0]["time_us"].as_u64().unwrap() > 1_700_000_000_000_000);
     }
 

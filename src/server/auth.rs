@@ -227,6 +227,23 @@ impl Grant {
         })
     }
 
+    /// Requires access to all twins: for changes of what all twins share.
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`] if the token is limited to some twins.
+    pub(crate) fn require_all_twins(&self) -> Result<(), Fault> {
+        if self.allows_all_twins() {
+            return Ok(());
+        }
+        let reason = "it is limited to some twins, and all twins share the assets of actors";
+        Err(Fault::Forbidden { field: "authorization", reason: reason.to_owned() })
+    }
+
+    /// Whether the token is not limited to some twins.
+    pub(crate) fn allows_all_twins(&self) -> bool {
+        self.twins.is_none()
+    }
+
     /// Whether the token may use the twin. Lists of twins leave out those that it may not use.
     pub(crate) fn allows_twin(&self, twin: &str) -> bool {
         self.twins.as_ref().is_none_or(|twins| twins.contains(twin))

@@ -40,3 +40,58 @@ async fn a_file_is_pushed_and_reported() {
     assert!(!done.status.success());
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 3);
 }
+
+/// Runs `wildcity actor` with some arguments. Returns whether it succeeded, and what it said.
+fn actor(arguments: &[&str]) -> (bool, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+    let command = command.arg("actor").args(arguments);
+    let done = tokio::task::block_in_place(|| command.output().unwrap());
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (done.status.success(), text(done.stdout), text(done.stderr))
+}
+
+/// `wildcity actor push` to a server, and `wildcity actor import` on this machine, with the same options.
+#[tokio::test(flavor = "multi_thread")]
+async fn an_actor_is_pushed_as_it_is_imported() {
+    let Some(van) = crate::data::real("vehicles/kenney_carkit/van.glb") else { return };
+    let server = TestServer::start().await;
+    let url = format!("http://{}", server.address());
+    let dir = tempfile::tempdir().unwrap();
+    let ply = write(dir.path(), "block.ply", &in_cell([0, 0], 400, 1));
+    let own = dir.path().join("own").display().to_string();
+    let paint = van.parent().unwrap().join("Textures/colormap-car.png");
+    let axes = ["--axes", "0 0 1 1 0 0 0 1 0", "--gaussians", "20000", "--record", "q32"];
+    let scale = ["--class", "object", "--scale", "0.5", "--record", "f32"];
+    for (file, parts, options) in
+        [(&van, vec![paint.to_str().unwrap()], &axes[..]), (&ply, vec![], &scale[..])]
+    {
+        let file = file.to_str().unwrap();
+        let run = |command: &str, parts: &[&str], place: [&str; 2]| {
+            actor(&[&[command, file], parts, options, &place[..]].concat())
+        };
+        let (imported, wanted, said) = run("import", &[], ["--twins", &own]);
+        assert!(imported, "{said}");
+        let (pushed, found, said) = run("push", &parts, ["--server", &url]);
+        assert!(pushed, "{said}");
+        let hash = |text: &str| text.lines().last().unwrap().to_owned();
+        assert!(hash(&wanted).starts_with("blake3 ") && hash(&found) == hash(&wanted), "{found}");
+        assert_eq!(found, wanted, "both say the same of it");
+    }
+    let listed = get(&server, "/v1/actors").await.body;
+    let name = |index: usize| listed["actors"][index]["name"].as_str().unwrap_or_default();
+    assert_eq!([name(0), name(1)], ["block", "van"]);
+
+    let ply = ply.to_str().unwrap();
+    for (arguments, why) in [
+        (vec!["push", ply, "--server", &url, "--name", "van"], "another content"),
+        (vec!["push", ply, "--server", &url, "--class", "tank"], "there is no class \"tank\""),
+        (vec!["push", ply, "--server", &url, "--gaussians", "10"], "10"),
+        (vec!["push", ply, "--server", &url, "--name", "A b"], "give --name"),
+        (vec!["push", ply, "--server", &url, "--scale", "1000"], "check the axes and the scale"),
+        (vec!["push", "nowhere.ply", "--server", &url], "cannot upload nowhere.ply"),
+        (vec!["push", ply, "--server", "http://127.0.0.1:1"], "127.0.0.1:1"),
+    ] {
+        let (done, _, said) = actor(&arguments);
+        assert!(!done && said.contains(why), "{arguments:?}: {said}");
+    }
+}

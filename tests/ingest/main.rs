@@ -19,6 +19,7 @@ mod damage;
 mod formats;
 mod fuzz;
 mod hostile;
+mod materials;
 mod meshes;
 mod real_scenes;
 mod round_trip;

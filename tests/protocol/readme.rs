@@ -21,17 +21,19 @@ fn every_json_example_is_a_message() {
     // Every request has one example `open` three, `reset`, `branch`, `close`, `resume` and `share_memory` two; `step` has
     // four. Every answer has one.
     assert_eq!(counted(page, kinds), [24, 9, 1]);
-    let kinds: [Kind; 8] = [
+    let kinds: [Kind; 10] = [
         ("new upload", parses::<http::NewUpload>),
         ("upload", parses::<http::Upload>),
         ("new push", parses::<http::NewPush>),
         ("push", parses::<http::Push>),
         ("rollback", parses::<http::Rollback>),
         ("new edit", parses::<http::NewEdit>),
+        ("new actor", parses::<http::NewActor>),
+        ("actor", parses::<http::ActorAsset>),
         ("refusal", parses::<http::Refusal>),
         ("drive", parses::<Drive>),
     ];
-    assert_eq!(counted(http, kinds), [1, 1, 1, 1, 1, 1, 1, 1]);
+    assert_eq!(counted(http, kinds), [1; 10]);
 }
 
 /// A kind of message, and a parser that returns the error if a text is not one.

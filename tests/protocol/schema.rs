@@ -15,6 +15,7 @@ fn schemas_are_up_to_date() {
     check_closed::<http::NewPush>("new_push");
     check_closed::<http::Rollback>("rollback");
     check_closed::<http::NewEdit>("new_edit");
+    check_closed::<http::NewActor>("new_actor");
     check::<message::Answer>("answer");
     check::<message::Drive>("drive");
     check::<observation::ObservationMetadata>("observation");
@@ -25,6 +26,7 @@ fn schemas_are_up_to_date() {
     check::<http::SessionInfo>("session");
     check::<http::Ticket>("ticket");
     check::<http::EpisodeInfo>("episode");
+    check::<http::ActorAsset>("actor");
     check::<http::Refusal>("refusal");
 }
 

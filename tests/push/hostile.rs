@@ -38,6 +38,7 @@ async fn hostile_bodies() {
         (file(json!({ "axes": "sideways" })), "invalid_request", "files[0].axes"),
         (file(json!({ "scale": 0 })), "invalid_request", "files[0].scale"),
         (file(json!({ "scale": 1e300 })), "invalid_request", "files[0].scale"),
+        (file(json!({ "name": "" })), "out_of_range", "files[0].name"),
         (json!({ "files": [{ "upload": 7 }] }), "invalid_request", "files[0].upload"),
         (json!({ "files": [{ "upload": "x" }], "cells": [] }), "out_of_range", "cells"),
         (json!({ "files": [{ "upload": "x" }], "record": "q1" }), "invalid_request", "record"),

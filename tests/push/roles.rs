@@ -54,6 +54,7 @@ async fn every_route_needs_its_role() {
     let upload = json!({ "name": "x", "size": 1, "digest": format!("blake3:{:064}", 0) });
     let upload = upload.to_string();
     let push = r#"{"files": [{"upload": "x"}]}"#;
+    let actor = r#"{"name": "a", "class": "object", "files": [{"upload": "x"}]}"#;
     for (request, body, roles) in [
         ("GET /v1/twins", "", [DRIVER, PUSHER, ADMIN].as_slice()),
         ("GET /v1/twins/test", "", &[DRIVER, PUSHER, ADMIN]),
@@ -67,6 +68,9 @@ async fn every_route_needs_its_role() {
         ("POST /v1/twins/test/rollback", r#"{"version": 9}"#, &[ADMIN]),
         ("POST /v1/twins/test/edits", "{}", &[PUSHER, ADMIN]),
         ("GET /v1/twins/test/ground", "", &[PUSHER, ADMIN]),
+        ("GET /v1/actors", "", &[DRIVER, PUSHER, ADMIN]),
+        ("GET /v1/actors/x", "", &[DRIVER, PUSHER, ADMIN]),
+        ("POST /v1/actors", actor, &[PUSHER, ADMIN]),
         ("GET /v1/sessions", "", &[ADMIN]),
         ("GET /metrics", "", &[ADMIN]),
     ] {
@@ -178,6 +182,38 @@ async fn web_pages_from_elsewhere_may_not_push() {
     let head = format!("{request}\r\nContent-Length: {}", body.len());
     send(server.address(), &head, body.as_bytes()).await.refused(403, "forbidden");
     assert_eq!(crate::http::get(&server, "/v1/twins/test").await.body["version"], 1);
+}
+
+/// All twins share the assets, and the source of one may name a twin.
+#[tokio::test]
+async fn a_token_that_is_limited_to_twins_pushes_no_assets_and_sees_no_sources() {
+    let server = guarded().await;
+    let url = format!("http://127.0.0.1:{}", server.address().port());
+    let dir = tempfile::tempdir().unwrap();
+    let path = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
+    let pusher = HttpClient::new(&url, &with_token(PUSHER)).unwrap();
+    let upload = pusher.upload(&path, &mut |_, _| {}).await.unwrap().id;
+    let asked = json!({ "name": "a", "class": "object", "files": [{ "upload": upload }] });
+    let asked = asked.to_string();
+
+    // An upload belongs to its token.
+    let foreign = ask(&server, "POST /v1/actors", Some(RIVAL), &asked).await;
+    foreign.refused(404, "unknown_upload");
+    assert_eq!(foreign.body["field"], "files[0].upload");
+    let limited = ask(&server, "POST /v1/actors", Some(ELSEWHERE), &asked).await;
+    limited.refused(403, "forbidden");
+    assert_eq!(limited.body["field"], "authorization");
+    let made = ask(&server, "POST /v1/actors", Some(PUSHER), &asked).await;
+    assert_eq!(made.status, 201, "{made:?}");
+
+    for (token, sees_source) in [(DRIVER, true), (ELSEWHERE, false)] {
+        let listed = ask(&server, "GET /v1/actors", Some(token), "").await.body["actors"].clone();
+        let shown = ask(&server, "GET /v1/actors/a", Some(token), "").await.body;
+        for actor in [&listed[0], &shown] {
+            assert_eq!(actor["hash"], made.body["hash"]);
+            assert_eq!(actor.get("provenance").is_some(), sees_source, "{actor}");
+        }
+    }
 }
 
 fn announcement(content: &[u8], size: u64) -> String {
@@ -293,6 +329,9 @@ async fn a_token_has_limits_of_its_own() {
     let large = announcement(b"large", 101);
     ask(&server, "POST /v1/uploads", Some(ADMIN), &large).await.refused(507, "storage_full");
     assert_eq!(ask(&server, "POST /v1/uploads", Some(RIVAL), &large).await.status, 201);
+    let actor = r#"{"name": "a", "class": "object", "files": [{"upload": "x"}]}"#;
+    ask(&server, "POST /v1/actors", Some(ADMIN), actor).await.refused(503, "busy");
+    ask(&server, "POST /v1/actors", Some(RIVAL), actor).await.refused(404, "unknown_upload");
     let edit = r#"{"rig": "surround6"}"#;
     let refused = ask(&server, "POST /v1/twins/test/edits", Some(ADMIN), edit).await;
     refused.refused(503, "busy");
@@ -316,6 +355,15 @@ async fn the_audit_log_says_which_token_changed_what() {
     edit(r#"{"rig": "surround6", "base": 77}"#).await.refused(404, "unknown_version");
     let admin = HttpClient::new(&url, &with_token(ADMIN)).unwrap();
     admin.rollback("test", 1).await.unwrap();
+    let upload = admin.upload(&scene, &mut |_, _| {}).await.unwrap().id;
+    let actor = async |scale: f64| {
+        let file = json!({ "upload": upload, "scale": scale });
+        let body = json!({ "name": "a", "class": "object", "files": [file] }).to_string();
+        ask(&server, "POST /v1/actors", Some(ADMIN), &body).await
+    };
+    let made = actor(1.0).await;
+    assert_eq!(made.status, 201, "{made:?}");
+    actor(1000.0).await.refused(422, "push_refused");
 
     let text = std::fs::read_to_string(&path).unwrap();
     let lines: Vec<serde_json::Value> =
@@ -338,7 +386,14 @@ async fn the_audit_log_says_which_token_changed_what() {
             ("admin", "edit", "refused", None),
             ("admin", "rollback", "begun", None),
             ("admin", "rollback", "done", Some(4)),
+            ("admin", "actor", "begun", None),
+            ("admin", "actor", "done", None),
+            ("admin", "actor", "begun", None),
+            ("admin", "actor", "refused", None),
         ]
     );
-    assert!(lines.iter().all(|line| line["twin"] == "test"), "{text}");
+    let (twins, actors) = lines.split_at(8);
+    assert!(twins.iter().all(|line| line["twin"] == "test"), "{text}");
+    assert!(actors.iter().all(|line| line["actor"] == "a" && line.get("twin").is_none()), "{text}");
+    assert_eq!(actors[1]["hash"], made.body["hash"]);
 }

@@ -77,8 +77,12 @@ pub(crate) fn write(dir: &Path, name: &str, gaussians: &Gaussians) -> PathBuf {
 
 /// A push of some uploads, with every default.
 pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
-    let file =
-        |id: &&str| PushFile { upload: (*id).to_owned(), axes: "identity".to_owned(), scale: 1.0 };
+    let file = |id: &&str| PushFile {
+        upload: (*id).to_owned(),
+        axes: "identity".to_owned(),
+        scale: 1.0,
+        name: None,
+    };
     NewPush {
         id: None,
         files: uploads.iter().map(file).collect(),

@@ -12,6 +12,7 @@ import subprocess
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import wildcity
@@ -171,6 +172,40 @@ class CuttingProxy:
                     if not self.has_cut and carried > self.after_bytes:
                         self.has_cut = True
                         return
+
+
+def test_an_asset_of_an_actor(server: str, tmp_path: Path) -> None:
+    assert wildcity.actors(server=server) == ()
+    path = write_ply(tmp_path / "thing.ply", 0.0, 6, count=500)
+    seen: list[PushProgress] = []
+    thing = wildcity.push_actor(path, name="thing", kind="object", record="f32", server=server, progress=seen.append)
+    assert (thing.name, thing.kind, thing.gaussians, thing.record) == ("thing", "object", 500, "f32")
+    assert 10 < thing.box.length_m < 18.001 and thing.box.height_m <= 3.001
+    assert thing.levels[0].gaussians == 500 and thing.levels[0].error_m == 0.0
+    assert thing.provenance is not None and thing.provenance.source.startswith("blake3:")
+    assert thing.provenance.options == ("axes=identity", "scale=1", "gaussians=200000")
+    assert [seen[0].state, seen[-1].state] == ["uploading", "ready"]
+    assert wildcity.push_actor(path, name="thing", kind="object", record="f32", server=server) == thing
+    assert wildcity.actors(server=server) == (thing,)
+    assert wildcity.actor("thing", server=server) == wildcity.actor(thing.hash[:8], server=server) == thing
+
+    for change, code, field in [
+        ({"name": "../x"}, "invalid_name", "name"),
+        ({"kind": "tank"}, "invalid_request", "class"),
+        ({"gaussians": 10}, "out_of_range", "gaussians"),
+        ({"scale": 0.0}, "invalid_request", "files[0].scale"),
+        ({"scale": 1000.0}, "push_refused", None),
+        ({"record": "q24"}, "conflict", "name"),
+    ]:
+        asked: dict[str, Any] = {"name": "thing", "kind": "object", "record": "f32", **change}
+        with pytest.raises(Refused) as refused:
+            wildcity.push_actor(path, server=server, **asked)
+        assert (refused.value.code, refused.value.field) == (code, field)
+    with pytest.raises(Refused) as unknown:
+        wildcity.actor("bus", server=server)
+    assert (unknown.value.code, unknown.value.field) == ("unknown_actor", "actor")
+    with pytest.raises(wildcity.ConnectFailed):
+        wildcity.push_actor(path, name="thing", server="http://127.0.0.1:1")
 
 
 def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

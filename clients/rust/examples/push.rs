@@ -28,7 +28,12 @@ async fn main() -> anyhow::Result<()> {
     let request = NewPush {
         id: None,
         // The axes of COLMAP: y points down and z forward.
-        files: vec![PushFile { upload: upload.id, axes: "y-down-z-forward".into(), scale: 1.0 }],
+        files: vec![PushFile {
+            upload: upload.id,
+            axes: "y-down-z-forward".into(),
+            scale: 1.0,
+            name: None,
+        }],
         base: None,
         cells: None,
         record: None,

@@ -228,12 +228,23 @@ impl HttpClient {
         path: &[&str],
         body: Option<&impl Serialize>,
     ) -> Result<T, HttpError> {
+        self.request_json_within(method, path, body, limits::HTTP_TIMEOUT).await
+    }
+
+    /// As [`HttpClient::request_json`], with another time-out.
+    pub(crate) async fn request_json_within<T: DeserializeOwned>(
+        &self,
+        method: Method,
+        path: &[&str],
+        body: Option<&impl Serialize>,
+        time_limit: Duration,
+    ) -> Result<T, HttpError> {
         let mut request = self.request(method, path);
         if let Some(body) = body {
             let json = serde_json::to_vec(body).map_err(|error| self.unreadable(&error))?;
             request = request.header("Content-Type", "application/json").body(json);
         }
-        let answer = self.send(request, limits::HTTP_TIMEOUT).await?;
+        let answer = self.send(request, time_limit).await?;
         serde_json::from_slice(&answer).map_err(|error| self.unreadable(&error))
     }
 

@@ -28,6 +28,7 @@
 //! The examples beside this package follow a trajectory and push a checkpoint. Units, frames, error codes and
 //! limits are in `protocol/README.md` of the project.
 
+mod actors;
 mod client;
 mod connection;
 mod decode;
@@ -49,8 +50,9 @@ pub use observation::{ImageView, Observation};
 pub use options::ConnectOptions;
 pub use wildcity_protocol as protocol;
 pub use wildcity_protocol::http::{
-    AllCells, CellReport, CellSelection, NewPush, PreviewRequest, Push, PushFile, PushReport,
-    PushState, Upload,
+    ActorAsset, ActorBox, ActorClass, ActorLevel, ActorProvenance, AllCells, CellReport,
+    CellSelection, NewActor, NewPush, PreviewRequest, Push, PushFile, PushReport, PushState,
+    Upload,
 };
 pub use wildcity_protocol::message::{
     Action, BranchPoint, Drive, DrivePose, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,

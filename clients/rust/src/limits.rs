@@ -14,9 +14,13 @@ pub const UPLOAD_CHUNK_BYTES: usize = 1 << 20;
 /// How long a client waits for a TCP and TLS connection to an HTTP server.
 pub const HTTP_CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// How long a client waits for an HTTP answer. The server answers at once: no HTTP request waits for a push
-/// or a rendered image.
+/// How long a client waits for an HTTP answer. The server answers at once: no HTTP request but that for an
+/// asset of an actor waits for a push or a rendered image.
 pub const HTTP_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// How long a client waits until an asset of an actor is stored: as long as a server reads by default (30 minutes), and
+/// time for earlier pushes.
+pub const ACTOR_TIMEOUT: Duration = Duration::from_secs(3600);
 
 /// Lowest rate, in bytes per second, at which an upload is sent and at which the server hashes it. A client
 /// that meets a lower rate gives up.

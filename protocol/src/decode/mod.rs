@@ -24,7 +24,7 @@ use std::sync::LazyLock;
 
 use serde::de::DeserializeOwned;
 
-use crate::http::{NewEdit, NewPush, NewUpload, Rollback};
+use crate::http::{NewActor, NewEdit, NewPush, NewUpload, Rollback};
 use crate::message::Request;
 
 use shape::Shapes;
@@ -55,6 +55,7 @@ inbound!(NewUpload, "new_upload");
 inbound!(NewPush, "new_push");
 inbound!(Rollback, "rollback");
 inbound!(NewEdit, "new_edit");
+inbound!(NewActor, "new_actor");
 
 /// Why a message was refused.
 #[derive(Clone, Debug, PartialEq, Eq)]

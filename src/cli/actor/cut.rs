@@ -17,7 +17,7 @@ use wildcity_sim::scenario::TracksFile;
 use wildcity_twin::ingest;
 use wildcity_twin::store::{Catalog, CutPlace, Version};
 
-use super::import::parse_class;
+use super::asset_options::parse_class;
 use crate::cli::directories::{TwinVersion, Twins};
 
 /// Lift what lies in a box out of a twin: makes a new version without it, and an asset of exactly these Gaussians.

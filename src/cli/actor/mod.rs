@@ -1,11 +1,14 @@
 //! `wildcity actor`.
 
+mod asset_options;
 mod cut;
 mod generate;
 mod import;
 mod list;
 mod picture;
+mod push;
 mod show;
+mod summary;
 
 pub(super) use generate::generated;
 
@@ -16,6 +19,7 @@ pub(super) use generate::generated;
 #[command(after_long_help = "\
 Examples:
   wildcity actor import car.glb --axes '0 0 1 1 0 0 0 1 0'
+  wildcity actor push car.glb --axes '0 0 1 1 0 0 0 1 0' --server http://sim:8080
   wildcity actor generate
   wildcity actor list
   wildcity actor show car --picture car.png")]
@@ -27,6 +31,7 @@ pub(super) struct Actor {
 #[derive(Debug, clap::Subcommand)]
 enum Subcommand {
     Import(import::Import),
+    Push(push::Push),
     Generate(generate::Generate),
     List(list::List),
     Show(show::Show),
@@ -37,6 +42,7 @@ impl Actor {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.subcommand {
             Subcommand::Import(import) => import.run(),
+            Subcommand::Push(push) => push.run(),
             Subcommand::Generate(generate) => generate.run(),
             Subcommand::List(list) => list.run(),
             Subcommand::Show(show) => show.run(),

@@ -124,6 +124,7 @@ fn status_of(code: Code) -> StatusCode {
         Code::Unauthorized => StatusCode::UNAUTHORIZED,
         Code::Forbidden => StatusCode::FORBIDDEN,
         Code::UnknownTwin
+        | Code::UnknownActor
         | Code::UnknownVersion
         | Code::UnknownRig
         | Code::UnknownCamera
@@ -317,7 +318,9 @@ fn of_profile(error: &ProfileError) -> WireFault {
 fn of_store(error: &StoreError) -> WireFault {
     match error {
         StoreError::Name { .. } => at(Code::InvalidName, "twin"),
-        StoreError::NoTwin { .. } | StoreError::NoActor { .. } => at(Code::UnknownTwin, "twin"),
+        StoreError::NoTwin { .. } => at(Code::UnknownTwin, "twin"),
+        StoreError::NoActor { .. } => at(Code::UnknownActor, "actor"),
+        StoreError::ActorExists { .. } => at(Code::Conflict, "name"),
         StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. } => {
             at(Code::UnknownVersion, "version")
         }

@@ -62,7 +62,6 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     // The hash is computed from the parsed body, so that white space does not make it a different push.
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
     let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
-    let files = files.into_iter().enumerate();
     let preview_poses = preview
         .poses
         .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES));
@@ -70,7 +69,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         id,
         twin,
         request_hash,
-        files: files.map(|(index, file)| requested_file(index, file)).collect::<Result<_, _>>()?,
+        files: requested_files(files)?,
         base,
         cells: match cells {
             None => CellSelection::Touched,
@@ -90,6 +89,12 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     Ok(request)
 }
 
+/// The files of a push.
+pub(super) fn requested_files(files: Vec<http::PushFile>) -> Result<Vec<RequestedFile>, PushError> {
+    let files = files.into_iter().enumerate();
+    files.map(|(index, file)| requested_file(index, file)).collect()
+}
+
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
     let axes = SourceAxes::parse(&file.axes, file.scale);
     let axes = axes.map_err(|error| {
@@ -100,10 +105,14 @@ fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, P
         let field = format!("files[{index}].{part}");
         PushError::InvalidField { field, reason: error.to_string() }
     })?;
-    Ok(RequestedFile { upload: file.upload, axes })
+    Ok(RequestedFile { upload: file.upload, axes, name: file.name })
 }
 
-fn parse_field<T: FromStr<Err: Display>>(field: &str, text: &str) -> Result<T, PushError> {
+/// Reads a value that is text on the wire.
+pub(super) fn parse_field<T: FromStr<Err: Display>>(
+    field: &str,
+    text: &str,
+) -> Result<T, PushError> {
     text.parse().map_err(|error: T::Err| PushError::InvalidField {
         field: field.to_owned(),
         reason: error.to_string(),

@@ -10,9 +10,11 @@
 //! camera       lenses, windshields, shutters and exposures, to and from the wire
 //! drive        recorded drives
 //! http         bodies of HTTP requests and answers
+//! actor        those about assets of actors
 //! fault        the wire code and the HTTP status of each fault
 //! ```
 
+mod actor;
 mod answer;
 mod camera;
 mod drive;
@@ -26,6 +28,7 @@ mod request;
 mod rig;
 mod sensors;
 
+pub(crate) use actor::{actor, actors, new_actor};
 pub(crate) use answer::{
     AlsoResumed, closed, in_memory, ok, opened, resumed, shared_memory, switched, twin, twins,
     welcome,

@@ -1,5 +1,6 @@
 //! HTTP routes.
 
+mod actors;
 mod cors;
 mod episodes;
 mod metrics;

@@ -9,9 +9,9 @@ use axum::response::{IntoResponse as _, Response};
 use axum::{Extension, Json};
 use tracing::Instrument as _;
 
-use wildcity_push::{Begun, Push, PushError, PushRequest, SourceFile, State};
+use wildcity_push::{Begun, Push, PushError, PushRequest, RequestedFile, SourceFile, State};
 
-use crate::audit::{Change, Ended};
+use crate::audit::{Change, Ended, Target};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
@@ -42,8 +42,9 @@ pub(super) async fn begin(
     let mut open = None;
     let files = || {
         open = Some(state.open_pushes.begin(&grant)?);
-        let files = find_uploads(&state, &grant.name, &request)?;
-        state.audit.begin(&grant, &Change { what: "push", twin: &twin, id: Some(&id) })?;
+        let files = find_uploads(&state, &grant.name, &request.files)?;
+        let target = Target::Twin(&twin);
+        state.audit.begin(&grant, &Change { what: "push", target, id: Some(&id) })?;
         Ok::<_, Fault>(files)
     };
     let push = match state.pushes.begin(&request, &id, files)? {
@@ -104,12 +105,14 @@ async fn run(
         wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints)
             .instrument(tracing::debug_span!("push", twin, id = owned.id));
     let result = tokio::select! {
-        result = published => result,
+        // A cancelled push ends with whatever its reading was at, too.
+        biased;
         () = push.cancelled() => Err(PushError::Cancelled),
+        result = published => result,
         () = state.stopped() => Err(PushError::ShuttingDown),
     };
     let reason = result.as_ref().err().map(ToString::to_string);
-    let change = Change { what: "push", twin: &twin, id: Some(&owned.id) };
+    let change = Change { what: "push", target: Target::Twin(&twin), id: Some(&owned.id) };
     let made = result.as_ref().map(|version| Ended::Version(version.number));
     let made = made.unwrap_or(Ended::Not(reason.as_deref().unwrap_or_default()));
     state.audit.end(&owned.grant, &change, made);
@@ -117,23 +120,27 @@ async fn run(
     if let Some(reason) = reason {
         tracing::warn!(state = ?ended, "a push ended: {reason}");
     }
-    let outcome = match ended {
+    state.metrics.push_ended(outcome(ended));
+}
+
+/// The outcome of a push that ended, as metrics count it.
+pub(super) fn outcome(ended: State) -> &'static str {
+    match ended {
         State::Ready => "ready",
         State::Refused => "refused",
         _ => "failed",
-    };
-    state.metrics.push_ended(outcome);
+    }
 }
 
 /// The finished uploads of a push, which belong to its token. An upload is not removed while its file is held.
-fn find_uploads(
+pub(super) fn find_uploads(
     state: &ServerState,
     owner: &str,
-    request: &PushRequest,
+    requested: &[RequestedFile],
 ) -> Result<Vec<SourceFile>, Fault> {
     let spool = state.spool()?;
-    let mut files = Vec::with_capacity(request.files.len());
-    for (index, file) in request.files.iter().enumerate() {
+    let mut files = Vec::with_capacity(requested.len());
+    for (index, file) in requested.iter().enumerate() {
         let field = format!("files[{index}].upload");
         let upload = spool.get(owner, &file.upload).map_err(|fault| match fault {
             Fault::UnknownUpload { id, .. } => Fault::UnknownUpload { id, field: Some(field) },
@@ -146,7 +153,7 @@ fn find_uploads(
             return Err(Fault::OutOfRange { field: format!("files[{index}].upload"), must });
         }
         files.push(SourceFile {
-            name: upload.announced().name.clone(),
+            name: file.name.clone().unwrap_or_else(|| upload.announced().name.clone()),
             path: upload.path(),
             bytes: size,
             guard: upload,

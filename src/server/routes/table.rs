@@ -10,7 +10,8 @@ use axum::routing::{MethodFilter, MethodRouter, on};
 use crate::state::ServerState;
 
 use super::{
-    episodes, metrics, openapi, pushes, ready, sessions, tickets, twins, uploads, viewer, websocket,
+    actors, episodes, metrics, openapi, pushes, ready, sessions, tickets, twins, uploads, viewer,
+    websocket,
 };
 
 /// A method of a path.
@@ -290,6 +291,26 @@ pub(super) fn guarded() -> Vec<Row> {
         op(Delete, "/v1/uploads/{id}", PUSH, "Removes an upload.")
             .answers(204, Content::None)
             .does(uploads::delete),
+        op(Get, "/v1/actors", ANY, "All assets of actors, in order of name and hash.")
+            .answers(200, List("actors", "actor"))
+            .does(actors::list),
+        op(
+            Get,
+            "/v1/actors/{actor}",
+            ANY,
+            "The asset of an actor of this name, or of a hash that begins so.",
+        )
+        .answers(200, Json("actor"))
+        .does(actors::show),
+        op(
+            Post,
+            "/v1/actors",
+            PUSH,
+            "Makes an asset of an actor from uploads; 200 instead if it is there already.",
+        )
+        .takes(Json("new_actor"))
+        .answers(201, Json("actor"))
+        .does(actors::push),
         op(Get, "/metrics", ADMIN, "Metrics for Prometheus.")
             .answers(200, Other("application/openmetrics-text"))
             .does(metrics::show),

@@ -10,7 +10,7 @@ use axum::{Extension, Json};
 use wildcity_push::PushError;
 use wildcity_twin::store::StoreError;
 
-use crate::audit::{Change, Ended};
+use crate::audit::{Change, Ended, Target};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
@@ -114,7 +114,7 @@ pub(super) async fn edit(
     let edited = tokio::spawn(async move {
         let _open = open;
         let twin = request.twin.clone();
-        let change = Change { what: "edit", twin: &twin, id: None };
+        let change = Change { what: "edit", target: Target::Twin(&twin), id: None };
         state.audit.begin(&grant, &change)?;
         let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
         let edited =
@@ -140,7 +140,7 @@ pub(super) async fn rollback(
     let number = convert::rollback(&body)?;
     let version = blocking(move || {
         let engine = &state.engine;
-        let change = Change { what: "rollback", twin: &name, id: None };
+        let change = Change { what: "rollback", target: Target::Twin(&name), id: None };
         state.audit.begin(&grant, &change)?;
         let rolled_back = engine.catalog().rollback(&name, number);
         let reason = rolled_back.as_ref().err().map(ToString::to_string).unwrap_or_default();

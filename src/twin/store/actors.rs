@@ -50,6 +50,24 @@ pub struct StoredActor {
     pub levels: Vec<StoredLevel>,
 }
 
+/// What [`Catalog::add_actor`] has done.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AddedActor {
+    /// The asset.
+    pub actor: StoredActor,
+    /// Whether it was not there before.
+    pub is_new: bool,
+}
+
+/// Whether an asset may get the name of an asset of another content. A name that two assets have stands for neither.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SameName {
+    /// It may.
+    Allowed,
+    /// It may not.
+    Refused,
+}
+
 /// One level of a [`StoredActor`].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -81,14 +99,45 @@ impl Catalog {
         asset: &ActorAsset,
         record: RecordFormat,
     ) -> Result<StoredActor, StoreError> {
+        self.add_actor(asset, record, SameName::Allowed).map(|added| added.actor)
+    }
+
+    /// As [`Catalog::put_actor`], and says whether the asset is new.
+    ///
+    /// In an object store, which has no locks, two processes that add different assets of one name at the same time
+    /// both succeed.
+    ///
+    /// # Errors
+    /// As [`Catalog::put_actor`]; [`StoreError::ActorExists`] with [`SameName::Refused`].
+    pub fn add_actor(
+        &self,
+        asset: &ActorAsset,
+        record: RecordFormat,
+        same_name: SameName,
+    ) -> Result<AddedActor, StoreError> {
         let (header, bytes) = self.encode_actor(asset, record)?;
+        let hash = blake3::hash(&bytes).to_hex().to_string();
         self.remove_abandoned_commits(Some(ACTORS))?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let mut staging = self.objects.begin_staging(ACTORS, &id)?;
-        let stored = staging.put(Box::new(|out| out.write_all(&bytes)))?;
+        // What holds of the other assets now holds until this one is visible.
         staging.lock_publishing()?;
+        if same_name == SameName::Refused {
+            self.check_name_is_free(&header.description.name, &hash)?;
+        }
+        let is_new = self.objects.check_present(ACTORS, &hash, bytes.len() as u64).is_err();
+        let stored = staging.put(Box::new(|out| out.write_all(&bytes)))?;
         staging.place_objects(&BTreeSet::from([&*stored.hash]))?;
-        Ok(StoredActor::new(stored.hash, stored.bytes, header))
+        Ok(AddedActor { actor: StoredActor::new(stored.hash, stored.bytes, header), is_new })
+    }
+
+    /// Refuses the name of an asset of another hash.
+    fn check_name_is_free(&self, name: &str, hash: &str) -> Result<(), StoreError> {
+        let is_other = |actor: &StoredActor| actor.description.name == name && actor.hash != hash;
+        match self.actors()?.into_iter().find(is_other) {
+            None => Ok(()),
+            Some(other) => Err(StoreError::ActorExists { name: name.to_owned(), hash: other.hash }),
+        }
     }
 
     /// All assets, in order of name and hash.

@@ -109,6 +109,18 @@ pub enum StoreError {
         /// Those that have it, or else all that exist.
         known: Vec<String>,
     },
+    /// An asset of another content has the name.
+    #[error(
+        "there is an actor {name:?} of another content already ({}): choose another name, since a name of two assets \
+         stands for neither",
+        hash.get(..12).unwrap_or(hash)
+    )]
+    ActorExists {
+        /// The name.
+        name: String,
+        /// The hash of the asset that has it.
+        hash: String,
+    },
     /// A box contains no Gaussian of the twin, or all of a cell's.
     #[error(
         "{}",

@@ -72,7 +72,7 @@ mod remote;
 mod settings;
 mod sky;
 
-pub use actors::{StoredActor, StoredLevel};
+pub use actors::{AddedActor, SameName, StoredActor, StoredLevel};
 pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
 pub use cut::{CUT_ABOVE_M, Cut, CutPlace};

@@ -6,6 +6,7 @@ in SI units, or have their unit in their name. Frames and conventions are in `pr
 
 from importlib.metadata import version as _version
 
+from .assets import ActorAsset, ActorBox, ActorLevel, ActorProvenance, actor, actors, push_actor
 from .errors import (
     BadFrame,
     Code,
@@ -76,6 +77,10 @@ __version__ = _version("wildcity")
 
 __all__ = [
     "Action",
+    "ActorAsset",
+    "ActorBox",
+    "ActorLevel",
+    "ActorProvenance",
     "AxisNoise",
     "BadFrame",
     "Camera",
@@ -139,9 +144,12 @@ __all__ = [
     "WheelSpeed",
     "WildCityError",
     "Windshield",
+    "actor",
+    "actors",
     "connect",
     "png_data_uri",
     "push",
+    "push_actor",
     "recorded_drive",
     "rollback",
     "serve",

@@ -14,6 +14,7 @@ Code = Literal[
     "unsupported_protocol",
     "session_state",
     "unknown_twin",
+    "unknown_actor",
     "unknown_version",
     "twin_damaged",
     "unknown_rig",

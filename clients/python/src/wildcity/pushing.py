@@ -99,10 +99,7 @@ def push(
     report = progress or (lambda _: None)
     request: dict[str, Any] = {
         "id": push_id or uuid.uuid4().hex,
-        "files": [
-            {"upload": _upload(http_client, Path(path), report), "axes": axes, "scale": scale}
-            for path in paths
-        ],
+        "files": upload_all(http_client, paths, axes, scale, report),
         "levels": levels,
         "profile": list(profile),
     }
@@ -188,6 +185,25 @@ def _finished_push(answer: dict[str, Any]) -> Push:
     raise PushFailed(code, error["message"], cells, answer.get("report"))
 
 
+def upload_all(
+    http_client: HttpClient,
+    paths: Sequence[str | os.PathLike[str]],
+    axes: str,
+    scale: float,
+    report: Callable[[PushProgress], None],
+) -> list[dict[str, Any]]:
+    """Uploads files, and returns them as a request has them. A file in a folder beside the first one is named with
+    that folder, as the first one names it."""
+    files: list[dict[str, Any]] = []
+    for path in map(Path, paths):
+        file = {"upload": _upload(http_client, path, report), "axes": axes, "scale": scale}
+        folder = Path(paths[0]).parent
+        if path.is_relative_to(folder) and path.parent != folder:
+            file["name"] = path.relative_to(folder).as_posix()
+        files.append(file)
+    return files
+
+
 def _upload(http_client: HttpClient, path: Path, report: Callable[[PushProgress], None]) -> str:
     """Uploads the bytes of a file that the server lacks, and returns the id of the upload."""
     digest = hashlib.sha256()
@@ -200,11 +216,11 @@ def _upload(http_client: HttpClient, path: Path, report: Callable[[PushProgress]
         failures = 0
         furthest = -1
         while True:
-            upload = http_client.json_with_retries("POST", "/v1/uploads", announcement)
-            if upload["complete"]:
+            known = http_client.json_with_retries("POST", "/v1/uploads", announcement)
+            if known["complete"]:
                 report(PushProgress("uploading", size, size))
-                return str(upload["id"])
-            offset = int(upload["offset"])
+                return str(known["id"])
+            offset = int(known["offset"])
             # An attempt that transferred something starts the count of failures again.
             failures = 0 if offset > furthest else failures + 1
             furthest = max(furthest, offset)
@@ -214,7 +230,7 @@ def _upload(http_client: HttpClient, path: Path, report: Callable[[PushProgress]
             headers = {"Upload-Offset": str(offset), "Content-Length": str(size - offset)}
             try:
                 body = _chunks(file, offset, size, report)
-                http_client.json("PATCH", f"/v1/uploads/{upload['id']}", body, headers)
+                http_client.json("PATCH", f"/v1/uploads/{known['id']}", body, headers)
             except ConnectFailed:
                 if failures >= ATTEMPTS:
                     raise

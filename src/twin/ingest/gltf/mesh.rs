@@ -1,21 +1,20 @@
 //! Ordinary meshes: their triangles are covered with flat Gaussians in the colour of their
 //! material.
 //!
-//! Long triangles are halved first (`triangle.rs` covers each). The colour is the product of the
-//! material's base colour, its texture, and the vertex colours, without lighting.
+//! Long triangles are halved first (`triangle.rs` covers each). The colour is what a camera sees in
+//! white light from all sides: the material's base colour, plus the light that it emits (`material.rs`).
 
 use std::collections::BTreeMap;
-use std::io::Cursor;
+use std::fmt;
 
 use glam::{DVec2, DVec3, DVec4};
 use gltf::Semantic;
 use gltf::accessor::{DataType, Dimensions};
-use gltf::image::Source;
 use gltf::mesh::Mode;
-use image::ImageReader;
 
 use super::instances::MeshInstance;
-use super::triangle::{LONGEST, Material, Texture, Triangle};
+use super::material::{self, MaterialSource, TextureArea};
+use super::triangle::{LONGEST, Material, Triangle};
 use super::uris::Uris;
 use super::{FORMAT, bad};
 use crate::ingest::IngestError;
@@ -41,15 +40,20 @@ pub(super) fn read(
     let mut textures = BTreeMap::new();
     let mut triangles = Vec::new();
     for placed in placed {
-        let place = format!("node {}", placed.node);
-        let mesh = meshes.get(placed.index).ok_or_else(|| bad(&place, "has no mesh".into()))?;
+        let no_mesh = || bad(&format!("node {}", placed.node), "has no mesh".into());
+        let mesh = meshes.get(placed.index).ok_or_else(no_mesh)?;
         for primitive in mesh.primitives() {
-            if let Some(image) = image_of(&primitive)
-                && !textures.contains_key(&image.index())
-            {
-                textures.insert(image.index(), decode(&image, buffers, uris)?);
+            let place =
+                Place { node: placed.node, mesh: mesh.index(), primitive: primitive.index() };
+            let source = MaterialSource::of(&primitive.material()).map_err(|r| place.bad(r))?;
+            for image in source.images() {
+                if !textures.contains_key(&image.index()) {
+                    textures.insert(image.index(), material::decode(&image, buffers, uris)?);
+                }
             }
-            let found = read_primitive(&primitive, buffers, &textures, &place, uris.parts())?;
+            let material = source.material(&textures);
+            let reader = PrimitiveReader { primitive, buffers, source, material, place };
+            let found = reader.read(uris.parts())?;
             triangles.extend(found.into_iter().map(|triangle| Triangle {
                 corners_m: triangle.corners_m.map(|m| placed.scene_from_mesh.transform_point3(m)),
                 ..triangle
@@ -94,156 +98,142 @@ pub(super) fn read(
     Ok(all)
 }
 
-/// The triangles of one primitive, in the axes of its mesh.
-fn read_primitive(
-    primitive: &gltf::Primitive<'_>,
-    buffers: &[&[u8]],
-    textures: &BTreeMap<usize, Texture>,
-    place: &str,
-    parts: &mut dyn SceneFiles,
-) -> Result<Vec<Triangle>, IngestError> {
-    let place = &format!("{place}, primitive {}", primitive.index());
-    if primitive.mode() != Mode::Triangles {
-        let reason = format!("has mode {:?}; only lists of triangles are read", primitive.mode());
-        return Err(bad(place, reason));
-    }
-    // Check the accessors before the gltf crate reads them.
-    let material = primitive.material();
-    let base = material.pbr_metallic_roughness();
-    let TextureArea { set, offset, scale } =
-        TextureArea::of(base.base_color_texture()).map_err(|reason| bad(place, reason))?;
-    const FRACTIONS: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
-    const INDICES: &[DataType] = &[DataType::U8, DataType::U16, DataType::U32];
-    for (accessor, dimensions, types) in [
-        (primitive.get(&Semantic::Positions), &[Dimensions::Vec3][..], &[DataType::F32][..]),
-        (primitive.get(&Semantic::TexCoords(set)), &[Dimensions::Vec2], FRACTIONS),
-        (primitive.get(&Semantic::Colors(0)), &[Dimensions::Vec3, Dimensions::Vec4], FRACTIONS),
-        (primitive.indices(), &[Dimensions::Scalar], INDICES),
-    ] {
-        if let Some(accessor) = accessor {
-            check(&accessor, dimensions, types, buffers).map_err(|reason| bad(place, reason))?;
-        }
-    }
-    // Count what will be allocated.
-    let reader = primitive.reader(|buffer| buffers.get(buffer.index()).copied());
-    let positions = reader.read_positions().ok_or_else(|| bad(place, "has no POSITION".into()))?;
-    let uv = reader.read_tex_coords(set).map(|uv| uv.into_f32());
-    let colors = reader.read_colors(0).map(|colors| colors.into_rgba_f32());
-    let corners = positions.len();
-    let count = reader.read_indices().map_or(corners, |indices| indices.into_u32().len()) / 3;
-    parts.budget().unpack(
-        FORMAT,
-        place,
-        (count * size_of::<Triangle>() + corners * 3 * size_of::<DVec4>()) as u128,
-    )?;
+/// Where a primitive is, for messages.
+#[derive(Clone, Copy)]
+struct Place {
+    node: usize,
+    mesh: usize,
+    primitive: usize,
+}
 
-    // Positions, colours, and texture coordinates per corner.
-    let positions_m: Vec<DVec3> = positions.map(|m| DVec3::from_array(m.map(f64::from))).collect();
-    let uv: Option<Vec<DVec2>> =
-        uv.map(|uv| uv.map(|uv| offset + scale * DVec2::from_array(uv.map(f64::from))).collect());
-    let factor = DVec4::from_array(base.base_color_factor().map(f64::from));
-    let colors: Option<Vec<DVec4>> =
-        colors.map(|colors| colors.map(|c| DVec4::from_array(c.map(f64::from))).collect());
-    let texture = image_of(primitive).and_then(|image| textures.get(&image.index()).cloned());
-    let is_solid = material.alpha_mode() == gltf::material::AlphaMode::Opaque;
-    let cutoff = match material.alpha_mode() {
-        gltf::material::AlphaMode::Mask => material.alpha_cutoff().unwrap_or(0.5).into(),
-        _ => 0.0,
-    };
-    let material = Material { texture: texture.filter(|_| uv.is_some()), cutoff };
-    let corner = |index: usize| -> Option<(DVec3, DVec4, DVec2)> {
-        let mut color =
-            factor * colors.as_ref().map_or(Some(DVec4::ONE), |c| c.get(index).copied())?;
-        if is_solid {
-            color.w = 1.0;
-        }
-        let uv = uv.as_ref().map_or(Some(DVec2::ZERO), |uv| uv.get(index).copied())?;
-        Some((*positions_m.get(index)?, color, uv))
-    };
+impl Place {
+    fn bad(self, reason: String) -> IngestError {
+        bad(&self.to_string(), reason)
+    }
+}
 
-    // Triangles: three corners each, by index or in order.
-    let indices: Vec<usize> = match reader.read_indices() {
-        Some(indices) => indices.into_u32().map(|index| index as usize).collect(),
-        None => (0..corners).collect(),
-    };
-    let (whole, _) = indices.as_chunks::<3>();
-    let triangle = |corners: &[usize; 3]| {
-        let missing = || bad(place, format!("a corner of {corners:?} does not exist"));
-        let [Some(a), Some(b), Some(c)] = corners.map(corner) else { return Err(missing()) };
-        Ok(Triangle {
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { node, mesh, primitive } = self;
+        write!(f, "node {node}, mesh {mesh}, primitive {primitive}")
+    }
+}
+
+/// Reads the triangles of one primitive.
+struct PrimitiveReader<'a> {
+    primitive: gltf::Primitive<'a>,
+    buffers: &'a [&'a [u8]],
+    source: MaterialSource<'a>,
+    material: Material,
+    place: Place,
+}
+
+/// What a primitive has at each corner.
+struct Corners {
+    positions_m: Vec<DVec3>,
+    /// Vertex colours; none if all are white.
+    colors: Option<Vec<DVec4>>,
+    /// Coordinates in the base colour's texture, and in that of the emitted light; none without a texture.
+    uv: Option<Vec<DVec2>>,
+    emissive_uv: Option<Vec<DVec2>>,
+}
+
+impl PrimitiveReader<'_> {
+    /// The triangles, in the axes of the mesh.
+    fn read(&self, parts: &mut dyn SceneFiles) -> Result<Vec<Triangle>, IngestError> {
+        let mode = self.primitive.mode();
+        if mode != Mode::Triangles {
+            let reason = format!("has mode {mode:?}; only lists of triangles are read");
+            return Err(self.place.bad(reason));
+        }
+        self.check_accessors().map_err(|reason| self.place.bad(reason))?;
+
+        // Count what will be allocated.
+        let reader = self.primitive.reader(|buffer| self.buffers.get(buffer.index()).copied());
+        let no_positions = || self.place.bad("has no POSITION".into());
+        let corners = reader.read_positions().ok_or_else(no_positions)?.len();
+        let count = reader.read_indices().map_or(corners, |indices| indices.into_u32().len()) / 3;
+        let bytes = count * size_of::<Triangle>() + corners * 4 * size_of::<DVec4>();
+        parts.budget().unpack(FORMAT, &self.place.to_string(), bytes as u128)?;
+
+        // Three corners each, by index or in order.
+        let corners = self.corners().ok_or_else(no_positions)?;
+        let indices: Vec<usize> = match reader.read_indices() {
+            Some(indices) => indices.into_u32().map(|index| index as usize).collect(),
+            None => (0..corners.positions_m.len()).collect(),
+        };
+        let triangle = |indices: &[usize; 3]| {
+            let missing = || self.place.bad(format!("a corner of {indices:?} does not exist"));
+            self.triangle(&corners, indices).ok_or_else(missing)
+        };
+        indices.as_chunks::<3>().0.iter().map(triangle).collect()
+    }
+
+    /// Checks the accessors before the gltf crate reads them, and that there are those that the material names.
+    fn check_accessors(&self) -> Result<(), String> {
+        const FRACTIONS: &[DataType] = &[DataType::U8, DataType::U16, DataType::F32];
+        const INDICES: &[DataType] = &[DataType::U8, DataType::U16, DataType::U32];
+        let check = |accessor: Option<gltf::Accessor<'_>>, dimensions: &[_], types: &[_]| {
+            accessor.map_or(Ok(()), |a| check(&a, dimensions, types, self.buffers))
+        };
+        let get = |semantic| self.primitive.get(&semantic);
+        check(get(Semantic::Positions), &[Dimensions::Vec3], &[DataType::F32])?;
+        check(get(Semantic::Colors(0)), &[Dimensions::Vec3, Dimensions::Vec4], FRACTIONS)?;
+        check(self.primitive.indices(), &[Dimensions::Scalar], INDICES)?;
+        for area in self.source.areas() {
+            let coordinates = get(Semantic::TexCoords(area.set));
+            if coordinates.is_none() {
+                // glTF 2.0, textureInfo.texCoord: a primitive must have them for the material to be applicable.
+                return Err(format!(
+                    "has no attribute TEXCOORD_{}, which the {} of its material names; export the mesh with texture \
+                     coordinates, or the material without this texture",
+                    area.set, area.texture
+                ));
+            }
+            check(coordinates, &[Dimensions::Vec2], FRACTIONS)?;
+        }
+        Ok(())
+    }
+
+    /// What the primitive has at its corners; none without positions.
+    fn corners(&self) -> Option<Corners> {
+        let reader = self.primitive.reader(|buffer| self.buffers.get(buffer.index()).copied());
+        let uv = |area: Option<&TextureArea>| {
+            let area = area?;
+            let uv = reader.read_tex_coords(area.set)?.into_f32();
+            Some(uv.map(|uv| area.place(DVec2::from_array(uv.map(f64::from)))).collect())
+        };
+        let colors = reader.read_colors(0).map(|colors| colors.into_rgba_f32());
+        let positions_m = reader.read_positions()?.map(|m| DVec3::from_array(m.map(f64::from)));
+        Some(Corners {
+            positions_m: positions_m.collect(),
+            colors: colors
+                .map(|colors| colors.map(|c| DVec4::from_array(c.map(f64::from))).collect()),
+            uv: uv(self.source.base_area()),
+            emissive_uv: uv(self.source.emissive_area()),
+        })
+    }
+
+    /// The triangle of three corners; none if one of them does not exist.
+    fn triangle(&self, corners: &Corners, indices: &[usize; 3]) -> Option<Triangle> {
+        let at = |index: usize| -> Option<(DVec3, DVec4, DVec2, DVec2)> {
+            let color = corners.colors.as_ref().map_or(Some(DVec4::ONE), |c| c.get(index).copied());
+            let uv = |uv: &Option<Vec<DVec2>>| {
+                uv.as_ref().map_or(Some(DVec2::ZERO), |uv| uv.get(index).copied())
+            };
+            let position_m = *corners.positions_m.get(index)?;
+            let color = self.source.base_color(color?);
+            Some((position_m, color, uv(&corners.uv)?, uv(&corners.emissive_uv)?))
+        };
+        let [Some(a), Some(b), Some(c)] = indices.map(at) else { return None };
+        Some(Triangle {
             corners_m: [a.0, b.0, c.0],
             colors: [a.1, b.1, c.1],
             uv: [a.2, b.2, c.2],
-            material: material.clone(),
+            emissive_uv: [a.3, b.3, c.3],
+            material: self.material.clone(),
         })
-    };
-    whole.iter().map(triangle).collect()
-}
-
-/// The part of an image that a texture shows: `offset + scale * uv` (KHR_texture_transform).
-struct TextureArea {
-    /// The set of texture coordinates.
-    set: u32,
-    offset: DVec2,
-    scale: DVec2,
-}
-
-impl TextureArea {
-    /// The area of a texture; all of the image without a texture or without a transform.
-    fn of(info: Option<gltf::texture::Info<'_>>) -> Result<Self, String> {
-        let mut area = Self { set: 0, offset: DVec2::ZERO, scale: DVec2::ONE };
-        let Some(info) = info else { return Ok(area) };
-        area.set = info.tex_coord();
-        let Some(transform) = info.texture_transform() else { return Ok(area) };
-        // Programs disagree about its direction: the formula of the extension's text turns the other way than the
-        // viewer of its authors.
-        if transform.rotation() != 0.0 {
-            return Err("has a texture that KHR_texture_transform rotates; export rotated texture coordinates".into());
-        }
-        area.set = transform.tex_coord().unwrap_or(area.set);
-        area.offset = DVec2::from_array(transform.offset().map(f64::from));
-        area.scale = DVec2::from_array(transform.scale().map(f64::from));
-        let numbers = [area.offset, area.scale];
-        match numbers.iter().all(|pair| pair.is_finite()) {
-            true => Ok(area),
-            false => Err("has a texture with a KHR_texture_transform that is not finite".into()),
-        }
     }
-}
-
-/// The image of a primitive's base colour texture.
-fn image_of<'a>(primitive: &gltf::Primitive<'a>) -> Option<gltf::Image<'a>> {
-    let texture = primitive.material().pbr_metallic_roughness().base_color_texture();
-    texture.map(|texture| texture.texture().source())
-}
-
-fn decode(
-    image: &gltf::Image<'_>,
-    buffers: &[&[u8]],
-    uris: &mut Uris<'_>,
-) -> Result<Texture, IngestError> {
-    let place = &format!("image {}", image.index());
-    let (file, fetched);
-    match image.source() {
-        Source::View { view, .. } => {
-            let end = view.offset().checked_add(view.length());
-            let buffer = buffers.get(view.buffer().index()).copied().unwrap_or_default();
-            let bytes = end.and_then(|end| buffer.get(view.offset()..end));
-            file = bytes.ok_or_else(|| bad(place, "its bufferView does not exist".into()))?;
-        }
-        Source::Uri { uri, .. } => {
-            fetched = uris.fetch(uri, place)?;
-            file = &fetched;
-        }
-    }
-    let damaged = |e: &dyn std::fmt::Display| bad(place, format!("is not a PNG or JPEG: {e}"));
-    let open = || ImageReader::new(Cursor::new(file)).with_guessed_format();
-    let size_px = open().map_err(|e| damaged(&e))?.into_dimensions().map_err(|e| damaged(&e))?;
-    let pixels = u128::from(size_px.0) * u128::from(size_px.1);
-    // 4 bytes per pixel as decoded, and 4 as RGBA.
-    uris.parts().budget().unpack(FORMAT, place, 8 * pixels)?;
-    let decoded = open().map_err(|e| damaged(&e))?.decode().map_err(|e| damaged(&e))?;
-    Ok(decoded.into_rgba8().into())
 }
 
 /// Checks what the gltf crate's readers assume of an accessor.

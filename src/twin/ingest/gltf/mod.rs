@@ -12,6 +12,7 @@
 mod accessor;
 mod document;
 mod instances;
+mod material;
 mod mesh;
 mod triangle;
 mod uris;

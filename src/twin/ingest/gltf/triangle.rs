@@ -4,6 +4,8 @@
 //! Each part becomes a Gaussian with the mean and covariance of a uniform triangle, widened so that
 //! neighbours leave no gaps.
 
+use std::sync::Arc;
+
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3, DVec4};
 use image::RgbaImage;
 
@@ -32,7 +34,10 @@ pub(super) struct Triangle {
     pub(super) corners_m: [DVec3; 3],
     /// Linear red, green, blue, and opacity at the corners, before the texture's.
     pub(super) colors: [DVec4; 3],
+    /// Coordinates in the texture of the base colour.
     pub(super) uv: [DVec2; 3],
+    /// Coordinates in the texture of the emitted light.
+    pub(super) emissive_uv: [DVec2; 3],
     pub(super) material: Material,
 }
 
@@ -40,11 +45,21 @@ pub(super) struct Triangle {
 #[derive(Clone)]
 pub(super) struct Material {
     pub(super) texture: Option<Texture>,
+    pub(super) emission: Option<Arc<Emission>>,
     /// Opacity below which a point is invisible.
     pub(super) cutoff: f64,
+    /// Whether alpha is ignored.
+    pub(super) is_solid: bool,
 }
 
-pub(super) type Texture = std::sync::Arc<RgbaImage>;
+/// The light that a material emits.
+pub(super) struct Emission {
+    /// Linear red, green and blue, before the texture's; may be above 1.
+    pub(super) factor: DVec3,
+    pub(super) texture: Option<Texture>,
+}
+
+pub(super) type Texture = Arc<RgbaImage>;
 
 impl Triangle {
     pub(super) fn area_m2(&self) -> f64 {
@@ -75,6 +90,8 @@ impl Triangle {
                     0.5 * (triangle.corners_m[replaced] + triangle.corners_m[other]);
                 half.colors[replaced] = 0.5 * (triangle.colors[replaced] + triangle.colors[other]);
                 half.uv[replaced] = 0.5 * (triangle.uv[replaced] + triangle.uv[other]);
+                half.emissive_uv[replaced] =
+                    0.5 * (triangle.emissive_uv[replaced] + triangle.emissive_uv[other]);
                 whole.push((half, halvings + 1));
             }
         }
@@ -142,27 +159,43 @@ impl Triangle {
         Some(([w, x, y, z].map(|q| q as f32), [long_m, short_m, FLATNESS * long_m]))
     }
 
-    /// Display colour and opacity, 0 to 1, at a point given by its barycentric coordinates.
+    /// Display colour and opacity, 0 to 1, at a point given by its barycentric coordinates. The colour is the linear
+    /// base colour plus the emitted light, encoded.
     fn color(&self, shares: [f64; 3]) -> ([f64; 3], f64) {
-        let at = |values: [DVec4; 3]| (0..3).map(|k| shares[k] * values[k]).sum::<DVec4>();
-        let mut color = at(self.colors);
-        if let Some(image) = &self.material.texture {
-            let uv = (0..3).map(|k| shares[k] * self.uv[k]).sum::<DVec2>();
-            let place = |share: f64, size: u32| {
-                // Repeated, which is glTF's default.
-                ((share.rem_euclid(1.0) * f64::from(size)) as u32).min(size - 1)
-            };
-            let texel = image.get_pixel(place(uv.x, image.width()), place(uv.y, image.height()));
-            let [red, green, blue, alpha] = texel.0.map(|value| f64::from(value) / 255.0);
-            let [red, green, blue] = [red, green, blue].map(linear_from_stored);
-            color *= DVec4::new(red, green, blue, alpha);
+        let weighted = |values: [DVec4; 3]| (0..3).map(|k| shares[k] * values[k]).sum::<DVec4>();
+        let texel = |image: &Texture, corners: [DVec2; 3]| {
+            sample(image, (0..3).map(|k| shares[k] * corners[k]).sum::<DVec2>())
+        };
+        let Material { texture, emission, cutoff, is_solid } = &self.material;
+        let mut color = weighted(self.colors);
+        if let Some(image) = texture {
+            color *= texel(image, self.uv);
         }
-        let opacity = if color.w >= self.material.cutoff { color.w.clamp(0.0, 1.0) } else { 0.0 };
-        (
-            [color.x, color.y, color.z].map(|light| stored_from_linear(light.clamp(0.0, 1.0))),
-            opacity,
-        )
+        let mut light = DVec3::ZERO;
+        if let Some(emission) = emission {
+            let image = emission.texture.as_ref();
+            let share = image.map_or(DVec3::ONE, |image| texel(image, self.emissive_uv).truncate());
+            light = emission.factor * share;
+        }
+        let opacity = match color.w {
+            _ if *is_solid => 1.0,
+            alpha if alpha >= *cutoff => alpha.clamp(0.0, 1.0),
+            _ => 0.0,
+        };
+        let seen = (color.truncate() + light).clamp(DVec3::ZERO, DVec3::ONE);
+        (seen.to_array().map(stored_from_linear), opacity)
     }
+}
+
+/// Linear red, green and blue, and alpha, at a point of an image.
+fn sample(image: &RgbaImage, uv: DVec2) -> DVec4 {
+    // Repeated, which is glTF's default.
+    let place =
+        |share: f64, size: u32| ((share.rem_euclid(1.0) * f64::from(size)) as u32).min(size - 1);
+    let texel = image.get_pixel(place(uv.x, image.width()), place(uv.y, image.height()));
+    let [red, green, blue, alpha] = texel.0.map(|value| f64::from(value) / 255.0);
+    let [red, green, blue] = [red, green, blue].map(linear_from_stored);
+    DVec4::new(red, green, blue, alpha)
 }
 
 #[cfg(test)]
@@ -174,7 +207,8 @@ mod tests {
             corners_m: corners_m.map(DVec3::from_array),
             colors: [DVec4::new(1.0, 0.0, 0.0, 1.0), DVec4::Y, DVec4::Z].map(|c| c.with_w(1.0)),
             uv: [DVec2::ZERO; 3],
-            material: Material { texture: None, cutoff: 0.0 },
+            emissive_uv: [DVec2::ZERO; 3],
+            material: Material { texture: None, emission: None, cutoff: 0.0, is_solid: false },
         }
     }
 
@@ -268,7 +302,7 @@ mod tests {
         let ([red, green, blue], opacity) = whole.color([0.5, 0.5, 0.0]);
         assert_eq!((red, blue, opacity), (green, 0.0, 1.0));
         assert!((red - 0.7354).abs() < 1e-4, "half the light, displayed: {red}");
-        whole.material = Material { texture: None, cutoff: 2.0 };
+        whole.material.cutoff = 2.0;
         let mut parts = Gaussians::with_capacity(0, 0);
         whole.cover(3, &mut parts);
         assert_eq!(parts.len(), 0);

@@ -1,11 +1,15 @@
-//! Bodies of HTTP requests and answers: uploads, pushes, versions, sessions.
+//! Bodies of HTTP requests and answers: uploads, pushes, assets of actors, versions, sessions.
 //!
 //! As on the WebSocket, unknown fields of requests are refused, and answers may gain fields.
+
+mod actor;
 
 use serde::{Deserialize, Serialize};
 
 use crate::error::Code;
 use crate::message::Pose;
+
+pub use actor::{ActorAsset, ActorBox, ActorClass, ActorLevel, ActorProvenance, NewActor};
 
 /// `POST /v1/uploads`: announces a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -80,7 +84,7 @@ pub struct NewPush {
     pub preview: PreviewRequest,
 }
 
-/// One scene file of a push.
+/// One scene file of a push, or of an actor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -93,6 +97,11 @@ pub struct PushFile {
     /// Metres per unit of the file.
     #[serde(default = "one")]
     pub scale: f64,
+    /// The name by which other files of the request name this one, such as `textures/paint.png`. If absent, that of
+    /// the upload.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 1_024)))]
+    pub name: Option<String>,
 }
 
 /// The cells that a push replaces.

@@ -1,0 +1,100 @@
+//! `wildcity actor push`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+
+use wildcity_client::{ActorAsset, ActorBox, ActorClass, HttpClient, NewActor, PushFile};
+use wildcity_push::AssetSettings;
+use wildcity_scene::ActorClass as Class;
+
+use super::asset_options::AssetOptions;
+use super::summary::Summary;
+use crate::cli::progress;
+use crate::cli::push::{Server, name_beside, upload};
+
+/// Make an asset on a running server from files of this machine, as `wildcity actor import` does on the server's own.
+///
+/// The same files with the same options give the same hash. Sessions that open afterwards can use the asset, by name and
+/// by hash. A name that an asset of another content has is refused. To continue an upload after a lost connection, run
+/// the same command again.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Push {
+    /// Files of Gaussians, or glTF meshes, and the files that they name. Files in folders beside the first keep their
+    /// folder in their name.
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+
+    #[command(flatten)]
+    options: AssetOptions,
+
+    #[command(flatten)]
+    server: Server,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity actor push car.glb --axes '0 0 1 1 0 0 0 1 0'
+  wildcity actor push person.ply --class pedestrian --name walker --server http://sim:8080 --token-file token
+  wildcity actor push truck.gltf truck.bin textures/paint.png --gaussians 400000";
+
+impl Push {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        // Refuses bad options before anything is sent.
+        let first = self.files.first().context("give a file")?;
+        let settings = self.options.settings(first)?;
+        self.options.source_axes()?;
+        let client = self.server.client()?;
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        print(&runtime.block_on(self.push(&client, settings))?)?;
+        Ok(())
+    }
+
+    async fn push(
+        &self,
+        client: &HttpClient,
+        settings: AssetSettings,
+    ) -> anyhow::Result<ActorAsset> {
+        let AssetOptions { axes, scale, .. } = &self.options;
+        let mut files = Vec::with_capacity(self.files.len());
+        for path in &self.files {
+            let upload = upload(client, path).await?;
+            let name = name_beside(&self.files, path);
+            files.push(PushFile { upload, axes: axes.clone(), scale: *scale, name });
+        }
+        let AssetSettings { name, class, mesh_gaussians, record } = settings;
+        let asked = NewActor {
+            class: match class {
+                Class::Vehicle => ActorClass::Vehicle,
+                Class::Pedestrian => ActorClass::Pedestrian,
+                Class::Bicycle => ActorClass::Bicycle,
+                Class::Object => ActorClass::Object,
+            },
+            files,
+            gaussians: Some(mesh_gaussians),
+            record: Some(record.to_string()),
+            name,
+        };
+        let spinner = progress::waiting("the server makes the asset");
+        let made = client.push_actor(&asked).await;
+        spinner.finish_and_clear();
+        made.with_context(|| format!("cannot push the actor {:?}", asked.name))
+    }
+}
+
+fn print(actor: &ActorAsset) -> io::Result<()> {
+    let ActorBox { length_m, width_m, height_m } = actor.box_;
+    let summary = Summary {
+        name: &actor.name,
+        class: actor.class.name(),
+        size_m: [length_m, width_m, height_m],
+        gaussians: actor.gaussians,
+        sh_degree: actor.sh_degree,
+        levels: actor.levels.len(),
+        bytes: actor.bytes,
+        hash: &actor.hash,
+    };
+    writeln!(io::stdout().lock(), "{summary}")
+}

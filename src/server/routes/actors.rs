@@ -1,0 +1,128 @@
+//! Assets of actors over HTTP: those that are stored, and pushes of new ones.
+
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use axum::extract::{Path, State as Shared};
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::response::IntoResponse as _;
+use axum::{Extension, Json};
+
+use wildcity_push::{AssetRequest, Push, PushError, SourceFile};
+use wildcity_twin::store::AddedActor;
+
+use crate::audit::{Change, Ended, Target};
+use crate::auth::{Grant, Role};
+use crate::blocking::blocking;
+use crate::convert;
+use crate::idle_deadline::IdleDeadline;
+use crate::open_pushes::OpenPush;
+use crate::state::ServerState;
+
+use super::pushes::{find_uploads, outcome};
+use super::refusal::HttpResult;
+
+/// `GET /v1/actors`: all assets.
+pub(super) async fn list(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+) -> HttpResult {
+    let catalog = state.engine.catalog().clone();
+    let actors = blocking(move || catalog.actors()).await?;
+    Ok(Json(convert::actors(&actors, grant.allows_all_twins())).into_response())
+}
+
+/// `GET /v1/actors/{actor}`: the asset of a name, of a hash, or of a hash that begins so.
+pub(super) async fn show(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Path(name): Path<String>,
+) -> HttpResult {
+    let catalog = state.engine.catalog().clone();
+    let actor = blocking(move || catalog.find_actor(&name)).await?;
+    Ok(Json(convert::actor(&actor, grant.allows_all_twins())).into_response())
+}
+
+/// `POST /v1/actors`: makes an asset of uploads, and answers when it is stored: 201, or 200 if it was there already. A
+/// client that goes away before cancels the push.
+pub(super) async fn push(
+    Shared(state): Shared<Arc<ServerState>>,
+    Extension(grant): Extension<Arc<Grant>>,
+    Extension(deadline): Extension<Arc<IdleDeadline>>,
+    body: Bytes,
+) -> HttpResult {
+    grant.require(Role::Push)?;
+    grant.require_all_twins()?;
+    let request = convert::new_actor(&body)?;
+    let open = state.open_pushes.begin(&grant)?;
+    let push = state.pushes.begin_actor()?;
+    let files = find_uploads(&state, &grant.name, &request.files)?;
+    state.audit.begin(&grant, &change(&request.settings.name))?;
+
+    let _cancelling = CancelWhenDropped(push.clone());
+    let made = tokio::spawn(run(state, push, OwnedPush { grant, _open: open }, request, files));
+    let made = deadline.extend_during(made).await.map_err(|_| PushError::Crashed)?;
+    let AddedActor { actor, is_new } = made?;
+    let status = if is_new { StatusCode::CREATED } else { StatusCode::OK };
+    // The token is not limited to some twins.
+    let mut response = (status, Json(convert::actor(&actor, true))).into_response();
+    if let Ok(location) = HeaderValue::from_str(&format!("/v1/actors/{}", actor.hash)) {
+        response.headers_mut().insert(header::LOCATION, location);
+    }
+    Ok(response)
+}
+
+/// Cancels a push whose request is dropped because its client went away.
+struct CancelWhenDropped(Arc<Push>);
+
+impl Drop for CancelWhenDropped {
+    fn drop(&mut self) {
+        // An error means that it has ended, or that its asset is being written.
+        let _ = self.0.cancel();
+    }
+}
+
+/// Whose push it is.
+struct OwnedPush {
+    grant: Arc<Grant>,
+    /// Counts among the token's pushes.
+    _open: OpenPush,
+}
+
+/// Runs a push to its end and records the result.
+async fn run(
+    state: Arc<ServerState>,
+    push: Arc<Push>,
+    owned: OwnedPush,
+    request: AssetRequest,
+    files: Vec<SourceFile>,
+) -> Result<AddedActor, PushError> {
+    let name = request.settings.name.clone();
+    let change = change(&name);
+    let catalog = state.engine.catalog();
+    let published = wildcity_push::publish_asset(catalog, &state.pushes, &push, request, files);
+    let result = tokio::select! {
+        // A cancelled push ends with whatever its reading was at, too.
+        biased;
+        () = push.cancelled() => Err(PushError::Cancelled),
+        result = published => result,
+        () = state.stopped() => Err(PushError::ShuttingDown),
+    };
+    let reason = result.as_ref().err().map(ToString::to_string).unwrap_or_default();
+    let ended = match &result {
+        Ok(added) => Ended::Asset(&added.actor.hash),
+        Err(_) => Ended::Not(&reason),
+    };
+    state.audit.end(&owned.grant, &change, ended);
+    let ended = push.close(result.as_ref().map(drop));
+    match &result {
+        Ok(added) => tracing::info!(actor = name, hash = added.actor.hash, "stored"),
+        Err(error) => tracing::warn!(actor = name, state = ?ended, "not stored: {error}"),
+    }
+    state.metrics.push_ended(outcome(ended));
+    result
+}
+
+fn change(name: &str) -> Change<'_> {
+    Change { what: "actor", target: Target::Actor(name), id: None }
+}
