@@ -23,6 +23,7 @@ pub(super) fn note(seq: u64, session: Option<&str>, command: &Command) {
 fn name(command: &Command) -> &'static str {
     match command {
         Command::Hello { .. } => "hello",
+        Command::ShareMemory { .. } => "share_memory",
         Command::Open { .. } => "open",
         Command::Step { .. } => "step",
         Command::StepMany { .. } => "step_many",
