@@ -42,8 +42,8 @@ pub const ACTOR_BYTES: u64 = 1 << 30;
 /// Largest header of an asset, in bytes. One has about 2 kB.
 pub const ACTOR_HEADER_BYTES: usize = 64 << 10;
 
-/// The most parts that the long triangles of a mesh are halved into. At 296 bytes each they take
-/// 120 MB.
+/// The most parts that the long triangles of a mesh are halved into. At 232 bytes each they take
+/// 100 MB.
 pub const MESH_PARTS: usize = 400_000;
 
 /// The most values of a NuRec payload, not counting the content of arrays; each takes 32 bytes of

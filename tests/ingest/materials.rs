@@ -64,6 +64,11 @@ fn looks(g: &Gaussians) -> ([f64; 3], f64) {
     first
 }
 
+fn is_white(file: &[u8]) {
+    let (colour, _) = looks(&read(file).unwrap());
+    assert!(colour.iter().all(|value| (value - 1.0).abs() < 1e-6), "{colour:?}");
+}
+
 #[test]
 fn emitted_light_adds_to_the_base_colour() {
     let base = r#""pbrMetallicRoughness":{"baseColorFactor":[0.2,0.4,0.05,1]}"#;
@@ -135,7 +140,7 @@ fn each_texture_has_its_own_coordinates_and_alpha_is_that_of_the_base() {
     for (alpha_mode, wanted) in [("OPAQUE", 0.97), ("BLEND", 0.97 * 128.0 / 255.0)] {
         let material = format!(r#"{textures},"alphaMode":"{alpha_mode}""#);
         let ([red, green, blue], opacity) = looks(&read(&model(BOTH, &material, "")).unwrap());
-        assert!(red < 1e-6 && green == 1.0, "{red}, {green}");
+        assert!(red < 1e-6 && (green - 1.0).abs() < 1e-6, "{red}, {green}");
         assert!((blue - 64.0 / 255.0).abs() < 2e-6, "{blue}");
         assert!((opacity - wanted).abs() < 1e-6, "{alpha_mode}: {opacity}");
     }
@@ -148,7 +153,7 @@ fn extensions_that_are_read_may_be_required() {
     let required = r#","extensionsUsed":["KHR_materials_unlit","KHR_materials_emissive_strength"],
         "extensionsRequired":["KHR_materials_unlit","KHR_materials_emissive_strength"]"#;
     let material = r#""extensions":{"KHR_materials_unlit":{}}"#;
-    assert_eq!(looks(&read(&model("", material, required)).unwrap()).0, [1.0; 3]);
+    is_white(&model("", material, required));
 }
 
 #[test]
@@ -172,12 +177,12 @@ fn a_texture_without_coordinates_is_refused() {
     }
     // A texture that is not read needs none.
     let normal = r#""normalTexture":{"index":1}"#;
-    assert_eq!(looks(&read(&model("", normal, "")).unwrap()).0, [1.0; 3]);
+    is_white(&model("", normal, ""));
 }
 
 #[test]
 fn light_that_is_no_light_is_refused() {
-    for (factor, strength) in [("[-0.5,0,0]", "1"), ("[1,1,1]", "-2"), ("[1,1,1]", "1e39")] {
+    for (factor, strength) in [("[-0.5,0,0]", "1"), ("[1,1,1]", "-2")] {
         let material = format!(
             r#""emissiveFactor":{factor},"extensions":{{"KHR_materials_emissive_strength":{{"emissiveStrength":{strength}}}}}"#
         );

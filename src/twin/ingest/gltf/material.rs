@@ -112,7 +112,7 @@ impl<'a> MaterialSource<'a> {
         let emits = self.emissive_factor != DVec3::ZERO;
         Material {
             texture: texture(&self.base),
-            emission: emits.then(|| emission.into()),
+            emission: emits.then_some(emission),
             cutoff: self.cutoff,
             is_solid: self.is_solid,
         }

@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::sync::Arc;
 
 use glam::{DVec2, DVec3, DVec4};
 use gltf::Semantic;
@@ -51,7 +52,7 @@ pub(super) fn read(
                     textures.insert(image.index(), material::decode(&image, buffers, uris)?);
                 }
             }
-            let material = source.material(&textures);
+            let material = Arc::new(source.material(&textures));
             let reader = PrimitiveReader { primitive, buffers, source, material, place };
             let found = reader.read(uris.parts())?;
             triangles.extend(found.into_iter().map(|triangle| Triangle {
@@ -124,7 +125,7 @@ struct PrimitiveReader<'a> {
     primitive: gltf::Primitive<'a>,
     buffers: &'a [&'a [u8]],
     source: MaterialSource<'a>,
-    material: Material,
+    material: Arc<Material>,
     place: Place,
 }
 
@@ -153,7 +154,9 @@ impl PrimitiveReader<'_> {
         let no_positions = || self.place.bad("has no POSITION".into());
         let corners = reader.read_positions().ok_or_else(no_positions)?.len();
         let count = reader.read_indices().map_or(corners, |indices| indices.into_u32().len()) / 3;
-        let bytes = count * size_of::<Triangle>() + corners * 4 * size_of::<DVec4>();
+        let emissive_bytes = self.source.emissive_area().map_or(0, |_| size_of::<[DVec2; 3]>());
+        let bytes = count * (size_of::<Triangle>() + emissive_bytes)
+            + corners * (3 * size_of::<DVec4>() + emissive_bytes);
         parts.budget().unpack(FORMAT, &self.place.to_string(), bytes as u128)?;
 
         // Three corners each, by index or in order.
@@ -216,24 +219,26 @@ impl PrimitiveReader<'_> {
 
     /// The triangle of three corners; none if one of them does not exist.
     fn triangle(&self, corners: &Corners, indices: &[usize; 3]) -> Option<Triangle> {
-        let at = |index: usize| -> Option<(DVec3, DVec4, DVec2, DVec2)> {
-            let color = corners.colors.as_ref().map_or(Some(DVec4::ONE), |c| c.get(index).copied());
-            let uv = |uv: &Option<Vec<DVec2>>| {
-                uv.as_ref().map_or(Some(DVec2::ZERO), |uv| uv.get(index).copied())
-            };
-            let position_m = *corners.positions_m.get(index)?;
-            let color = self.source.base_color(color?);
-            Some((position_m, color, uv(&corners.uv)?, uv(&corners.emissive_uv)?))
+        let Corners { positions_m, colors, uv, emissive_uv } = corners;
+        let colors = match colors {
+            Some(colors) => at(colors, indices)?,
+            None => [DVec4::ONE; 3],
         };
-        let [Some(a), Some(b), Some(c)] = indices.map(at) else { return None };
+        let emissive_uv = emissive_uv.as_ref().map(|uv| at(uv, indices).ok_or(())).transpose();
         Some(Triangle {
-            corners_m: [a.0, b.0, c.0],
-            colors: [a.1, b.1, c.1],
-            uv: [a.2, b.2, c.2],
-            emissive_uv: [a.3, b.3, c.3],
-            material: self.material.clone(),
+            corners_m: at(positions_m, indices)?,
+            colors: colors.map(|color| self.source.base_color(color)),
+            uv: uv.as_ref().map_or(Some([DVec2::ZERO; 3]), |uv| at(uv, indices))?,
+            emissive_uv: emissive_uv.ok()?.map(Box::new),
+            material: Arc::clone(&self.material),
         })
     }
+}
+
+/// The values of three corners; none if one of them does not exist.
+fn at<T: Copy>(values: &[T], indices: &[usize; 3]) -> Option<[T; 3]> {
+    let [a, b, c] = indices.map(|index| values.get(index).copied());
+    Some([a?, b?, c?])
 }
 
 /// Checks what the gltf crate's readers assume of an accessor.

@@ -36,16 +36,15 @@ pub(super) struct Triangle {
     pub(super) colors: [DVec4; 3],
     /// Coordinates in the texture of the base colour.
     pub(super) uv: [DVec2; 3],
-    /// Coordinates in the texture of the emitted light.
-    pub(super) emissive_uv: [DVec2; 3],
-    pub(super) material: Material,
+    /// Coordinates in the texture of the emitted light, which few materials have.
+    pub(super) emissive_uv: Option<Box<[DVec2; 3]>>,
+    pub(super) material: Arc<Material>,
 }
 
-/// What all corners share.
-#[derive(Clone)]
+/// What all triangles of a primitive share.
 pub(super) struct Material {
     pub(super) texture: Option<Texture>,
-    pub(super) emission: Option<Arc<Emission>>,
+    pub(super) emission: Option<Emission>,
     /// Opacity below which a point is invisible.
     pub(super) cutoff: f64,
     /// Whether alpha is ignored.
@@ -90,8 +89,9 @@ impl Triangle {
                     0.5 * (triangle.corners_m[replaced] + triangle.corners_m[other]);
                 half.colors[replaced] = 0.5 * (triangle.colors[replaced] + triangle.colors[other]);
                 half.uv[replaced] = 0.5 * (triangle.uv[replaced] + triangle.uv[other]);
-                half.emissive_uv[replaced] =
-                    0.5 * (triangle.emissive_uv[replaced] + triangle.emissive_uv[other]);
+                if let (Some(half), Some(uv)) = (&mut half.emissive_uv, &triangle.emissive_uv) {
+                    half[replaced] = 0.5 * (uv[replaced] + uv[other]);
+                }
                 whole.push((half, halvings + 1));
             }
         }
@@ -166,15 +166,17 @@ impl Triangle {
         let texel = |image: &Texture, corners: [DVec2; 3]| {
             sample(image, (0..3).map(|k| shares[k] * corners[k]).sum::<DVec2>())
         };
-        let Material { texture, emission, cutoff, is_solid } = &self.material;
+        let Material { texture, emission, cutoff, is_solid } = &*self.material;
         let mut color = weighted(self.colors);
         if let Some(image) = texture {
             color *= texel(image, self.uv);
         }
         let mut light = DVec3::ZERO;
         if let Some(emission) = emission {
-            let image = emission.texture.as_ref();
-            let share = image.map_or(DVec3::ONE, |image| texel(image, self.emissive_uv).truncate());
+            let share = match (&emission.texture, &self.emissive_uv) {
+                (Some(image), Some(uv)) => texel(image, **uv).truncate(),
+                _ => DVec3::ONE,
+            };
             light = emission.factor * share;
         }
         let opacity = match color.w {
@@ -202,13 +204,17 @@ fn sample(image: &RgbaImage, uv: DVec2) -> DVec4 {
 mod tests {
     use super::*;
 
+    fn material(cutoff: f64) -> Material {
+        Material { texture: None, emission: None, cutoff, is_solid: false }
+    }
+
     fn triangle(corners_m: [[f64; 3]; 3]) -> Triangle {
         Triangle {
             corners_m: corners_m.map(DVec3::from_array),
             colors: [DVec4::new(1.0, 0.0, 0.0, 1.0), DVec4::Y, DVec4::Z].map(|c| c.with_w(1.0)),
             uv: [DVec2::ZERO; 3],
-            emissive_uv: [DVec2::ZERO; 3],
-            material: Material { texture: None, emission: None, cutoff: 0.0, is_solid: false },
+            emissive_uv: None,
+            material: material(0.0).into(),
         }
     }
 
@@ -302,7 +308,7 @@ mod tests {
         let ([red, green, blue], opacity) = whole.color([0.5, 0.5, 0.0]);
         assert_eq!((red, blue, opacity), (green, 0.0, 1.0));
         assert!((red - 0.7354).abs() < 1e-4, "half the light, displayed: {red}");
-        whole.material.cutoff = 2.0;
+        whole.material = material(2.0).into();
         let mut parts = Gaussians::with_capacity(0, 0);
         whole.cover(3, &mut parts);
         assert_eq!(parts.len(), 0);
