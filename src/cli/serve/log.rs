@@ -82,6 +82,8 @@ mod otlp {
                 true => endpoint.to_owned(),
                 false => format!("{}{TRACES_PATH}", endpoint.trim_end_matches('/')),
             };
+            // The client of the exporter has no TLS of its own. Another part may have installed the provider before.
+            let _ = rustls::crypto::ring::default_provider().install_default();
             let exporter = SpanExporter::builder().with_http().with_endpoint(url).build();
             let exporter = exporter.with_context(cannot)?;
             let batches = BatchConfigBuilder::default()
