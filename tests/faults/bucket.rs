@@ -215,7 +215,7 @@ impl State {
             if writes > 0 {
                 self.late.push(Late { key, bytes, mode, writes: writes - 1 });
             } else {
-                // Nobody waits for the answer.
+                // No process waits for the answer.
                 let _ = self.put(&key, bytes, &mode, now_us);
             }
         }
