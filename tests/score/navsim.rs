@@ -231,3 +231,18 @@ fn the_score_is_as_in_the_vectors() {
         assert_near(found, &case.expected["epdms"], &case.name);
     }
 }
+
+/// At both ends, where the window has no samples beyond, the polynomial of the last window holds.
+#[test]
+fn the_filter_follows_a_parabola_to_its_ends() {
+    let at = |k: i32| 0.1 * f64::from(k);
+    let samples: Vec<f64> = (0..12).map(|k| 2.0 - at(k) + 3.0 * at(k) * at(k)).collect();
+    let same = wildcity_score::savgol(&samples, 7, 2, 0, 0.1);
+    let slopes = wildcity_score::savgol(&samples, 7, 2, 1, 0.1);
+    for k in 0..12 {
+        let slope = 6.0 * at(k) - 1.0;
+        let k = k as usize;
+        assert!((same[k] - samples[k]).abs() < 1e-12, "{k}: {}", same[k]);
+        assert!((slopes[k] - slope).abs() < 1e-10, "{k}: {}", slopes[k]);
+    }
+}
