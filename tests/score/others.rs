@@ -171,7 +171,8 @@ fn plan_deviation_is_as_in_the_vector() {
     let Some(cases) = cases("alpasim", "plan deviation") else { return };
     for case in cases {
         let distances_m = numbers(&case.input["distances"]);
-        let found = alpasim_plans::plan_deviation(&distances_m, number(&case.input["decay"])).unwrap();
+        let found =
+            alpasim_plans::plan_deviation(&distances_m, number(&case.input["decay"])).unwrap();
         assert_near(found, &case.expected["deviation"], &case.name);
     }
 }
