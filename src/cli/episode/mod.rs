@@ -31,7 +31,7 @@ enum Command {
     Show(show::Show),
     Score(score::Score),
     Diff(diff::Diff),
-    Export(export::Export),
+    Export(Box<export::Export>),
     Video(Box<video::Video>),
 }
 
