@@ -57,7 +57,8 @@ pub(crate) trait Medium: Debug {
 }
 
 impl Kind {
-    pub(crate) fn new(self, clock: &Arc<SimClock>, plant: Option<Plant>) -> Box<dyn Medium> {
+    /// A medium without twins.
+    pub(crate) fn empty(self, clock: &Arc<SimClock>, plant: Option<Plant>) -> Box<dyn Medium> {
         match self {
             Self::Disk => Box::new(SimDisk::new(clock.clone(), plant)),
             Self::Bucket => Box::new(SimBucket::new(clock.clone(), plant)),

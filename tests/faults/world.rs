@@ -96,7 +96,7 @@ fn merged(below: &Cells, above: &Cells) -> Cells {
 impl World {
     pub(crate) fn new(kind: Kind, plant: Option<Plant>) -> Result<Self, String> {
         let clock = Arc::new(SimClock::new());
-        let medium = kind.new(&clock, plant);
+        let medium = kind.empty(&clock, plant);
         let catalog = open(&*medium, &clock)?;
         Ok(Self {
             clock,

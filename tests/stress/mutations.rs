@@ -440,8 +440,8 @@ fn every_check_of_moving_actors_fails_under_a_mutation() {
             let mutated = MutatedBackend { inner: &backend, mutation, count: AtomicU32::new(0) };
             let checks = case(number).checks(&mutated).unwrap();
             let failed: Vec<&Check> = checks.iter().filter(|check| !check.holds()).collect();
-            println!("{number} {mutation:?}: {} of {} fail", failed.len(), checks.len());
-            failed.iter().for_each(|check| println!("    {check}"));
+            eprintln!("{number} {mutation:?}: {} of {} fail", failed.len(), checks.len());
+            failed.iter().for_each(|check| eprintln!("    {check}"));
             unfailed.retain(|what| failed.iter().all(|check| key(&check.what) != key(what)));
         }
         assert!(unfailed.is_empty(), "{number}: nothing fails {unfailed:?}");

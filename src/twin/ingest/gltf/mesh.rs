@@ -5,6 +5,7 @@
 //! white light from all sides: the material's base colour, plus the light that it emits (`material.rs`).
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::fmt;
 use std::sync::Arc;
 
@@ -48,8 +49,8 @@ pub(super) fn read(
                 Place { node: placed.node, mesh: mesh.index(), primitive: primitive.index() };
             let source = MaterialSource::of(&primitive.material()).map_err(|r| place.bad(r))?;
             for image in source.images() {
-                if !textures.contains_key(&image.index()) {
-                    textures.insert(image.index(), material::decode(&image, buffers, uris)?);
+                if let Entry::Vacant(unread) = textures.entry(image.index()) {
+                    unread.insert(material::decode(image, buffers, uris)?);
                 }
             }
             let material = Arc::new(source.material(&textures));
