@@ -128,7 +128,7 @@ fn plans(frames: &[&Frame]) -> Vec<Plan> {
             let world_from_rig = *world_from_start * start_from_rig;
             let forward = world_from_rig.rotation * DVec3::X;
             PlannedPose {
-                time_us: decided_us + time_us,
+                time_us: decided_us.saturating_add(time_us),
                 origin_m: world_from_rig.position_m.truncate(),
                 yaw_rad: forward.y.atan2(forward.x),
             }

@@ -120,7 +120,7 @@ pub struct EpisodeFile {
     pub frames: Vec<Frame>,
     /// The actors, step by step.
     pub actors: Vec<ActorsLine>,
-    /// What happened, in order.
+    /// What happened, in order; without what a session undid when it went back to an earlier step.
     pub events: Vec<EventLine>,
     /// The result that the session wrote.
     pub result: Option<EpisodeResult>,
@@ -199,7 +199,15 @@ impl EpisodeFile {
         let mut text = Vec::new();
         let first = read_line(&mut reader, limits::HEAD_BYTES, &mut text).map_err(failed)?;
         let header = match first.and_then(|_| parse(&text)) {
-            Ok(Line::Episode(header)) if header.format == Self::FORMAT => *header,
+            Ok(Line::Episode(header)) if header.format == Self::FORMAT && header.dt_us > 0 => {
+                *header
+            }
+            Ok(Line::Episode(header)) if header.format == Self::FORMAT => {
+                return Err(no_header(format!(
+                    "dt_us is {}; a step takes 1 µs at least",
+                    header.dt_us
+                )));
+            }
             Ok(Line::Episode(header)) => {
                 let reason = format!("format {}; this build reads {}", header.format, Self::FORMAT);
                 return Err(no_header(reason));
@@ -250,7 +258,15 @@ impl EpisodeFile {
                 event.check(self.actor_count())?;
                 self.events.push(event);
             }
-            Line::Frame(frame) => self.frames.push(frame),
+            Line::Frame(frame) => {
+                // Where a session went back, what happened later did not happen.
+                if frame.request != "observe"
+                    && self.events.last().is_some_and(|last| last.time_us > frame.time_us)
+                {
+                    self.events.retain(|event| event.time_us <= frame.time_us);
+                }
+                self.frames.push(frame);
+            }
             Line::Result(result) => self.result = Some(result),
             Line::End(end) => self.end = Some(end),
             Line::Other => {}

@@ -69,10 +69,11 @@ pub fn record_bytes(record: &Path) -> u64 {
 /// There is no such file, or it cannot be read.
 pub fn read_mcap(record: &Path, most: u64) -> io::Result<Option<Vec<u8>>> {
     let path = mcap_of(record);
-    match fs::metadata(&path)?.len() > most {
-        true => Ok(None),
-        false => fs::read(path).map(Some),
+    let found = fs::symlink_metadata(&path)?;
+    if !found.is_file() {
+        return Err(io::Error::other("it is not a regular file"));
     }
+    if found.len() > most { Ok(None) } else { fs::read(path).map(Some) }
 }
 
 /// The text of an episode's file; none if it has more than `most` bytes. An incomplete last line, which a session may be

@@ -58,7 +58,7 @@ impl SharedMemory {
     /// Bytes from one slot to the next.
     pub(crate) const SLOT_BYTES: u64 = OBSERVATION_BYTES as u64;
 
-    /// New memory, in which nothing is but the proof.
+    /// Creates memory that contains only the proof.
     ///
     /// # Errors
     /// The operating system is not Linux, or refuses.

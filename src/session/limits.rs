@@ -18,7 +18,7 @@ pub const WAITING_EXPORTS: usize = 1024;
 
 /// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times its size. A day at
 /// 10 Hz has 720 MB; `wildcity episode export` reads it.
-pub const EXPORTED_RECORD_BYTES: u64 = 256 << 20;
+pub const EXPORTED_RECORD_BYTES: u64 = 64 << 20;
 
 /// Episodes whose failed export is remembered: more than a listing has.
 pub const FAILED_EXPORTS: usize = 1024;

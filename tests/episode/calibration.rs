@@ -64,7 +64,8 @@ fn opencvs_lenses_are_exact() {
     let (pinhole, error_px) = alone(Lens::Pinhole);
     assert_eq!((pinhole.distortion_model.as_str(), pinhole.d), ("plumb_bob", vec![0.0; 5]));
     assert!(error_px < 1e-9, "{error_px}");
-    assert_eq!(pinhole.k, [410.0, 0.0, 322.0, 0.0, 400.0, 239.0, 0.0, 0.0, 1.0]);
+    // OpenCV counts from the middle of the first pixel.
+    assert_eq!(pinhole.k, [410.0, 0.0, 321.5, 0.0, 400.0, 238.5, 0.0, 0.0, 1.0]);
 
     let k = [-0.11, 0.02, -0.001, 0.01, 0.003, 0.0002];
     let (opencv, error_px) = alone(Lens::OpenCv(OpenCv::new(k, [1e-3, -2e-3], [0.0; 4])));
@@ -108,7 +109,7 @@ fn an_f_theta_lens_is_described_to_a_fraction_of_a_pixel() {
             let distorted = angle * (1.0 + k1 * a2 + k2 * a4 + k3 * a2 * a4 + k4 * a4 * a4);
             let plane = direction.truncate() * (distorted / radius);
             let k = &calibration.k;
-            let projected_px = DVec2::new(k[0] * plane.x + k[2], k[4] * plane.y + k[5]);
+            let projected_px = DVec2::new(k[0] * plane.x + k[2], k[4] * plane.y + k[5]) + 0.5;
             assert!(projected_px.distance(at_px) < 0.3, "{}: {projected_px} {at_px}", camera.name);
         }
     }

@@ -258,7 +258,7 @@ async fn memory_is_given_back() {
     for end in ["close", "drop", "kill", "offered"] {
         let mut agent = server.agent().await;
         if end == "offered" {
-            // The client goes between the two requests.
+            // The client disconnects between the two requests.
             let (memory, _) = Memory::open(&agent.ask(json!({ "type": "share_memory" })).await);
             targets.push(memory.target.clone());
             continue;

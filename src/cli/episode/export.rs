@@ -62,6 +62,15 @@ const NOTED_ERROR_PX: f64 = 0.1;
 impl Export {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let path = super::file_of(&self.episode, &self.episodes)?;
+        let is_record = self
+            .mcap
+            .canonicalize()
+            .is_ok_and(|mcap| path.canonicalize().is_ok_and(|record| record == mcap));
+        anyhow::ensure!(
+            !is_record,
+            "--mcap {}: this is the record itself; name another file",
+            self.mcap.display()
+        );
         let (exported, report) = match self.images {
             true => self.with_images(&path).map(|(exported, report)| (exported, Some(report)))?,
             false => (export_file(&path, &self.mcap)?, None),

@@ -49,7 +49,8 @@ impl Calibration {
         let nearest = Nearest::to(camera);
         let (name, d) = nearest.model.in_foxglove();
         let DVec2 { x: fx, y: fy } = nearest.focal_px;
-        let [cx, cy] = [camera.pinhole.cx, camera.pinhole.cy];
+        // Foxglove and OpenCV count pixels from the middle of the first one, this project from its corner.
+        let [cx, cy] = [camera.pinhole.cx - 0.5, camera.pinhole.cy - 0.5];
         let message = foxglove::CameraCalibration {
             timestamp: Some(timestamp(time_us)),
             width: camera.width_px,
@@ -121,7 +122,8 @@ impl Nearest {
             let projected_px = center_px + self.focal_px * self.model.plane(direction);
             Some(projected_px.distance(at_px))
         });
-        off_px.fold(0.0, f64::max)
+        // NaN, of a fit that failed, is no small error.
+        off_px.fold(0.0, |most: f64, off| if off <= most { most } else { off.min(f64::INFINITY) })
     }
 }
 

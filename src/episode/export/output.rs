@@ -1,6 +1,5 @@
-//! An output whose first failure is kept, and told at the end.
-//!
-//! The crate `mcap` panics when a writer is dropped after some failures, such as of a full disk. So it never sees one.
+//! A writer that stores its first error and reports success to the crate `mcap`, which panics when its writer is dropped
+//! after some errors, such as of a full disk. [`McapFile`](super::container::McapFile) returns the stored error.
 
 use std::cell::Cell;
 use std::io::{self, Seek, SeekFrom, Write};

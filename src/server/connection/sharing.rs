@@ -22,6 +22,9 @@ impl Connection {
         if self.memory.as_ref().is_some_and(SharedMemory::is_open) {
             return Err(Fault::SessionState("this connection shares memory already"));
         }
+        if !self.slots.is_empty() {
+            return Err(Fault::SessionState("share_memory comes before open and resume"));
+        }
         let memory = SharedMemory::new()?;
         let text = convert::shared_memory(seq, &memory)?;
         self.memory = Some(memory);

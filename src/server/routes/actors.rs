@@ -7,6 +7,7 @@ use axum::extract::{Path, State as Shared};
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
+use tracing::Instrument as _;
 
 use wildcity_push::{AssetRequest, Push, PushError, SourceFile};
 use wildcity_twin::store::AddedActor;
@@ -19,7 +20,7 @@ use crate::idle_deadline::IdleDeadline;
 use crate::open_pushes::OpenPush;
 use crate::state::ServerState;
 
-use super::pushes::{find_uploads, outcome};
+use super::pushes::{find_uploads, outcome, stopped_before_commit};
 use super::refusal::HttpResult;
 
 /// `GET /v1/actors`: all assets.
@@ -82,7 +83,7 @@ impl Drop for CancelWhenDropped {
     }
 }
 
-/// Whose push it is.
+/// The token that owns a push, and its count.
 struct OwnedPush {
     grant: Arc<Grant>,
     /// Counts among the token's pushes.
@@ -100,13 +101,14 @@ async fn run(
     let name = request.settings.name.clone();
     let change = change(&name);
     let catalog = state.engine.catalog();
-    let published = wildcity_push::publish_asset(catalog, &state.pushes, &push, request, files);
+    let published = wildcity_push::publish_asset(catalog, &state.pushes, &push, request, files)
+        .instrument(tracing::debug_span!("push", actor = name));
     let result = tokio::select! {
         // A cancelled push ends with whatever its reading was at, too.
         biased;
         () = push.cancelled() => Err(PushError::Cancelled),
         result = published => result,
-        () = state.stopped() => Err(PushError::ShuttingDown),
+        () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
     let reason = result.as_ref().err().map(ToString::to_string).unwrap_or_default();
     let ended = match &result {

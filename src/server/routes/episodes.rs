@@ -69,7 +69,7 @@ pub(super) async fn mcap(
     grant.require(Role::Admin)?;
     let (checked, its_name) = (state.clone(), name.clone());
     let record = blocking(move || record_of(&checked, &grant, &its_name)).await?;
-    let is_over = state.engine.wait_for_exports(Some(name.clone()), limits::MCAP_WAIT).await;
+    let is_over = state.engine.wait_for_exports(Some(&name), limits::MCAP_WAIT).await;
     let bytes = blocking(move || {
         if let Ok(bytes) = read_mcap(&record, limits::EPISODE_BYTES) {
             return bytes.ok_or_else(too_large);

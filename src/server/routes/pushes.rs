@@ -1,5 +1,6 @@
 //! Pushes over HTTP: passes requests to the package `wildcity-push`, and answers with the push's status.
 
+use std::future::pending;
 use std::sync::Arc;
 
 use axum::body::Bytes;
@@ -83,7 +84,7 @@ pub(super) async fn cancel(
     Ok(answer(StatusCode::OK, &id, &twin, &push))
 }
 
-/// Whose push it is.
+/// The token that owns a push, and its count.
 struct OwnedPush {
     grant: Arc<Grant>,
     id: String,
@@ -109,7 +110,7 @@ async fn run(
         biased;
         () = push.cancelled() => Err(PushError::Cancelled),
         result = published => result,
-        () = state.stopped() => Err(PushError::ShuttingDown),
+        () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
     let reason = result.as_ref().err().map(ToString::to_string);
     let change = Change { what: "push", target: Target::Twin(&twin), id: Some(&owned.id) };
@@ -121,6 +122,14 @@ async fn run(
         tracing::warn!(state = ?ended, "a push ended: {reason}");
     }
     state.metrics.push_ended(outcome(ended));
+}
+
+/// Completes when the server stops, unless the push can no longer be cancelled: then its own result is the truth.
+pub(super) async fn stopped_before_commit(state: &ServerState, push: &Push) {
+    state.stopped().await;
+    if push.cancel().is_err() {
+        pending().await
+    }
 }
 
 /// The outcome of a push that ended, as metrics count it.

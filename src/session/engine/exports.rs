@@ -5,9 +5,11 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use parking_lot::{Condvar, Mutex};
+use parking_lot::Mutex;
+use tokio::sync::watch;
+use tokio::time::timeout;
 
 use wildcity_episode::{EpisodeFile, export_file, mcap_of, record_bytes};
 
@@ -23,8 +25,8 @@ pub(crate) struct Exports {
 #[derive(Default)]
 struct Shared {
     state: Mutex<State>,
-    /// An export has ended.
-    ended: Condvar,
+    /// Number of exports that have ended.
+    ended: watch::Sender<u64>,
 }
 
 #[derive(Default)]
@@ -51,7 +53,7 @@ impl Exports {
         Ok(Self { records, shared })
     }
 
-    /// Lets a record be exported, unless too many wait already.
+    /// Queues a record for export, unless too many wait already.
     pub(crate) fn add(&self, record: PathBuf) {
         let name = EpisodeFile::name_of(&record);
         let mut state = self.shared.state.lock();
@@ -65,15 +67,10 @@ impl Exports {
     }
 
     /// Waits until an episode is not being exported, or until none is; at most `longest`. Returns whether that is so.
-    pub(crate) fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
-        let until = Instant::now() + longest;
-        let mut state = self.shared.state.lock();
-        while state.is_waiting(episode) {
-            if self.shared.ended.wait_until(&mut state, until).timed_out() {
-                return !state.is_waiting(episode);
-            }
-        }
-        true
+    pub(crate) async fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
+        let is_over = |_: &u64| !self.shared.state.lock().is_waiting(episode);
+        let mut ended = self.shared.ended.subscribe();
+        timeout(longest, ended.wait_for(is_over)).await.is_ok_and(|waited| waited.is_ok())
     }
 
     /// Why an episode was not exported.
@@ -95,7 +92,7 @@ impl Shared {
                 state.fail(name, reason);
             }
             drop(state);
-            self.ended.notify_all();
+            self.ended.send_modify(|ended| *ended += 1);
         }
     }
 }

@@ -340,19 +340,13 @@ impl Engine {
         self.exports.is_some()
     }
 
-    /// Waits until no MCAP file of an episode is being written, or of none of this name; at most `longest`. Returns
-    /// whether that is so.
-    pub async fn wait_for_exports(
-        self: &Arc<Self>,
-        episode: Option<String>,
-        longest: Duration,
-    ) -> bool {
-        let engine = self.clone();
-        let wait = move || {
-            let exports = engine.exports.as_ref();
-            exports.is_none_or(|exports| exports.wait(episode.as_deref(), longest))
-        };
-        run_blocking(wait).await.unwrap_or(false)
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns whether
+    /// that is so.
+    pub async fn wait_for_exports(&self, episode: Option<&str>, longest: Duration) -> bool {
+        match &self.exports {
+            Some(exports) => exports.wait(episode, longest).await,
+            None => true,
+        }
     }
 
     /// Why an episode of this engine has no MCAP file; none if that is not known.

@@ -12,6 +12,7 @@
 //! not touch assets.
 
 use std::collections::BTreeSet;
+use std::io::ErrorKind;
 use std::sync::Arc;
 
 use glam::DVec3;
@@ -125,7 +126,13 @@ impl Catalog {
         if same_name == SameName::Refused {
             self.check_name_is_free(&header.description.name, &hash)?;
         }
-        let is_new = self.objects.check_present(ACTORS, &hash, bytes.len() as u64).is_err();
+        let is_new = match self.objects.check_present(ACTORS, &hash, bytes.len() as u64) {
+            Ok(()) => false,
+            Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => true,
+            // One that is damaged is written again.
+            Err(StoreError::Damaged { .. }) => true,
+            Err(error) => return Err(error),
+        };
         let stored = staging.put(Box::new(|out| out.write_all(&bytes)))?;
         staging.place_objects(&BTreeSet::from([&*stored.hash]))?;
         Ok(AddedActor { actor: StoredActor::new(stored.hash, stored.bytes, header), is_new })
@@ -195,7 +202,7 @@ impl Catalog {
             });
         }
         let bytes = match self.objects.read_object(ACTORS, hash, limits::ACTOR_BYTES) {
-            Err(StoreError::Io { cause, .. }) if cause.kind() == std::io::ErrorKind::NotFound => {
+            Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
                 return Err(self.find_actor(hash).err().unwrap_or_else(|| StoreError::NoActor {
                     text: hash.to_owned(),
                     dir: self.dir().to_owned(),
