@@ -35,8 +35,8 @@ pub fn push_memory_bytes(file_bytes: u64) -> u64 {
 pub const REMEMBERED_PUSHES: usize = 64;
 
 /// Gaussians for the triangles of an actor's mesh, unless the request says otherwise: the least with which edges of a
-/// lorry at 8 m are at most a tenth wider than those of its triangles (BENCHMARKS.md, "Actors"); `tests/actors/softness.py`
-/// measures it. It is one Gaussian every 18 mm, and as many as `wildcity import` takes.
+/// lorry at 8 m are at most a tenth wider than those of its triangles (BENCHMARKS.md, "Actors");
+/// `tests/actors/softness.py` measures it. It is one Gaussian every 18 mm, and as many as `wildcity import` takes.
 pub const ACTOR_MESH_GAUSSIANS: u32 = 200_000;
 
 /// Gaussians that may be asked for. With the most, small triangles add as many again, which is the most of an actor.

@@ -16,8 +16,8 @@ use crate::cli::push::{Server, name_beside, upload};
 
 /// Make an asset on a running server from files of this machine, as `wildcity actor import` does on the server's own.
 ///
-/// The same files with the same options give the same hash. Sessions that open afterwards can use the asset, by name and
-/// by hash. A name that an asset of another content has is refused. To continue an upload after a lost connection, run
+/// The same files with the same options give the same hash. Sessions that open afterwards can use the asset, by name
+/// and by hash. A name that an asset of another content has is refused. To continue an upload after a lost connection, run
 /// the same command again.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
