@@ -234,15 +234,16 @@ async fn what_cannot_share_memory() {
         refused(&answer, "shared_memory_unavailable");
         assert_eq!(answer["field"], "proof", "{answer}");
     }
-    // Without a proof, observations come through the socket.
-    agent.open(json!({ "session": "a" })).await;
-    agent.step(1.0).await;
     // Asking again gives new memory, and frees the old.
     let (newer, new_proof) = Memory::open(&agent.ask(ask()).await);
     assert!(newer.target != memory.target && new_proof != proof);
     let target = memory.target.clone();
     drop(memory);
     Memory::is_given_back(&target).await;
+    // Without a proof, observations come through the socket, and no other memory is offered any more.
+    agent.open(json!({ "session": "a" })).await;
+    agent.step(1.0).await;
+    refused(&agent.ask(ask()).await, "session_state");
     refused(&agent.ask(prove(&proof)).await, "shared_memory_unavailable");
     assert_eq!(agent.ask(prove(&new_proof)).await["type"], "ok");
     refused(&agent.ask(ask()).await, "session_state");
