@@ -147,3 +147,40 @@ fn a_directory_is_listed_newest_first() {
     assert_eq!(names, ["b-1", "a-1"]);
     assert!(listed[0].bytes > 1000);
 }
+
+#[test]
+fn what_a_session_undid_did_not_happen() {
+    let lines = Made { steps: 5, ..Made::default() }.lines();
+    let left = |step: u64| {
+        let time_us = 100_000 * step;
+        json!({ "kind": "event", "step": step, "time_us": time_us, "event": "left", "actor": 1 })
+    };
+    let is_frame =
+        |line: &serde_json::Value, step: u64| line["kind"] == "frame" && line["step"] == step;
+    let at = |step: u64| lines.iter().position(|line| is_frame(line, step)).unwrap();
+    let mut went_back = lines.clone();
+    // Both events are before the frames of their steps; then the session goes back to step 2.
+    went_back.insert(at(4), left(4));
+    went_back.insert(at(1), left(1));
+    let end = went_back.pop().unwrap();
+    let whole = written::read(&went_back);
+    assert_eq!(
+        whole.events.iter().map(|event| event.time_us).collect::<Vec<_>>(),
+        [100_000, 400_000]
+    );
+    went_back.extend([lines[at(2)].clone(), end]);
+    let read = written::read(&went_back);
+    assert_eq!(read.cut, None);
+    assert_eq!(read.events.iter().map(|event| event.time_us).collect::<Vec<_>>(), [100_000]);
+}
+
+#[test]
+fn a_record_without_a_step_time_is_no_record() {
+    let mut lines = Made { steps: 3, ..Made::default() }.lines();
+    lines[0]["dt_us"] = json!(0);
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("still-1.jsonl");
+    written::write(&path, &lines);
+    let error = EpisodeFile::read(&path).unwrap_err().to_string();
+    assert!(error.contains("dt_us is 0"), "{error}");
+}
