@@ -9,7 +9,7 @@
 //! ```
 //!
 //! There is no log: an asset never changes, and the same input gives the same object. Garbage collection of twins does
-//! not touch assets.
+//! not touch assets; [`Catalog::remove_actor`] removes one. An asset that is damaged does not concern the others.
 
 use std::collections::BTreeSet;
 use std::io::ErrorKind;
@@ -23,8 +23,10 @@ use wildcity_scene::actor::{ActorAsset, AssetDescription, AssetLevel};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_scene::record::Clamped;
+use wildcity_scene::rig::is_name;
 use wildcity_scene::{RecordFormat, sh};
 
+use super::backend::{HashedStart, ListedObject};
 use super::chunk_file::{self, LevelOfBlock};
 use super::layout::{ACTORS, is_hash};
 use super::{Catalog, StoreError};
@@ -49,6 +51,47 @@ pub struct StoredActor {
     pub record: RecordFormat,
     /// Its levels of detail, from level 0 on.
     pub levels: Vec<StoredLevel>,
+}
+
+/// The assets of a catalog.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ActorList {
+    /// Those that can be read, in order of name and hash.
+    pub actors: Vec<StoredActor>,
+    /// The others, in order of hash.
+    pub damaged: Vec<DamagedActor>,
+}
+
+/// An asset that differs from what was stored, or cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DamagedActor {
+    /// Its hash, 64 lower-case hex digits.
+    pub hash: String,
+    /// The name that it states, if that can be read. It may be damaged, too, so that it stands for no asset.
+    pub name: Option<String>,
+    /// What is wrong.
+    pub reason: String,
+}
+
+/// Assets, and those of which nothing is known, because the disk or the object store fails to read them.
+#[derive(Default)]
+struct ReadActors {
+    list: ActorList,
+    /// Hashes and errors.
+    unread: Vec<(String, StoreError)>,
+}
+
+impl ReadActors {
+    /// The list, if it is complete. Otherwise it cannot be said that no other asset has a name.
+    ///
+    /// # Errors
+    /// One was not read.
+    fn whole(self) -> Result<ActorList, StoreError> {
+        match self.unread.into_iter().next() {
+            None => Ok(self.list),
+            Some((_, error)) => Err(error),
+        }
+    }
 }
 
 /// What [`Catalog::add_actor`] has done.
@@ -126,13 +169,10 @@ impl Catalog {
         if same_name == SameName::Refused {
             self.check_name_is_free(&header.description.name, &hash)?;
         }
-        let is_new = match self.objects.check_present(ACTORS, &hash, bytes.len() as u64) {
-            Ok(()) => false,
-            Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => true,
-            // One that is damaged is written again.
-            Err(StoreError::Damaged { .. }) => true,
-            Err(error) => return Err(error),
-        };
+        let is_whole = |known: &ListedObject| known.is_file && known.bytes == bytes.len() as u64;
+        let known = self.objects.list_objects(ACTORS)?.into_iter().find(|known| known.hash == hash);
+        let is_new = !known.as_ref().is_some_and(is_whole);
+        // It is written in any case, over one that is damaged as well.
         let stored = staging.put(Box::new(|out| out.write_all(&bytes)))?;
         staging.place_objects(&BTreeSet::from([&*stored.hash]))?;
         Ok(AddedActor { actor: StoredActor::new(stored.hash, stored.bytes, header), is_new })
@@ -141,82 +181,162 @@ impl Catalog {
     /// Refuses the name of an asset of another hash.
     fn check_name_is_free(&self, name: &str, hash: &str) -> Result<(), StoreError> {
         let is_other = |actor: &StoredActor| actor.description.name == name && actor.hash != hash;
-        match self.actors()?.into_iter().find(is_other) {
+        let list = self.read_actors(self.objects.list_objects(ACTORS)?).whole()?;
+        match list.actors.into_iter().find(is_other) {
             None => Ok(()),
             Some(other) => Err(StoreError::ActorExists { name: name.to_owned(), hash: other.hash }),
         }
     }
 
-    /// All assets, in order of name and hash.
+    /// All assets, and those that are damaged or that the disk fails to read.
     ///
     /// # Errors
-    /// They cannot be listed, or one is damaged.
-    pub fn actors(&self) -> Result<Vec<StoredActor>, StoreError> {
-        let mut actors = Vec::new();
-        for object in self.objects.list_objects(ACTORS)? {
-            let most = START_BYTES + limits::ACTOR_HEADER_BYTES;
-            let start = self.objects.read_start(ACTORS, &object.hash, most)?;
-            let (header, _) = self.header(&object.hash, &start)?;
-            actors.push(StoredActor::new(object.hash, object.bytes, header));
+    /// They cannot be listed.
+    pub fn actors(&self) -> Result<ActorList, StoreError> {
+        let ReadActors { mut list, unread } = self.read_actors(self.objects.list_objects(ACTORS)?);
+        let unread = unread.into_iter().map(|(hash, error)| DamagedActor {
+            hash,
+            name: None,
+            reason: reason_of(error),
+        });
+        list.damaged.extend(unread);
+        list.damaged.sort_by_cached_key(|one| one.hash.clone());
+        Ok(list)
+    }
+
+    fn read_actors(&self, objects: Vec<ListedObject>) -> ReadActors {
+        let mut read = ReadActors::default();
+        for object in objects {
+            let hash = object.hash.clone();
+            match self.stored_actor(object) {
+                Ok(Ok(Some(actor))) => read.list.actors.push(actor),
+                // It was removed in between.
+                Ok(Ok(None)) => {}
+                Ok(Err(damaged)) => read.list.damaged.push(damaged),
+                Err(error) => read.unread.push((hash, error)),
+            }
         }
-        actors.sort_by(|a, b| (&a.description.name, &a.hash).cmp(&(&b.description.name, &b.hash)));
-        Ok(actors)
+        let actors = &mut read.list.actors;
+        actors.sort_by_cached_key(|one| (one.description.name.clone(), one.hash.clone()));
+        read
+    }
+
+    /// An asset without its Gaussians; `None` if it does not exist. The inner error is damage of the asset.
+    ///
+    /// # Errors
+    /// The disk or the object store fails to read it: it may be whole.
+    fn stored_actor(
+        &self,
+        object: ListedObject,
+    ) -> Result<Result<Option<StoredActor>, DamagedActor>, StoreError> {
+        let ListedObject { hash, bytes, is_file, .. } = object;
+        let most = START_BYTES + limits::ACTOR_HEADER_BYTES;
+        let read = match self.objects.read_and_hash(ACTORS, &hash, most) {
+            Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
+                return Ok(Ok(None));
+            }
+            read => read,
+        };
+        let HashedStart { start, hash: found } = match read {
+            Ok(read) => read,
+            Err(error @ StoreError::Io { .. }) if is_file => return Err(error),
+            Err(error) => {
+                return Ok(Err(DamagedActor { hash, name: None, reason: reason_of(error) }));
+            }
+        };
+        Ok(match header(&start) {
+            Ok((header, _)) if found == hash => Ok(Some(StoredActor::new(hash, bytes, header))),
+            Ok((header, _)) => {
+                let name = Some(header.description.name).filter(|name| is_name(name));
+                Err(DamagedActor { hash, name, reason: format!("its bytes hash to {found}") })
+            }
+            Err(reason) => Err(DamagedActor { hash, name: None, reason }),
+        })
     }
 
     /// The one asset of a name, of a hash, or of a hash that begins with at least 4 digits.
     ///
     /// # Errors
-    /// [`StoreError::NoActor`] if there is none, or more than one.
+    /// [`StoreError::NoActor`] if there is none, or more than one; [`StoreError::ActorDamaged`] if the only ones are
+    /// damaged; the disk fails to read one that may be it.
     pub fn find_actor(&self, text: &str) -> Result<StoredActor, StoreError> {
-        let actors = self.actors()?;
-        let is_prefix = text.len() >= 4 && text.bytes().all(|b| b.is_ascii_hexdigit());
-        let is_it = |actor: &&StoredActor| {
-            actor.description.name == text || is_prefix && actor.hash.starts_with(text)
-        };
-        let found: Vec<&StoredActor> = actors.iter().filter(is_it).collect();
-        if let [one] = found[..] {
-            return Ok(one.clone());
+        let mut objects = self.objects.list_objects(ACTORS)?;
+        // Sessions look the assets of each episode up by their whole hashes: no other asset is read then.
+        if objects.iter().any(|object| object.hash == text) {
+            objects.retain(|object| object.hash == text);
         }
-        let listed = if found.is_empty() { actors.iter().collect() } else { found.clone() };
-        let named =
-            |actor: &&StoredActor| format!("{} ({})", actor.description.name, &actor.hash[..12]);
-        Err(StoreError::NoActor {
-            text: text.to_owned(),
-            dir: self.dir().to_owned(),
-            found: found.len(),
-            known: listed.iter().map(named).collect(),
-        })
+        let ActorList { actors, damaged } = self.read_actors(objects).whole()?;
+        let is_prefix = text.len() >= 4 && text.bytes().all(|b| b.is_ascii_hexdigit());
+        let is_hash_of = |hash: &str| is_prefix && hash.starts_with(text);
+        let is_it = |one: &&StoredActor| one.description.name == text || is_hash_of(&one.hash);
+        let found: Vec<&StoredActor> = actors.iter().filter(is_it).collect();
+        // A damaged asset keeps no other from its name.
+        let is_damaged = |one: &&DamagedActor| {
+            is_hash_of(&one.hash) || found.is_empty() && one.name.as_deref() == Some(text)
+        };
+        let found_damaged: Vec<&DamagedActor> = damaged.iter().filter(is_damaged).collect();
+        let count = found.len() + found_damaged.len();
+        match (&found[..], &found_damaged[..]) {
+            ([one], []) => return Ok((*one).clone()),
+            ([], [one]) => return Err((*one).clone().into()),
+            _ => {}
+        }
+        let listed = if count == 0 { actors.iter().collect() } else { found };
+        let named = |one: &StoredActor| format!("{} ({})", one.description.name, digits(&one.hash));
+        let damaged = |one: &DamagedActor| format!("a damaged one ({})", digits(&one.hash));
+        let known = listed.into_iter().map(named).chain(found_damaged.into_iter().map(damaged));
+        Err(StoreError::NoActor { text: text.to_owned(), found: count, known: known.collect() })
+    }
+
+    /// Removes an asset, given as to [`Catalog::find_actor`]; a damaged one, too. Returns its hash. With `dry_run`
+    /// nothing is removed.
+    ///
+    /// What has the asset in memory keeps it. Scenarios that name it are refused from now on, and recorded episodes
+    /// that drew it cannot be replayed, until the same asset is stored again.
+    ///
+    /// # Errors
+    /// [`StoreError::NoActor`]; it cannot be removed.
+    pub fn remove_actor(&self, text: &str, dry_run: bool) -> Result<String, StoreError> {
+        let find = || match self.find_actor(text) {
+            Ok(actor) => Ok(actor.hash),
+            Err(StoreError::ActorDamaged { hash, .. }) => Ok(hash),
+            Err(error) => Err(error),
+        };
+        if dry_run {
+            return find();
+        }
+        let mut removed = String::new();
+        self.objects.remove_objects(ACTORS, &mut || {
+            removed = find()?;
+            Ok(vec![removed.clone()])
+        })?;
+        Ok(removed)
     }
 
     /// Reads an asset, and compares it with its hash, 64 lower-case hex digits.
     ///
     /// # Errors
-    /// [`StoreError::NoActor`]; [`StoreError::Damaged`] or [`StoreError::Format`] if it cannot be used.
+    /// [`StoreError::NoActor`]; [`StoreError::ActorDamaged`] if it cannot be used.
     pub fn actor(&self, hash: &str) -> Result<ActorAsset, StoreError> {
+        let none = || StoreError::NoActor { text: hash.to_owned(), found: 0, known: Vec::new() };
         if !is_hash(hash) {
-            return Err(StoreError::NoActor {
-                text: hash.to_owned(),
-                dir: self.dir().to_owned(),
-                found: 0,
-                known: Vec::new(),
-            });
+            return Err(none());
         }
+        let damaged = |name: Option<String>, reason: String| StoreError::ActorDamaged {
+            hash: hash.to_owned(),
+            name,
+            reason,
+        };
         let bytes = match self.objects.read_object(ACTORS, hash, limits::ACTOR_BYTES) {
-            Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {
-                return Err(self.find_actor(hash).err().unwrap_or_else(|| StoreError::NoActor {
-                    text: hash.to_owned(),
-                    dir: self.dir().to_owned(),
-                    found: 0,
-                    known: Vec::new(),
-                }));
+            Ok(bytes) => bytes,
+            // It does not exist, is no file, or cannot be read.
+            Err(error @ StoreError::Io { .. }) => {
+                return Err(self.find_actor(hash).err().unwrap_or(error));
             }
-            read => read?,
+            Err(error) => return Err(damaged(None, reason_of(error))),
         };
-        let (header, mut rest) = self.header(hash, &bytes)?;
-        let damaged = |reason: String| {
-            let path = self.objects.object_path(ACTORS, hash);
-            StoreError::Damaged { path, reason }
-        };
+        let (header, mut rest) = header(&bytes).map_err(|reason| damaged(None, reason))?;
+        let damaged = |reason: String| damaged(Some(header.description.name.clone()), reason);
         let mut levels = Vec::with_capacity(header.levels.len());
         for (index, level) in header.levels.iter().enumerate() {
             let of_level = |reason: String| damaged(format!("level {index}: {reason}"));
@@ -268,32 +388,48 @@ impl Catalog {
         bytes.extend(content);
         Ok((header, bytes))
     }
+}
 
-    /// The header of an asset, and the bytes after it.
-    fn header<'a>(&self, hash: &str, bytes: &'a [u8]) -> Result<(Header, &'a [u8]), StoreError> {
-        let path = self.objects.object_path(ACTORS, hash);
-        let damaged = |reason: String| StoreError::Damaged { path: path.clone(), reason };
-        let start = bytes.split_first_chunk::<START_BYTES>();
-        let (start, rest) = start.ok_or_else(|| damaged("it is shorter than its start".into()))?;
-        let word = |at: usize| {
-            u32::from_le_bytes([start[at], start[at + 1], start[at + 2], start[at + 3]])
-        };
-        if start[..8] != MAGIC {
-            return Err(damaged("it does not start as an actor".into()));
-        }
-        if word(8) != FORMAT {
-            let path = path.clone();
-            return Err(StoreError::Format { path, found: word(8), supported: FORMAT });
-        }
-        let length = word(12) as usize;
-        if length > limits::ACTOR_HEADER_BYTES {
-            return Err(damaged("its header is longer than it may be".into()));
-        }
-        let json = rest.get(..length).ok_or_else(|| damaged("it ends in its header".into()))?;
-        let header: Header =
-            serde_json::from_slice(json).map_err(|error| damaged(error.to_string()))?;
-        header.check().map_err(damaged)?;
-        Ok((header, &rest[length..]))
+/// The header of an asset, and the bytes after it. The error says what is wrong with them.
+fn header(bytes: &[u8]) -> Result<(Header, &[u8]), String> {
+    let start = bytes.split_first_chunk::<START_BYTES>();
+    let (start, rest) = start.ok_or("it is shorter than its start")?;
+    let word =
+        |at: usize| u32::from_le_bytes([start[at], start[at + 1], start[at + 2], start[at + 3]]);
+    if start[..8] != MAGIC {
+        return Err("it does not start as an actor".to_owned());
+    }
+    if word(8) != FORMAT {
+        return Err(format!("it has format {}; this build reads format {FORMAT}", word(8)));
+    }
+    let length = word(12) as usize;
+    if length > limits::ACTOR_HEADER_BYTES {
+        return Err("its header is longer than it may be".to_owned());
+    }
+    let json = rest.get(..length).ok_or("it ends in its header")?;
+    let header: Header = serde_json::from_slice(json).map_err(|error| error.to_string())?;
+    header.check()?;
+    Ok((header, &rest[length..]))
+}
+
+/// The first digits of a hash, which are enough to find an asset.
+fn digits(hash: &str) -> &str {
+    hash.get(..12).unwrap_or(hash)
+}
+
+/// What is wrong with an asset that cannot be read, without its path: clients of a server get this text.
+fn reason_of(error: StoreError) -> String {
+    match error {
+        StoreError::Io { action, cause, .. } => format!("cannot {action} it: {cause}"),
+        StoreError::Damaged { reason, .. } => reason,
+        error => error.to_string(),
+    }
+}
+
+impl From<DamagedActor> for StoreError {
+    fn from(damaged: DamagedActor) -> Self {
+        let DamagedActor { hash, name, reason } = damaged;
+        Self::ActorDamaged { hash, name, reason }
     }
 }
 

@@ -31,9 +31,26 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// [`StoreError::Damaged`] for another hash, and for an object longer than `limit_bytes`.
     fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError>;
 
-    /// Reads an object of any size, compares it with its hash, and returns its first bytes, at most
-    /// `most_bytes`.
-    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError>;
+    /// Reads an object of any size. Returns its first bytes, at most `most_bytes`, and the hash of all of them.
+    fn read_and_hash(
+        &self,
+        name: &str,
+        hash: &str,
+        most_bytes: usize,
+    ) -> Result<HashedStart, StoreError>;
+
+    /// As [`ObjectBackend::read_and_hash`], and compares the object with its hash.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] for another hash.
+    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
+        let HashedStart { start, hash: found } = self.read_and_hash(name, hash, most_bytes)?;
+        if found == hash {
+            return Ok(start);
+        }
+        let path = self.object_path(name, hash);
+        Err(StoreError::Damaged { path, reason: format!("its bytes hash to {found}") })
+    }
 
     /// Reads a range of an object and compares it with a hash of that range.
     ///
@@ -77,7 +94,7 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// The record does not exist, or the backend cannot rename.
     fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError>;
 
-    /// All objects of a twin, in order of their hashes.
+    /// All objects of a twin, in order of their hashes, and whatever else has the name of an object.
     fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
 
     /// Removes the objects that `which` returns. Where the backend has locks, publishing is locked
@@ -164,11 +181,21 @@ pub(super) trait Staging: Debug + Send {
     fn dir(&self) -> &Path;
 }
 
+/// The start of an object.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct HashedStart {
+    pub(super) start: Vec<u8>,
+    /// BLAKE3 of the whole object, 64 lower-case hex digits.
+    pub(super) hash: String,
+}
+
 /// An object in a listing.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct ListedObject {
     pub(super) hash: String,
     pub(super) bytes: u64,
+    /// Whether it is a file, as all objects that a commit writes are: no link, pipe or directory.
+    pub(super) is_file: bool,
     /// When it was last written, in microseconds since 1970.
     pub(super) written_us: i64,
 }

@@ -1,7 +1,7 @@
-//! The file system under a directory of twins, as an interface.
+//! A file system, as an interface.
 //!
-//! The store writes to disks through it, so that a simulation can take the disk's place: one that loses what was not
-//! synced, fails, or stops the process between any two operations.
+//! The store writes to disks through it, and so does the server's spool of uploads, so that a simulation can take the
+//! disk's place: one that loses what was not synced, fails, or stops the process between any two operations.
 
 use std::any::Any;
 use std::fmt::Debug;
@@ -33,6 +33,12 @@ pub trait Disk: Debug + Send + Sync {
     /// # Errors
     /// As [`std::fs::File::create`].
     fn create(&self, path: &Path) -> io::Result<Box<dyn WriteFile>>;
+
+    /// Opens a regular file to write at its end.
+    ///
+    /// # Errors
+    /// As [`Disk::open`].
+    fn append(&self, path: &Path) -> io::Result<Box<dyn WriteFile>>;
 
     /// Creates a directory in an existing one.
     ///
@@ -108,6 +114,13 @@ pub trait ReadFile: Read + Seek + Debug + Send {
 
 /// A file that is written.
 pub trait WriteFile: Write + Debug + Send {
+    /// Discards all bytes from an offset on.
+    ///
+    /// # Errors
+    /// As [`std::fs::File::set_len`]; [`io::ErrorKind::UnexpectedEof`] if the file has fewer bytes, to which none are
+    /// added.
+    fn truncate(&mut self, bytes: u64) -> io::Result<()>;
+
     /// Makes what was written durable.
     ///
     /// # Errors
@@ -136,6 +149,18 @@ pub struct Lock {
 pub trait Held: Any + Debug + Send + Sync {}
 
 impl<T: Any + Debug + Send + Sync> Held for T {}
+
+/// Refuses to truncate a file of `found` bytes to more of them.
+///
+/// # Errors
+/// [`io::ErrorKind::UnexpectedEof`], with both numbers.
+pub fn check_truncation(found: u64, bytes: u64) -> io::Result<()> {
+    if found >= bytes {
+        return Ok(());
+    }
+    let reason = format!("the file has {found} bytes, and must have at least {bytes}");
+    Err(io::Error::new(io::ErrorKind::UnexpectedEof, reason))
+}
 
 impl Lock {
     /// A lock that is held as long as something is.

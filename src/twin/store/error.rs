@@ -94,20 +94,32 @@ pub enum StoreError {
     },
     /// No asset of an actor has this name or hash, or several have it.
     #[error(
-        "{} actor of name or hash {text:?} in {}; {}",
+        "{} actor of name or hash {text:?}; {}",
         if *found == 0 { "there is no" } else { "there is more than one" },
-        dir.display(),
-        known_actors(known)
+        known_actors(*found, known)
     )]
     NoActor {
         /// The requested name or hash.
         text: String,
-        /// The directory or URL of twins.
-        dir: PathBuf,
         /// How many have it.
         found: usize,
         /// Those that have it, or else all that exist.
         known: Vec<String>,
+    },
+    /// An asset differs from what was stored, or cannot be read.
+    #[error(
+        "the actor {}{} is damaged: {reason}; store it again, or remove it with `wildcity actor remove {}`",
+        hash.get(..12).unwrap_or(hash),
+        name.as_ref().map(|name| format!(" ({name:?})")).unwrap_or_default(),
+        hash.get(..12).unwrap_or(hash)
+    )]
+    ActorDamaged {
+        /// Its hash, 64 lower-case hex digits.
+        hash: String,
+        /// The name that it states, if that can be read. It may be damaged, too.
+        name: Option<String>,
+        /// What is wrong.
+        reason: String,
     },
     /// An asset of another content has the name.
     #[error(
@@ -313,10 +325,16 @@ fn known_twins(known: &[String]) -> String {
     }
 }
 
-fn known_actors(known: &[String]) -> String {
+fn known_actors(found: usize, known: &[String]) -> String {
+    const NAMED: usize = 20;
+    let mut names = known.iter().take(NAMED).cloned().collect::<Vec<_>>().join(", ");
+    if known.len() > NAMED {
+        names += &format!(" and {} more", known.len() - NAMED);
+    }
     match known {
-        [] => "make one with `wildcity actor import`".to_owned(),
-        names => format!("it holds {}", names.join(", ")),
+        [] => "there are no actors: make one with `wildcity actor import`".to_owned(),
+        _ if found > 0 => format!("give the hash of one: {names}"),
+        _ => format!("`wildcity actor list` shows {names}"),
     }
 }
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use wildcity_scene::manifest::SkyRef;
 
+use super::backend::ListedObject;
 use super::catalog::check_name;
 use super::gc::ObjectTotals;
 use super::{Catalog, StoreError};
@@ -95,7 +96,9 @@ impl Catalog {
         }
         let (verified, named) = self.reread(name, &readable, progress)?;
         let mut unreferenced = ObjectTotals::default();
-        for object in listed.iter().filter(|object| !named.contains(&object.hash)) {
+        let is_unreferenced =
+            |object: &&ListedObject| object.is_file && !named.contains(&object.hash);
+        for object in listed.iter().filter(is_unreferenced) {
             unreferenced.add(object.bytes);
         }
         Ok(FsckReport {

@@ -167,7 +167,7 @@ impl Catalog {
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
         let mut plan = CollectionPlan::default();
         for object in self.objects.list_objects(name)? {
-            if named.contains(&object.hash) {
+            if !object.is_file || named.contains(&object.hash) {
                 continue;
             }
             let noted_us = before.get(&object.hash).copied();
@@ -179,11 +179,16 @@ impl Catalog {
                 plan.candidates.insert(object.hash, noted_us.unwrap_or(now_us));
             }
         }
-        // Versions that lose their manifest. A record that cannot be read names no object that could
-        // be removed.
-        for number in numbers.into_iter().filter(|number| !kept.contains(number)) {
-            if self.record(name, number).is_ok_and(|record| plan.remove.contains(&record.manifest))
-            {
+        // Versions that lose their manifest. A damaged record names no object that could be removed. One that the disk
+        // fails to read may: its version would seem damaged if it lost objects and were not marked.
+        let loses = |number: &u64| !kept.contains(number) && !gone.contains(number);
+        let removes = !plan.remove.is_empty();
+        for number in numbers.into_iter().filter(|number| removes && loses(number)) {
+            let is_gone = match self.record(name, number) {
+                Err(StoreError::Damaged { .. }) => false,
+                record => plan.remove.contains(&record?.manifest),
+            };
+            if is_gone {
                 plan.gone.insert(number);
             }
         }

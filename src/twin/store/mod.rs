@@ -72,7 +72,7 @@ mod remote;
 mod settings;
 mod sky;
 
-pub use actors::{AddedActor, SameName, StoredActor, StoredLevel};
+pub use actors::{ActorList, AddedActor, DamagedActor, SameName, StoredActor, StoredLevel};
 pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};
 pub use commit::{Commit, StoredCells};
 pub use cut::{CUT_ABOVE_M, Cut, CutPlace};
@@ -83,6 +83,7 @@ pub use error::StoreError;
 pub use fsck::{DamagedObject, FsckReport, RecordSetAside, VerifyReport};
 pub use gc::{CollectionReport, ObjectTotals, Retention};
 pub use lease::Lease;
+pub use local::{RealDisk, create_dirs};
 pub use log::{CommitKind, LogEntry};
 pub use new_version::NewVersion;
 pub use pack::StorageOptions;

@@ -97,9 +97,15 @@ impl Local {
         self.disk.lock(&path, wait).map_err(StoreError::io("lock", &path))
     }
 
-    /// Whether something is at a path.
-    pub(super) fn exists(&self, path: &Path) -> bool {
-        self.disk.info(path).is_ok()
+    /// Whether something is at a path. A disk that fails is an error: otherwise a commit would leave an object behind,
+    /// or take another version's object for its own.
+    pub(super) fn exists(&self, path: &Path) -> Result<bool, StoreError> {
+        match self.disk.info(path) {
+            Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+                Ok(false)
+            }
+            found => found.map(|_| true).map_err(StoreError::io("find", path)),
+        }
     }
 
     /// Whether no process holds the lock of a staging directory. The caller holds the publish lock.
@@ -108,7 +114,7 @@ impl Local {
         match self.disk.lock(&path, Wait::NoAndExisting) {
             Ok(lock) => Ok(lock.is_some()),
             // Its process was killed before it created the lock, or is removing the directory now.
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(self.exists(dir)),
+            Err(error) if error.kind() == ErrorKind::NotFound => self.exists(dir),
             Err(error) => Err(StoreError::io("lock", &path)(error)),
         }
     }

@@ -4,7 +4,7 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::path::Path;
 
 use crate::store::StoreError;
-use crate::store::disk::Disk;
+use crate::store::disk::{Disk, ReadFile};
 
 /// Bytes read or written at once.
 pub(super) const BUFFER_BYTES: usize = 256 << 10;
@@ -44,6 +44,21 @@ impl<F: Write> Write for HashingFile<F> {
     }
 }
 
+/// Reads a file, up to a limit.
+///
+/// # Errors
+/// The file system fails, or has fewer bytes than the file's size says.
+pub(super) fn read_all(file: Box<dyn ReadFile>, limit_bytes: u64) -> io::Result<Vec<u8>> {
+    let size = file.size_bytes()?.min(limit_bytes);
+    let mut bytes = Vec::with_capacity(size as usize);
+    file.take(limit_bytes).read_to_end(&mut bytes)?;
+    if (bytes.len() as u64) < size {
+        let said = format!("it ended after {} of {size} bytes", bytes.len());
+        return Err(io::Error::new(ErrorKind::UnexpectedEof, said));
+    }
+    Ok(bytes)
+}
+
 /// Names in a directory, sorted; none if it does not exist.
 pub(super) fn entries(disk: &dyn Disk, dir: &Path) -> Result<Vec<String>, StoreError> {
     let mut names = match disk.list(dir) {
@@ -63,7 +78,10 @@ pub(super) fn create_parent(disk: &dyn Disk, path: &Path) -> Result<(), StoreErr
 
 /// Creates a directory and the missing ones above it, and syncs each: what is written into a
 /// directory is lost in a power cut if the directory's own entry is.
-pub(super) fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
+///
+/// # Errors
+/// [`StoreError::Io`] names the directory that cannot be created or synced.
+pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     let is_dir = || disk.info(dir).is_ok_and(|found| found.is_dir);
     // The parent of "twins" is "", which is the current directory.
     if dir.as_os_str().is_empty() || is_dir() {

@@ -15,16 +15,17 @@ use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::backend::{ListedObject, ObjectBackend, Staging};
+use super::backend::{HashedStart, ListedObject, ObjectBackend, Staging};
 use super::disk::{FileInfo, Lock, Wait};
 use super::layout::{ACTORS, LOCK_ENDING, check_hash, check_side_file, is_hash, log_numbers};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
-pub(super) use real_disk::RealDisk;
+pub use files::create_dirs;
+pub use real_disk::RealDisk;
 
 use directory::{OpenObject, SEPARATOR, STAGING};
-use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, sync_parent};
+use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, read_all, sync_parent};
 use staging::LocalStaging;
 
 impl ObjectBackend for Local {
@@ -47,31 +48,28 @@ impl ObjectBackend for Local {
     fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
         let path = self.record_path(name, number);
         let file = self.disk.open(&path).map_err(StoreError::io("open", &path))?;
-        let mut bytes = Vec::new();
-        file.take(limits::LOG_RECORD_BYTES)
-            .read_to_end(&mut bytes)
-            .map_err(StoreError::io("read", &path))?;
-        Ok(bytes)
+        read_all(file, limits::LOG_RECORD_BYTES).map_err(StoreError::io("read", &path))
     }
 
     fn read_object(&self, name: &str, hash: &str, limit_bytes: u64) -> Result<Vec<u8>, StoreError> {
-        let OpenObject { path, mut file, bytes: size } = self.open(name, hash)?;
+        let OpenObject { path, file, bytes: size } = self.open(name, hash)?;
         if size > limit_bytes {
             let reason = format!("{size} bytes are above {limit_bytes}");
             return Err(StoreError::Damaged { path, reason });
         }
-        let mut bytes = Vec::with_capacity(size as usize);
-        (&mut file)
-            .take(limit_bytes)
-            .read_to_end(&mut bytes)
-            .map_err(StoreError::io("read", &path))?;
+        let bytes = read_all(file, limit_bytes).map_err(StoreError::io("read", &path))?;
         match check_hash(&bytes, hash) {
             Ok(()) => Ok(bytes),
             Err(reason) => Err(StoreError::Damaged { path, reason }),
         }
     }
 
-    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
+    fn read_and_hash(
+        &self,
+        name: &str,
+        hash: &str,
+        most_bytes: usize,
+    ) -> Result<HashedStart, StoreError> {
         let OpenObject { path, file, .. } = self.open(name, hash)?;
         let failed = || StoreError::io("read", &path);
         let mut reader = HashingFile::new(file);
@@ -79,11 +77,7 @@ impl ObjectBackend for Local {
         (&mut reader).take(most_bytes as u64).read_to_end(&mut start).map_err(failed())?;
         let mut buffer = vec![0; BUFFER_BYTES];
         while reader.read(&mut buffer).map_err(failed())? > 0 {}
-        let found = reader.hasher.finalize().to_hex();
-        if found.as_str() == hash {
-            return Ok(start);
-        }
-        Err(StoreError::Damaged { path, reason: format!("its bytes hash to {found}") })
+        Ok(HashedStart { start, hash: reader.hasher.finalize().to_hex().to_string() })
     }
 
     fn read_range(
@@ -195,10 +189,14 @@ impl ObjectBackend for Local {
         for prefix in entries(&*self.disk, &objects)? {
             for hash in entries(&*self.disk, &objects.join(&prefix))? {
                 let path = objects.join(&prefix).join(&hash);
-                let found = self.disk.info(&path).map_err(StoreError::io("find", &path))?;
-                if is_hash(&hash) && found.is_file {
-                    let FileInfo { bytes, modified_us: written_us, .. } = found;
-                    listed.push(ListedObject { hash, bytes, written_us });
+                let found = match self.disk.info(&path) {
+                    // It was removed in between.
+                    Err(error) if error.kind() == ErrorKind::NotFound => continue,
+                    found => found.map_err(StoreError::io("find", &path))?,
+                };
+                if is_hash(&hash) {
+                    let FileInfo { bytes, modified_us: written_us, is_file, .. } = found;
+                    listed.push(ListedObject { hash, bytes, is_file, written_us });
                 }
             }
         }
@@ -231,10 +229,8 @@ impl ObjectBackend for Local {
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             opened => opened.map_err(StoreError::io("open", &path))?,
         };
-        let mut bytes = Vec::new();
-        file.take(limits::SIDE_FILE_BYTES + 1)
-            .read_to_end(&mut bytes)
-            .map_err(StoreError::io("read", &path))?;
+        let bytes =
+            read_all(file, limits::SIDE_FILE_BYTES + 1).map_err(StoreError::io("read", &path))?;
         if bytes.len() as u64 > limits::SIDE_FILE_BYTES {
             let reason = format!("it is above {} bytes", limits::SIDE_FILE_BYTES);
             return Err(StoreError::Damaged { path, reason });

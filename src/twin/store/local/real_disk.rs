@@ -8,11 +8,11 @@ use std::time::UNIX_EPOCH;
 
 use rustix::fs::OFlags;
 
-use crate::store::disk::{Disk, FileInfo, Lock, ReadFile, Wait, WriteFile};
+use crate::store::disk::{Disk, FileInfo, Lock, ReadFile, Wait, WriteFile, check_truncation};
 
 /// The file system of this machine.
 #[derive(Clone, Copy, Debug, Default)]
-pub(in crate::store) struct RealDisk;
+pub struct RealDisk;
 
 impl Disk for RealDisk {
     fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
@@ -41,6 +41,10 @@ impl Disk for RealDisk {
 
     fn create(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
         Ok(Box::new(File::create(path)?))
+    }
+
+    fn append(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
+        Ok(Box::new(open_regular(File::options().append(true), path)?))
     }
 
     fn create_dir(&self, dir: &Path) -> io::Result<()> {
@@ -95,6 +99,11 @@ impl ReadFile for File {
 }
 
 impl WriteFile for File {
+    fn truncate(&mut self, bytes: u64) -> io::Result<()> {
+        check_truncation(self.metadata()?.len(), bytes)?;
+        self.set_len(bytes)
+    }
+
     fn sync(&mut self) -> io::Result<()> {
         self.sync_all()
     }

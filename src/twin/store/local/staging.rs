@@ -56,12 +56,12 @@ impl LocalStaging {
         let mut changed = BTreeSet::new();
         for hash in hashes {
             let staged = self.dir.join(hash);
-            if !self.local.exists(&staged) {
+            if !self.local.exists(&staged)? {
                 continue;
             }
             let path = self.local.object_file(&self.name, hash);
             create_parent(&*self.local.disk, &path)?;
-            if !self.local.exists(&path) {
+            if !self.local.exists(&path)? {
                 self.placed.push(path.clone());
             }
             self.local.disk.rename(&staged, &path).map_err(StoreError::io("write", &path))?;

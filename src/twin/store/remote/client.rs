@@ -85,7 +85,12 @@ impl Remote {
                 if size > limit_bytes {
                     return Ok(Err(size));
                 }
-                found.bytes().await.map(|bytes| Ok(Vec::from(bytes)))
+                let bytes = found.bytes().await?;
+                if (bytes.len() as u64) < size {
+                    let source = format!("it ended after {} of {size} bytes", bytes.len()).into();
+                    return Err(object_store::Error::Generic { store: "object store", source });
+                }
+                Ok(Ok(Vec::from(bytes)))
             }
         })?;
         read.map_err(|size| self.damaged(key, format!("{size} bytes are above {limit_bytes}")))

@@ -22,7 +22,7 @@ use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::backend::{ListedObject, ObjectBackend, Staging};
+use super::backend::{HashedStart, ListedObject, ObjectBackend, Staging};
 use super::disk::Lock;
 use super::layout::{check_side_file, is_hash, log_numbers, object_key, record_key};
 
@@ -72,7 +72,12 @@ impl ObjectBackend for Remote {
         Ok(bytes)
     }
 
-    fn read_start(&self, name: &str, hash: &str, most_bytes: usize) -> Result<Vec<u8>, StoreError> {
+    fn read_and_hash(
+        &self,
+        name: &str,
+        hash: &str,
+        most_bytes: usize,
+    ) -> Result<HashedStart, StoreError> {
         let key = object_key(name, hash);
         let read = || {
             let store = self.store.clone();
@@ -89,19 +94,13 @@ impl ObjectBackend for Remote {
                         let more = most_bytes.saturating_sub(start.len()).min(bytes.len());
                         start.extend_from_slice(&bytes[..more]);
                     }
-                    Ok((start, hasher.finalize().to_hex()))
+                    Ok(HashedStart { start, hash: hasher.finalize().to_hex().to_string() })
                 }
             })
         };
         // The bytes may have been damaged in transit and not in the store: read once more.
-        let (mut start, mut found) = read()?;
-        if found.as_str() != hash {
-            (start, found) = read()?;
-        }
-        if found.as_str() == hash {
-            return Ok(start);
-        }
-        Err(self.damaged(&key, format!("its bytes hash to {found}")))
+        let first = read()?;
+        if first.hash == hash { Ok(first) } else { read() }
     }
 
     fn read_range(
@@ -198,7 +197,7 @@ impl ObjectBackend for Remote {
         let listed = found.into_iter().filter_map(|found| {
             let hash = found.location.filename().filter(|name| is_hash(name))?.to_owned();
             let written_us = found.last_modified.timestamp_micros();
-            Some(ListedObject { hash, bytes: found.size, written_us })
+            Some(ListedObject { hash, bytes: found.size, is_file: true, written_us })
         });
         let mut listed: Vec<ListedObject> = listed.collect();
         listed.sort_unstable_by(|a, b| a.hash.cmp(&b.hash));
