@@ -159,7 +159,8 @@ pub async fn publish_asset(
         })
     };
     let limit = queue.check_timeout();
-    let asset = timeout(limit, made).await.map_err(|_| PushError::TimedOut { limit })??;
+    let made = timeout(limit, made).await.map_err(|_| PushError::TimedOut { limit })?;
+    let asset = made.map_err(|error| push.cause(error))?;
     drop(stopping);
 
     // From here on the push cannot be cancelled.

@@ -141,6 +141,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::NoTwin { .. }
         | StoreError::NoVersion { .. }
         | StoreError::NoActor { .. }
+        | StoreError::ActorDamaged { .. }
         | StoreError::NothingToCut { .. }
         | StoreError::GarbageCollected { .. }
         | StoreError::Leased { .. }

@@ -14,7 +14,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout, timeout_at};
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::chunk::cell_at;
@@ -65,12 +65,15 @@ pub async fn publish(
     let request = Arc::new(request);
 
     let limit = queue.check_timeout();
-    let checked = timeout(limit, read_and_check(engine, push, &request, files, &turn)).await;
-    let Ok(checked) = checked else {
+    let deadline = Instant::now() + limit;
+    // Later than the push itself: a push that takes too long ends as `TimedOut`, not by a late frame.
+    let frames_by = deadline + engine.step_timeout();
+    let checked = read_and_check(engine, push, &request, files, &turn, frames_by);
+    let Ok(checked) = timeout_at(deadline, checked).await else {
         push.stop_flag().stop();
         return Err(PushError::TimedOut { limit });
     };
-    let (scene, base) = checked?;
+    let (scene, base) = checked.map_err(|error| push.cause(error))?;
 
     // From here on the push cannot be cancelled.
     push.enter(State::Committing)?;
@@ -94,13 +97,15 @@ pub async fn publish(
     Ok(PushedVersion { number: version.number, hash: version.hash })
 }
 
-/// Everything before the commit. Threads hold the turn: they end a moment after their push does.
+/// Everything before the commit. Frames of the preview have until `frames_by`. Threads hold the turn: they end a moment
+/// after their push does.
 async fn read_and_check(
     engine: &Arc<Engine>,
     push: &Arc<Push>,
     request: &Arc<PushRequest>,
     files: Vec<SourceFile>,
     turn: &Turn,
+    frames_by: Instant,
 ) -> Result<(CheckedScene, Option<Arc<Version>>), PushError> {
     push.enter(State::Ingesting)?;
     let scene = {
@@ -121,7 +126,7 @@ async fn read_and_check(
         let request = request.clone();
         run_blocking(move || find_base(engine.catalog(), &request)).await?.map(Arc::new)
     };
-    let scene = check(engine, push, request, scene, base.clone()).await?;
+    let scene = check(engine, push, request, scene, base.clone(), frames_by).await?;
     Ok((scene, base))
 }
 
@@ -132,6 +137,7 @@ async fn check(
     request: &Arc<PushRequest>,
     scene: PushedScene,
     base: Option<Arc<Version>>,
+    frames_by: Instant,
 ) -> Result<CheckedScene, PushError> {
     let (mut scene, changed) = {
         let push = push.clone();
@@ -147,7 +153,7 @@ async fn check(
     if let Some(changed) = changed {
         let progress = |done, total| push.set_progress(done, total);
         let poses = request.preview_poses.clone();
-        scene.report.preview = preview_psnr(engine, changed, poses, &progress).await?;
+        scene.report.preview = preview_psnr(engine, changed, poses, frames_by, &progress).await?;
         push.set_report(scene.report.clone());
     }
     check_psnr(request, &scene.gaussians, &scene.report, base.as_deref())?;

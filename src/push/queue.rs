@@ -333,7 +333,10 @@ mod tests {
         let queue = queue(2);
         let push = new(begin(&queue, "a", "x"));
         push.enter(State::Ingesting).unwrap();
+        assert!(matches!(push.cause(PushError::Crashed), PushError::Crashed));
         push.cancel().unwrap();
+        let ended = push.cause(PushError::Crashed);
+        assert!(matches!(ended, PushError::Cancelled), "not by how its reading ended: {ended}");
         assert!(matches!(push.enter(State::Committing), Err(PushError::Cancelled)));
         let version = PushedVersion { number: 1, hash: String::new() };
         assert_eq!(push.end(Ok(version)), State::Failed);

@@ -145,6 +145,15 @@ impl Push {
         self.cancelled.notified().await;
     }
 
+    /// What ends the push: its cancellation if there was one, since that also ends the reading with an error of its own.
+    pub(crate) fn cause(&self, error: PushError) -> PushError {
+        let status = self.status.lock();
+        match status.error.as_deref() {
+            Some(PushError::Cancelled) => PushError::Cancelled,
+            _ => error,
+        }
+    }
+
     /// Stops the threads that read the push's files.
     pub(crate) fn stop_flag(&self) -> &StopFlag {
         &self.stop

@@ -44,8 +44,9 @@ pub(crate) struct ProposedChange {
 type LoadedSections = BTreeMap<SectionRef, Arc<Chunk>>;
 
 /// Renders small images of a version before and after a proposed change, and compares them. The frames wait
-/// in the render queue with those of the sessions. Without `poses`, the images are taken from some poses along
-/// the first trajectory, near the change. Calls `progress` with the number of poses that are done and the
+/// in the render queue with those of the sessions, until the deadline. It may be later than that of a step, because no
+/// agent waits for them. Without `poses`, the images are taken from some poses along the first trajectory, near the
+/// change. Calls `progress` with the number of poses that are done and the
 /// number of all poses.
 ///
 /// # Errors
@@ -54,6 +55,7 @@ pub(crate) async fn preview_psnr(
     engine: &Arc<Engine>,
     change: ProposedChange,
     poses: Option<Vec<Pose>>,
+    deadline: Instant,
     progress: &(dyn Fn(u64, u64) + Sync),
 ) -> Result<Vec<PsnrPreview>, PushError> {
     let poses = poses.unwrap_or_else(|| preview_poses(&change));
@@ -106,8 +108,9 @@ pub(crate) async fn preview_psnr(
         new_scene = scenes.new_scene;
         loaded = scenes.loaded;
 
-        let before = render_small(engine, scenes.before, manifest.profile, views.clone()).await?;
-        let after = render_small(engine, scenes.after, change.profile, views).await?;
+        let before =
+            render_small(engine, scenes.before, manifest.profile, views.clone(), deadline).await?;
+        let after = render_small(engine, scenes.after, change.profile, views, deadline).await?;
         let psnr_db = psnr_db_u8(before.iter().zip(&after));
         previews.push(PsnrPreview { world_from_rig, psnr_db });
     }
@@ -120,8 +123,8 @@ async fn render_small(
     scene: Scene,
     profile: RenderProfile,
     views: Vec<View>,
+    deadline: Instant,
 ) -> Result<Vec<u8>, PushError> {
-    let deadline = Instant::now() + engine.step_timeout();
     let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
     let cost = FrameCost { session: PUSHES, pixels };
     let rendered = engine.run(cost, deadline, move |_, backend| {

@@ -12,7 +12,7 @@ use tracing::Instrument as _;
 use wildcity_push::{AssetRequest, Push, PushError, SourceFile};
 use wildcity_twin::store::AddedActor;
 
-use crate::audit::{Change, Ended, Target};
+use crate::audit::{Change, Made, Target};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
@@ -23,7 +23,7 @@ use crate::state::ServerState;
 use super::pushes::{find_uploads, outcome, stopped_before_commit};
 use super::refusal::HttpResult;
 
-/// `GET /v1/actors`: all assets.
+/// `GET /v1/actors`: all assets, and the damaged ones.
 pub(super) async fn list(
     Shared(state): Shared<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -104,18 +104,14 @@ async fn run(
     let published = wildcity_push::publish_asset(catalog, &state.pushes, &push, request, files)
         .instrument(tracing::debug_span!("push", actor = name));
     let result = tokio::select! {
-        // A cancelled push ends with whatever its reading was at, too.
+        // A cancelled push does not wait for its reading to stop.
         biased;
         () = push.cancelled() => Err(PushError::Cancelled),
         result = published => result,
         () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
-    let reason = result.as_ref().err().map(ToString::to_string).unwrap_or_default();
-    let ended = match &result {
-        Ok(added) => Ended::Asset(&added.actor.hash),
-        Err(_) => Ended::Not(&reason),
-    };
-    state.audit.end(&owned.grant, &change, ended);
+    let made = result.as_ref().map(|added| Made::Asset(&added.actor.hash));
+    state.audit.end(&owned.grant, &change, made);
     let ended = push.close(result.as_ref().map(drop));
     match &result {
         Ok(added) => tracing::info!(actor = name, hash = added.actor.hash, "stored"),

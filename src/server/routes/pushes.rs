@@ -12,7 +12,7 @@ use tracing::Instrument as _;
 
 use wildcity_push::{Begun, Push, PushError, PushRequest, RequestedFile, SourceFile, State};
 
-use crate::audit::{Change, Ended, Target};
+use crate::audit::{Change, Made, Target};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
@@ -106,17 +106,16 @@ async fn run(
         wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints)
             .instrument(tracing::debug_span!("push", twin, id = owned.id));
     let result = tokio::select! {
-        // A cancelled push ends with whatever its reading was at, too.
+        // A cancelled push does not wait for its reading to stop.
         biased;
         () = push.cancelled() => Err(PushError::Cancelled),
         result = published => result,
         () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
-    let reason = result.as_ref().err().map(ToString::to_string);
     let change = Change { what: "push", target: Target::Twin(&twin), id: Some(&owned.id) };
-    let made = result.as_ref().map(|version| Ended::Version(version.number));
-    let made = made.unwrap_or(Ended::Not(reason.as_deref().unwrap_or_default()));
+    let made = result.as_ref().map(|version| Made::Version(version.number));
     state.audit.end(&owned.grant, &change, made);
+    let reason = result.as_ref().err().map(ToString::to_string);
     let ended = push.end(result);
     if let Some(reason) = reason {
         tracing::warn!(state = ?ended, "a push ended: {reason}");
