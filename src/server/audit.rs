@@ -4,6 +4,7 @@
 //! [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, in place of an older one, and a new file begins; if that
 //! fails, the log says why and goes on in the same file.
 
+use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -48,15 +49,13 @@ pub(crate) enum Target<'a> {
     Actor(&'a str),
 }
 
-/// How a change ended.
+/// What a change made.
 #[derive(Clone, Debug)]
-pub(crate) enum Ended<'a> {
-    /// With a version.
+pub(crate) enum Made<'a> {
+    /// A version of this number.
     Version(u64),
-    /// With an asset of this hash.
+    /// An asset of this hash.
     Asset(&'a str),
-    /// Without either, for this reason.
-    Not(&'a str),
 }
 
 /// A line.
@@ -96,8 +95,15 @@ impl Audit {
         self.write(grant, change, None)
     }
 
-    /// Writes how a change ended. What is done is done: a line that cannot be written is an error in the server's log.
-    pub(crate) fn end(&self, grant: &Grant, change: &Change<'_>, ended: Ended<'_>) {
+    /// Writes what a change made, or why it made nothing. What is done is done: a line that cannot be written is an
+    /// error in the server's log.
+    pub(crate) fn end(
+        &self,
+        grant: &Grant,
+        change: &Change<'_>,
+        ended: Result<Made<'_>, impl Display>,
+    ) {
+        let ended = ended.map_err(|reason| reason.to_string());
         if let Err(fault) = self.write(grant, change, Some(ended)) {
             tracing::error!(target = ?change.target, "{fault}");
         }
@@ -107,7 +113,7 @@ impl Audit {
         &self,
         grant: &Grant,
         change: &Change<'_>,
-        ended: Option<Ended<'_>>,
+        ended: Option<Result<Made<'_>, String>>,
     ) -> Result<(), Fault> {
         let Some(log) = &self.0 else { return Ok(()) };
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
@@ -128,13 +134,13 @@ impl Audit {
             hash: None,
             reason: None,
         };
-        let line = match ended {
+        let line = match &ended {
             None => begun,
-            Some(Ended::Version(version)) => {
-                Line { state: "done", version: Some(version), ..begun }
+            Some(Ok(Made::Version(version))) => {
+                Line { state: "done", version: Some(*version), ..begun }
             }
-            Some(Ended::Asset(hash)) => Line { state: "done", hash: Some(hash), ..begun },
-            Some(Ended::Not(reason)) => Line { state: "refused", reason: Some(reason), ..begun },
+            Some(Ok(Made::Asset(hash))) => Line { state: "done", hash: Some(*hash), ..begun },
+            Some(Err(reason)) => Line { state: "refused", reason: Some(reason), ..begun },
         };
         let mut text = serde_json::to_vec(&line).map_err(|e| Fault::Internal(e.to_string()))?;
         text.push(b'\n');
@@ -219,8 +225,8 @@ mod tests {
         for _ in 0..2 {
             let audit = Audit::open(Some(&path)).unwrap();
             audit.begin(&grant, &change()).unwrap();
-            audit.end(&grant, &change(), Ended::Version(3));
-            audit.end(&grant, &change(), Ended::Not("too sparse"));
+            audit.end(&grant, &change(), Ok::<_, &str>(Made::Version(3)));
+            audit.end(&grant, &change(), Err("too sparse"));
         }
         let lines = lines(&path);
         assert_eq!(lines.len(), 6);

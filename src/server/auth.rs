@@ -10,6 +10,7 @@ use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
 
 use crate::fault::Fault;
+use crate::limits;
 
 /// What the holder of a token may do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
@@ -122,6 +123,12 @@ impl Tokens {
                 let reason = "a name is not empty, and belongs to one token only";
                 return Err(wrong(format!("tokens[{index}].name"), reason));
             }
+            if name.len() > limits::TOKEN_NAME_BYTES {
+                let bytes = name.len();
+                let most = limits::TOKEN_NAME_BYTES;
+                let reason = format!("a name of {bytes} bytes; choose one of at most {most}");
+                return Err(wrong(format!("tokens[{index}].name"), &reason));
+            }
             let secret = match (token, hash) {
                 (Some(token), None) if token.len() >= MIN_TOKEN_BYTES => {
                     Secret::OfToken(blake3::hash(token.as_bytes()))
@@ -139,7 +146,8 @@ impl Tokens {
                     return Err(wrong(format!("tokens[{index}]"), reason));
                 }
             };
-            tokens.push(Token { grant: Arc::new(Grant { name, role, twins, limits }), secret });
+            let grant = Grant { name, role, twins, limits };
+            tokens.push(Token { grant: Arc::new(grant), secret });
         }
         Ok(Self(tokens))
     }
@@ -298,6 +306,14 @@ mod tests {
 
     #[test]
     fn a_file_of_tokens_is_refused_without_repeating_them() {
+        let with_name = |bytes: usize| {
+            let name = "n".repeat(bytes);
+            format!(
+                r#"{{"tokens": [{{"name": "{name}", "role": "push", "token": "secretsecretsecret"}}]}}"#
+            )
+        };
+        assert!(Tokens::parse(with_name(255).as_bytes()).is_ok());
+        let long_name = with_name(256);
         for (text, location) in [
             (r#"{"tokens": []}"#, "tokens"),
             (
@@ -320,6 +336,7 @@ mod tests {
                 "tokens[1].name",
             ),
             (r#"{"tokens": [{"name": "a", "role": "drive", "hash": "secret"}]}"#, "tokens[0].hash"),
+            (long_name.as_str(), "tokens[0].name"),
         ] {
             let error = Tokens::parse(text.as_bytes()).unwrap_err().to_string();
             assert!(error.starts_with(location) && !error.contains("secret"), "{error}");

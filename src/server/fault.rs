@@ -327,11 +327,15 @@ pub(crate) enum Fault {
         /// Its value, and what is accepted.
         must: String,
     },
-    /// A file of the spool cannot be read or written.
-    #[error("cannot {action} the spool: {cause}")]
-    Spool {
-        /// What was tried.
-        action: &'static str,
+    /// A file of the spool cannot be read now; a repetition may succeed.
+    #[error("cannot read the spool: {cause}")]
+    SpoolRead {
+        /// What the operating system says.
+        cause: io::Error,
+    },
+    /// A file of the spool cannot be written.
+    #[error("cannot write to the spool: {cause}")]
+    SpoolWrite {
         /// What the operating system says.
         cause: io::Error,
     },

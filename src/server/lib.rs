@@ -58,6 +58,15 @@ mod tickets;
 mod tls;
 mod watchers;
 
+// The support of the tests names this package.
+#[cfg(test)]
+extern crate self as wildcity_server;
+
+/// Simulated faults of uploads and connections.
+#[cfg(test)]
+#[path = "../../tests/faults/server/mod.rs"]
+mod simulation;
+
 pub use auth::{Role, Tokens, TokensError};
 pub use config::{Config, Directories, Limits, SpoolLimits};
 pub use origins::{OriginError, Origins};

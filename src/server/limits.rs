@@ -71,6 +71,13 @@ pub const UPLOADS: usize = 1024;
 /// Longest name of an upload: what file systems allow.
 pub const UPLOAD_NAME_BYTES: usize = 255;
 
+/// Longest name of a token.
+pub const TOKEN_NAME_BYTES: usize = 255;
+
+/// Largest file that says what was announced: a digest, and the names of an upload and of a token. With all their bytes
+/// escaped these have 2 x 6 x 255 = 3,060 bytes.
+pub const ANNOUNCEMENT_BYTES: u64 = 16 << 10;
+
 /// Largest upload: 250 million Gaussians of 236 bytes are 59 GB.
 pub const UPLOAD_BYTES: u64 = 64 << 30;
 

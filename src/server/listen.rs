@@ -1,17 +1,20 @@
 //! Accepts connections, a bounded number of them.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use axum::Router;
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
+use tokio::task::JoinHandle;
 
 use crate::idle_deadline::IdleDeadline;
 use crate::limits;
-use crate::newcomers::Newcomers;
+use crate::newcomers::{ConnectionSlot, Newcomers};
 use crate::routes;
 use crate::state::ServerState;
 use crate::stream::Stream;
@@ -19,12 +22,12 @@ use crate::tls::Tls;
 
 /// Serves connections until the server stops.
 pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: Option<Arc<Tls>>) {
-    let newcomers = Newcomers::new(state.limits.connections + limits::SPARE_CONNECTIONS);
-    let app = routes::router(state.clone());
+    let acceptor = Acceptor::new(state.clone());
+    let hello = state.limits.hello;
     loop {
         let accepted = async {
             let (stream, address) = listener.accept().await?;
-            Ok::<_, std::io::Error>((stream, newcomers.admit(address.ip()).await))
+            Ok::<_, std::io::Error>((stream, acceptor.admit(address.ip()).await))
         };
         let (stream, slot) = tokio::select! {
             accepted = accepted => match accepted {
@@ -39,29 +42,55 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
             () = state.stopped() => return,
         };
         set_options(&stream);
-        let deadline = Arc::new(IdleDeadline::new(state.limits.hello + state.limits.send));
+        let tls = tls.clone();
+        acceptor.serve(slot, async move { Stream::accept(stream, tls.as_deref(), hello).await });
+    }
+}
+
+/// Serves connections, whatever carries their bytes.
+pub(crate) struct Acceptor {
+    state: Arc<ServerState>,
+    newcomers: Arc<Newcomers>,
+    app: Router,
+}
+
+impl Acceptor {
+    pub(crate) fn new(state: Arc<ServerState>) -> Self {
+        let newcomers = Newcomers::new(state.limits.connections + limits::SPARE_CONNECTIONS);
+        let app = routes::router(state.clone());
+        Self { state, newcomers, app }
+    }
+
+    /// A slot for a connection from an address.
+    pub(crate) async fn admit(&self, address: IpAddr) -> ConnectionSlot {
+        self.newcomers.admit(address).await
+    }
+
+    /// Serves a connection until it ends or becomes a WebSocket.
+    pub(crate) fn serve(
+        &self,
+        slot: ConnectionSlot,
+        stream: impl Future<Output = Option<Stream>> + Send + 'static,
+    ) -> JoinHandle<()> {
+        let state = self.state.clone();
+        let hello = state.limits.hello;
+        let deadline = Arc::new(IdleDeadline::new(hello + state.limits.send));
         // A WebSocket outlives its HTTP request, and keeps the slot that came with it.
         let slot = Arc::new(slot);
-        let app = app
+        let app = self
+            .app
             .clone()
             .layer(axum::Extension(slot.clone()))
             .layer(axum::Extension(deadline.clone()));
-        let state = state.clone();
-        let tls = tls.clone();
-        let connection = {
-            let hello = state.limits.hello;
-            async move {
-                let Some(stream) = Stream::accept(stream, tls.as_deref(), hello).await else {
-                    return;
-                };
-                // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
-                let _ = http1::Builder::new()
-                    .timer(TokioTimer::new())
-                    .header_read_timeout(hello)
-                    .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
-                    .with_upgrades()
-                    .await;
-            }
+        let connection = async move {
+            let Some(stream) = stream.await else { return };
+            // Errors are caused by the client, which disconnected or sent no HTTP, and are not logged.
+            let _ = http1::Builder::new()
+                .timer(TokioTimer::new())
+                .header_read_timeout(hello)
+                .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
+                .with_upgrades()
+                .await;
         };
         tokio::spawn(async move {
             tokio::select! {
@@ -70,7 +99,7 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
                 () = slot.closed() => {}
                 () = state.stopped() => {}
             }
-        });
+        })
     }
 }
 

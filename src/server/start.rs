@@ -20,7 +20,7 @@ use crate::metrics::Metrics;
 use crate::open_pushes::OpenPushes;
 use crate::sessions::SessionRegistry;
 use crate::shutdown::Running;
-use crate::spool::Spool;
+use crate::spool::{Spool, SpoolMedium};
 use crate::state::ServerState;
 use crate::tickets::Tickets;
 use crate::tls::{Tls, TlsError};
@@ -125,7 +125,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     // Uploads. Agents can drive without them.
     let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
     let own_bytes = tokens.as_ref().map(Tokens::upload_bytes).unwrap_or_default();
-    let spool = Spool::open(&uploads, limits.spool, uploaders, own_bytes);
+    let spool = Spool::open(SpoolMedium::directory(&uploads), limits.spool, uploaders, own_bytes);
     let spool = spool.map(Arc::new).map_err(|error| {
         let reason = format!("{}: {error}", uploads.display());
         tracing::warn!("uploads are refused: {reason}");

@@ -7,7 +7,7 @@ use wildcity_protocol::http;
 use wildcity_push::{AssetRequest, AssetSettings, limits};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{ActorBox, ActorClass};
-use wildcity_twin::store::{StoredActor, StoredLevel};
+use wildcity_twin::store::{ActorList, DamagedActor, StoredActor, StoredLevel};
 
 use super::http::{parse_field, requested_files};
 use super::mistake::read_body;
@@ -36,10 +36,18 @@ pub(crate) fn new_actor(body: &[u8]) -> Result<AssetRequest, Fault> {
     Ok(request)
 }
 
-/// All assets.
-pub(crate) fn actors(actors: &[StoredActor], with_provenance: bool) -> Value {
-    let actors: Vec<Value> = actors.iter().map(|one| actor(one, with_provenance)).collect();
-    json!({ "actors": actors })
+/// The body of `GET /v1/actors`.
+pub(crate) fn actors(list: &ActorList, with_provenance: bool) -> Value {
+    let actors: Vec<Value> = list.actors.iter().map(|one| actor(one, with_provenance)).collect();
+    if list.damaged.is_empty() {
+        return json!({ "actors": actors });
+    }
+    let damaged = |DamagedActor { hash, name, reason }: &DamagedActor| match name {
+        Some(name) => json!({ "hash": hash, "name": name, "reason": reason }),
+        None => json!({ "hash": hash, "reason": reason }),
+    };
+    let damaged: Vec<Value> = list.damaged.iter().map(damaged).collect();
+    json!({ "actors": actors, "damaged": damaged })
 }
 
 /// An asset. Its provenance may name a twin.

@@ -236,7 +236,10 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::StorageFull { .. } => plain(Code::StorageFull),
         Fault::OutOfRange { field, .. } => at(Code::OutOfRange, field),
         Fault::Audit { cause, .. } if is_full(cause) => plain(Code::StorageFull),
-        Fault::Audit { .. } | Fault::Spool { .. } | Fault::Internal(_) => plain(Code::Internal),
+        Fault::Audit { .. }
+        | Fault::SpoolRead { .. }
+        | Fault::SpoolWrite { .. }
+        | Fault::Internal(_) => plain(Code::Internal),
         Fault::Session(error) => of_session(error),
         Fault::Push(error) => of_push(error),
     }
@@ -320,6 +323,7 @@ fn of_store(error: &StoreError) -> WireFault {
         StoreError::Name { .. } => at(Code::InvalidName, "twin"),
         StoreError::NoTwin { .. } => at(Code::UnknownTwin, "twin"),
         StoreError::NoActor { .. } => at(Code::UnknownActor, "actor"),
+        StoreError::ActorDamaged { .. } => at(Code::TwinDamaged, "actor"),
         StoreError::ActorExists { .. } => at(Code::Conflict, "name"),
         StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. } => {
             at(Code::UnknownVersion, "version")

@@ -94,8 +94,8 @@ fn record_of(state: &ServerState, grant: &Grant, name: &str) -> Result<PathBuf, 
         return Err(unknown());
     }
     let path = state.episodes.join(format!("{name}.jsonl"));
-    let file = EpisodeFile::read(&path).map_err(|_| unknown())?;
-    grant.require_twin(&file.header.twin)?;
+    let header = EpisodeFile::header(&path).map_err(|_| unknown())?;
+    grant.require_twin(&header.twin)?;
     Ok(path)
 }
 

@@ -10,7 +10,7 @@ use axum::{Extension, Json};
 use wildcity_push::PushError;
 use wildcity_twin::store::StoreError;
 
-use crate::audit::{Change, Ended, Target};
+use crate::audit::{Change, Made, Target};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
@@ -119,9 +119,8 @@ pub(super) async fn edit(
         let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
         let edited =
             wildcity_push::publish_edit(&state.engine, &state.pushes, request, &viewpoints).await;
-        let reason = edited.as_ref().err().map(ToString::to_string).unwrap_or_default();
-        let ended = edited.as_ref().map(|version| Ended::Version(version.number));
-        state.audit.end(&grant, &change, ended.unwrap_or(Ended::Not(&reason)));
+        let made = edited.as_ref().map(|version| Made::Version(version.number));
+        state.audit.end(&grant, &change, made);
         Ok::<_, Fault>(edited?)
     });
     let edited = edited.await.map_err(|_| PushError::Crashed)?;
@@ -143,9 +142,8 @@ pub(super) async fn rollback(
         let change = Change { what: "rollback", target: Target::Twin(&name), id: None };
         state.audit.begin(&grant, &change)?;
         let rolled_back = engine.catalog().rollback(&name, number);
-        let reason = rolled_back.as_ref().err().map(ToString::to_string).unwrap_or_default();
-        let ended = rolled_back.as_ref().map(|version| Ended::Version(version.number));
-        state.audit.end(&grant, &change, ended.unwrap_or(Ended::Not(&reason)));
+        let made = rolled_back.as_ref().map(|version| Made::Version(version.number));
+        state.audit.end(&grant, &change, made);
         let version = rolled_back?;
         // A push that is still loading its version has pinned the one before; move that pin, so that
         // the rollback becomes the latest at once.

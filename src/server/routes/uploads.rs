@@ -60,9 +60,9 @@ pub(super) async fn delete(
     Path(id): Path<String>,
 ) -> HttpResult {
     grant.require(Role::Push)?;
-    let upload = state.spool()?.get(&grant.name, &id)?;
-    let writer = upload.write().await?;
     let spool = state.spool()?.clone();
+    let upload = spool.get(&grant.name, &id)?;
+    let writer = spool.write(&upload).await?;
     blocking(move || {
         spool.remove(&upload);
         drop(writer);
@@ -93,7 +93,7 @@ pub(super) async fn append(
         false => 0,
     };
     let announced_sha256 = sha256_of_content(&headers)?;
-    let writer = upload.write().await?;
+    let writer = spool.write(&upload).await?;
     let held = upload.offset();
     if start != held {
         return Err(Fault::UploadOffset { given: start, held }.into());
@@ -208,11 +208,14 @@ fn check_content_digest(
 
 /// After the last byte of the upload: checks the whole file, and removes it if it does not match its
 /// digest.
-fn finish(spool: &Spool, upload: Arc<Upload>, writer: Writer) -> Result<Arc<Upload>, Fault> {
+fn finish(spool: &Spool, upload: Arc<Upload>, mut writer: Writer) -> Result<Arc<Upload>, Fault> {
     if upload.offset() == upload.announced().size
         && let Err(fault) = writer.finish()
     {
-        spool.remove(&upload);
+        // What the disk only fails to read is kept: a request without bytes checks it again.
+        if !matches!(fault, Fault::SpoolRead { .. }) {
+            spool.remove(&upload);
+        }
         return Err(fault);
     }
     Ok(upload)

@@ -1,8 +1,6 @@
 //! Digests of uploads.
 
-use std::fs::File;
-use std::io;
-use std::path::Path;
+use std::io::{self, ErrorKind, Read};
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
@@ -33,21 +31,28 @@ impl Digest {
         format!("{algorithm}:{hex}").try_into().ok()
     }
 
-    /// The digest of a file, with the algorithm of this one.
-    pub(super) fn of_same_kind(&self, path: &Path) -> io::Result<Self> {
-        let mut file = File::open(path)?;
+    /// The digest of the content of a file of `size` bytes, with the algorithm of this one.
+    ///
+    /// # Errors
+    /// The file cannot be read, or ends early ([`ErrorKind::UnexpectedEof`]).
+    pub(super) fn of_same_kind(&self, mut file: impl Read, size: u64) -> io::Result<Self> {
+        let bytes;
         let hash = match self.algorithm {
             Algorithm::Blake3 => {
                 let mut hasher = blake3::Hasher::new();
-                io::copy(&mut file, &mut hasher)?;
+                bytes = io::copy(&mut file, &mut hasher)?;
                 *hasher.finalize().as_bytes()
             }
             Algorithm::Sha256 => {
                 let mut hasher = Sha256::new();
-                io::copy(&mut file, &mut hasher)?;
+                bytes = io::copy(&mut file, &mut hasher)?;
                 hasher.finalize().into()
             }
         };
+        if bytes < size {
+            let reason = format!("the file ended after {bytes} of {size} bytes");
+            return Err(io::Error::new(ErrorKind::UnexpectedEof, reason));
+        }
         Ok(Self { algorithm: self.algorithm, hash })
     }
 }

@@ -10,7 +10,8 @@
 //!
 //! **The id is the digest**: the same content is the same upload. So an upload needs no state but its
 //! bytes: announcing it again finds it, whatever happened to the server or the client. An incomplete upload
-//! survives a restart, and can be continued.
+//! survives a restart, and can be continued. A complete one survives a power cut, too; an incomplete one may lose its
+//! last bytes.
 //!
 //! **An upload belongs to the token that announced it.** Another token cannot see, continue, remove or push it, and has
 //! an upload of its own for the same content. The stem of its files is the id, followed by a hash of the token's name.
@@ -22,13 +23,16 @@ mod quota;
 mod upload;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use parking_lot::Mutex;
+
+use wildcity_twin::store::clock::{Clock, SystemClock};
+use wildcity_twin::store::disk::{Disk, Lock, Wait};
+use wildcity_twin::store::{RealDisk, create_dirs};
 
 use crate::config::SpoolLimits;
 use crate::fault::Fault;
@@ -37,16 +41,24 @@ pub(crate) use upload::{Announced, Upload, Writer};
 
 use digest::Digest;
 use quota::Quota;
-use upload::RemovedFiles;
+use upload::{RemovedFiles, remove_file};
 
 /// The uploads of a server.
 pub(crate) struct Spool {
-    dir: PathBuf,
+    medium: SpoolMedium,
     limits: SpoolLimits,
     quota: Quota,
     /// By the stem of their files.
     uploads: Mutex<Uploads>,
-    _lock: File,
+    _lock: Lock,
+}
+
+/// Where uploads are kept, and the time.
+#[derive(Clone, Debug)]
+pub(crate) struct SpoolMedium {
+    pub(crate) dir: PathBuf,
+    pub(crate) disk: Arc<dyn Disk>,
+    pub(crate) clock: Arc<dyn Clock>,
 }
 
 type Uploads = BTreeMap<String, Arc<Upload>>;
@@ -60,25 +72,29 @@ pub(crate) struct SpoolUsage {
     pub(crate) bytes: u64,
 }
 
+impl SpoolMedium {
+    /// A directory of this machine.
+    pub(crate) fn directory(dir: &Path) -> Self {
+        Self { dir: dir.to_owned(), disk: Arc::new(RealDisk), clock: Arc::new(SystemClock) }
+    }
+}
+
 impl Spool {
     /// Opens a directory for one server, with the uploads that an earlier server left there. `tokens` is the number
     /// of tokens that may upload, and `own_bytes` the bytes of those with a limit of their own, by name.
     pub(crate) fn open(
-        dir: &Path,
+        medium: SpoolMedium,
         limits: SpoolLimits,
         tokens: usize,
         own_bytes: BTreeMap<String, u64>,
     ) -> io::Result<Self> {
-        fs::create_dir_all(dir)?;
-        let lock = OpenOptions::new().create(true).append(true).open(dir.join("lock"))?;
-        lock.try_lock().map_err(|error| match error {
-            fs::TryLockError::Error(error) => error,
-            fs::TryLockError::WouldBlock => {
-                io::Error::other("another server uses it: give one of them another --uploads DIR")
-            }
+        create_dirs(&*medium.disk, &medium.dir).map_err(io::Error::other)?;
+        let lock = medium.disk.lock(&medium.dir.join("lock"), Wait::No)?;
+        let lock = lock.ok_or_else(|| {
+            io::Error::other("another server uses it: give one of them another --uploads DIR")
         })?;
         let spool = Self {
-            dir: dir.to_owned(),
+            medium,
             limits,
             quota: Quota::new(limits, tokens, own_bytes),
             uploads: Mutex::default(),
@@ -88,7 +104,8 @@ impl Spool {
         Ok(spool)
     }
 
-    /// The upload of a file by a token, which is begun if it is new. Old uploads are removed to make room for it.
+    /// The upload of a file by a token, which is begun if it is new. Old uploads are removed to make room for it. One
+    /// that an earlier server left, and that could not be read when this one started, is continued.
     ///
     /// # Errors
     /// The upload is too large, there is no room, the disk fails, or the token has all of that content, of another
@@ -99,11 +116,15 @@ impl Spool {
                 format!("{}; at most {} are accepted", announced.size, self.limits.upload_bytes);
             return Err(Fault::OutOfRange { field: "size".to_owned(), must });
         }
-        let upload = Arc::new(Upload::new(&self.dir, owner, announced));
+        let upload = Arc::new(Upload::new(&self.medium, owner, announced));
         let stem = upload.stem().to_owned();
         // Declared before the lock, so that files are deleted after the lock is released.
         let mut removed = Vec::new();
         let mut uploads = self.uploads.lock();
+        if !uploads.contains_key(&stem) {
+            let found = self.find(&stem).map_err(|cause| Fault::SpoolRead { cause })?;
+            uploads.extend(found.map(|found| (stem.clone(), found)));
+        }
         if let Some(known) = uploads.get(&stem) {
             let size = upload.announced().size;
             let known_size = known.announced().size;
@@ -149,9 +170,26 @@ impl Spool {
         self.uploads.lock().get(&upload::stem(owner, id)).cloned().ok_or_else(unknown)
     }
 
-    /// Removes an upload.
+    /// Takes an upload over, as [`Upload::write`].
+    ///
+    /// # Errors
+    /// [`Fault::Busy`]; [`Fault::UnknownUpload`] if it was removed meanwhile.
+    pub(crate) async fn write(&self, upload: &Arc<Upload>) -> Result<Writer, Fault> {
+        let writer = upload.write().await?;
+        // The files of its stem may be those of a newer upload.
+        if !is_own(&self.uploads.lock(), upload) {
+            return Err(Fault::UnknownUpload { id: upload.id().to_owned(), field: None });
+        }
+        Ok(writer)
+    }
+
+    /// Removes an upload, unless it was removed before. The caller has its [`Writer`], so that no one writes to files
+    /// that a newer upload has.
     pub(crate) fn remove(&self, upload: &Upload) {
         let mut uploads = self.uploads.lock();
+        if !is_own(&uploads, upload) {
+            return;
+        }
         uploads.remove(upload.stem());
         // Under the lock: an upload of the same id may begin right after.
         let removed = upload.set_aside();
@@ -161,9 +199,10 @@ impl Spool {
 
     /// Removes uploads that are too old and not in use.
     pub(crate) fn remove_old(&self) {
+        let now_us = self.medium.clock.now_us();
         let is_old = |upload: &Arc<Upload>| {
-            let age = upload.used().elapsed().unwrap_or_default();
-            age >= self.limits.age && Arc::strong_count(upload) == 1
+            let age_us = u64::try_from(now_us - upload.used_us()).unwrap_or_default();
+            Duration::from_micros(age_us) >= self.limits.age && Arc::strong_count(upload) == 1
         };
         // Declared before the lock, so that files are deleted after the lock is released.
         let mut removed = Vec::new();
@@ -187,13 +226,10 @@ impl Spool {
         quota::usage(uploads.values())
     }
 
-    /// Reads the directory. Files of uploads that cannot be continued are removed; files of other names
-    /// are left alone.
+    /// Reads the directory. Files of uploads that cannot be continued are removed; files of other names, and files that
+    /// cannot be read now, are left alone.
     fn recover(&self) -> io::Result<()> {
-        let mut names = Vec::new();
-        for entry in fs::read_dir(&self.dir)? {
-            names.extend(entry?.file_name().into_string());
-        }
+        let names = self.medium.disk.list(&self.medium.dir)?;
         let upload_stem = |name: &String| {
             let (stem, kind) = name.split_once('.')?;
             let is_known = ["json", "part", "data", "gone"].contains(&kind);
@@ -204,13 +240,105 @@ impl Spool {
         let stems: BTreeSet<String> = names.iter().filter_map(upload_stem).collect();
         let mut uploads = self.uploads.lock();
         for stem in stems {
-            match Upload::found(&self.dir, &stem) {
-                Some(upload) => {
-                    uploads.insert(stem, Arc::new(upload));
+            match self.find(&stem) {
+                Ok(Some(upload)) => {
+                    uploads.insert(stem, upload);
                 }
-                None => drop(RemovedFiles::of(&self.dir, &stem)),
+                Ok(None) => drop(RemovedFiles::of(&self.medium, &stem)),
+                Err(error) => tracing::warn!("cannot read the upload {stem}: {error}"),
             }
         }
-        Ok(())
+        // An earlier process may have ended after it renamed a complete upload, and before this.
+        self.medium.disk.sync_dir(&self.medium.dir)
+    }
+
+    /// The upload of these files that an earlier server left, if they are valid.
+    fn find(&self, stem: &str) -> io::Result<Option<Arc<Upload>>> {
+        let Some(upload) = Upload::found(&self.medium, stem)? else { return Ok(None) };
+        // The process may have ended before it deleted these.
+        remove_file(&self.medium, stem, "gone");
+        if upload.is_complete() {
+            remove_file(&self.medium, stem, "part");
+        }
+        Ok(Some(Arc::new(upload)))
+    }
+}
+
+/// Whether an upload is the spool's, and not one that was removed: a newer one may have its stem.
+fn is_own(uploads: &Uploads, upload: &Upload) -> bool {
+    uploads.get(upload.stem()).is_some_and(|known| std::ptr::eq(&**known, upload))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open(dir: &Path) -> Spool {
+        let medium = SpoolMedium::directory(dir);
+        Spool::open(medium, SpoolLimits::default(), 1, BTreeMap::new()).unwrap()
+    }
+
+    /// An upload of 7 bytes.
+    fn announced() -> Announced {
+        let digest = format!("blake3:{}", blake3::hash(b"content").to_hex());
+        Announced { name: "a".to_owned(), size: 7, digest: digest.try_into().unwrap() }
+    }
+
+    /// A server may be killed after it renamed the files of an upload, when the same content was announced again.
+    #[test]
+    fn what_a_killed_server_was_deleting_is_deleted_at_the_next_start() {
+        let dir = tempfile::tempdir().unwrap();
+        let stem = open(dir.path()).begin("", announced()).unwrap().stem().to_owned();
+        let gone = dir.path().join(format!("{stem}.gone"));
+        std::fs::write(&gone, b"cont").unwrap();
+        let spool = open(dir.path());
+        assert!(!gone.exists());
+        assert_eq!(spool.usage().uploads, 1);
+    }
+
+    #[test]
+    fn an_announcement_keeps_the_bytes_of_an_upload_that_could_not_be_read_at_the_start() {
+        let dir = tempfile::tempdir().unwrap();
+        let stem = open(dir.path()).begin("", announced()).unwrap().stem().to_owned();
+        let file = |kind: &str| dir.path().join(format!("{stem}.{kind}"));
+        std::fs::write(file("part"), b"cont").unwrap();
+        let announcement = std::fs::read_to_string(file("json")).unwrap();
+        // Longer than an announcement can be.
+        std::fs::write(file("json"), format!("{announcement:20000}")).unwrap();
+        let spool = open(dir.path());
+        assert_eq!(spool.usage().uploads, 0);
+        let refused = spool.begin("", announced());
+        assert!(matches!(refused, Err(Fault::SpoolRead { .. })), "{refused:?}");
+        std::fs::write(file("json"), &announcement).unwrap();
+        assert_eq!(spool.begin("", announced()).unwrap().offset(), 4);
+        assert_eq!(std::fs::read(file("part")).unwrap(), b"cont");
+    }
+
+    #[tokio::test]
+    async fn nothing_is_appended_to_a_file_that_has_lost_bytes() {
+        let dir = tempfile::tempdir().unwrap();
+        let spool = open(dir.path());
+        let upload = spool.begin("", announced()).unwrap();
+        let part = dir.path().join(format!("{}.part", upload.stem()));
+        let mut writer = spool.write(&upload).await.unwrap();
+        writer.append(b"cont").unwrap();
+        std::fs::write(&part, b"co").unwrap();
+        let refused = writer.append(b"ent");
+        assert!(matches!(refused, Err(Fault::SpoolWrite { .. })), "{refused:?}");
+        assert_eq!(std::fs::read(&part).unwrap(), b"co");
+    }
+
+    #[tokio::test]
+    async fn a_request_for_a_removed_upload_leaves_the_newer_one_of_its_stem_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        let spool = open(dir.path());
+        let old = spool.begin("", announced()).unwrap();
+        spool.remove(&old);
+        let new = spool.begin("", announced()).unwrap();
+        spool.remove(&old);
+        assert_eq!(spool.usage().uploads, 1);
+        let refused = spool.write(&old).await.map(drop);
+        assert!(matches!(refused, Err(Fault::UnknownUpload { .. })), "{refused:?}");
+        assert!(spool.write(&new).await.is_ok());
     }
 }

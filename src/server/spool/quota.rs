@@ -109,7 +109,7 @@ impl Quota {
             };
             let first = others()
                 .filter(is_removable)
-                .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used()));
+                .min_by_key(|known| (known.owner() != owner, known.offset() > 0, known.used_us()));
             let Some(stem) = first.map(|known| known.stem().to_owned()) else {
                 let (whose, kept, most) = match is_own_full {
                     true => ("this token keeps", own, token),

@@ -1,20 +1,21 @@
 //! One upload on disk.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write as _};
+use std::io::{self, ErrorKind, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+use std::sync::atomic::{AtomicI64, AtomicU64, Ordering};
+use std::time::Duration;
 
-use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{Mutex as AsyncMutex, Notify, OwnedMutexGuard};
 use tokio::time::timeout;
 
+use wildcity_twin::store::disk::{FileInfo, WriteFile};
+
 use crate::fault::{Fault, is_full};
 use crate::limits;
 
+use super::SpoolMedium;
 use super::digest::Digest;
 
 /// Value of [`Upload::held`] for an upload after its digest was checked.
@@ -28,13 +29,13 @@ pub(crate) struct Upload {
     /// Name of the token that announced it; empty on a server without tokens.
     owner: String,
     announced: Announced,
-    dir: PathBuf,
+    medium: SpoolMedium,
     /// Bytes on disk; [`COMPLETE`] once they are checked.
     held: AtomicU64,
-    /// When the last byte arrived, or the upload was last announced.
-    used: Mutex<SystemTime>,
-    /// When the last byte arrived, or the upload was begun or found.
-    active: Mutex<Instant>,
+    /// When the last byte arrived, or the upload was last announced, in microseconds since 1970.
+    used_us: AtomicI64,
+    /// When the last byte arrived, or the upload was begun or found, by the clock that never jumps.
+    active_us: AtomicI64,
     writing: Arc<AsyncMutex<()>>,
     /// Asks the connection that writes to release the upload to another one.
     release: Notify,
@@ -68,42 +69,52 @@ pub(super) fn stem(owner: &str, id: &str) -> String {
 
 impl Upload {
     /// A new upload of a token in a directory, without its files.
-    pub(super) fn new(dir: &Path, owner: &str, announced: Announced) -> Self {
-        Self::with(dir, owner.to_owned(), announced, 0, SystemTime::now())
+    pub(super) fn new(medium: &SpoolMedium, owner: &str, announced: Announced) -> Self {
+        Self::with(medium, owner.to_owned(), announced, 0, medium.clock.now_us())
     }
 
     /// The upload of these files that an earlier server left in the directory, if they are valid.
-    pub(super) fn found(dir: &Path, stem: &str) -> Option<Self> {
-        let path = |kind: &str| dir.join(format!("{stem}.{kind}"));
-        let metadata = |kind: &str| fs::metadata(path(kind)).ok();
-        let text = fs::read(path("json")).ok()?;
-        let AnnouncedBy { announced, owner } = serde_json::from_slice(&text).ok()?;
+    ///
+    /// # Errors
+    /// They cannot be read now.
+    pub(super) fn found(medium: &SpoolMedium, stem: &str) -> io::Result<Option<Self>> {
+        let file = |kind: &str| found_file(medium.disk.info(&path(medium, stem, kind)));
+        let data = file("data")?;
+        let part = file("part")?;
+        let Some(AnnouncedBy { announced, owner }) = announcement(medium, stem)? else {
+            return Ok(None);
+        };
         if self::stem(&owner, &announced.digest.id()) != stem {
-            return None;
+            return Ok(None);
         }
         let size = announced.size;
-        let data = metadata("data").filter(|data| data.len() == size);
-        let part = metadata("part").filter(|part| part.len() <= size);
+        let data = data.filter(|data| data.bytes == size);
+        let part = part.filter(|part| part.bytes <= size);
         let (held, file) = match (data, part) {
             (Some(data), _) => (COMPLETE, data),
-            (None, Some(part)) => (part.len(), part),
-            (None, None) => return None,
+            (None, Some(part)) => (part.bytes, part),
+            (None, None) => return Ok(None),
         };
-        let used = file.modified().unwrap_or_else(|_| SystemTime::now());
-        Some(Self::with(dir, owner, announced, held, used))
+        Ok(Some(Self::with(medium, owner, announced, held, file.modified_us)))
     }
 
-    fn with(dir: &Path, owner: String, announced: Announced, held: u64, used: SystemTime) -> Self {
+    fn with(
+        medium: &SpoolMedium,
+        owner: String,
+        announced: Announced,
+        held: u64,
+        used_us: i64,
+    ) -> Self {
         let id = announced.digest.id();
         Self {
             stem: stem(&owner, &id),
             id,
             owner,
             announced,
-            dir: dir.to_owned(),
+            medium: medium.clone(),
             held: held.into(),
-            used: Mutex::new(used),
-            active: Mutex::new(Instant::now()),
+            used_us: used_us.into(),
+            active_us: medium.clock.monotonic_us().into(),
             writing: Arc::default(),
             release: Notify::new(),
         }
@@ -164,26 +175,42 @@ impl Upload {
         let create = || {
             let announced = self.announced.clone();
             let announced = AnnouncedBy { announced, owner: self.owner.clone() };
-            fs::write(self.file("json"), serde_json::to_vec(&announced)?)?;
-            File::create(self.file("part"))
+            let mut file = self.medium.disk.create(&self.file("json"))?;
+            file.write_all(&serde_json::to_vec(&announced)?)?;
+            self.medium.disk.create(&self.file("part"))
         };
-        create().map_err(|cause| io_fault("write to", cause))?;
+        create().map_err(write_fault)?;
         if self.announced.size == 0 { self.finish() } else { Ok(()) }
     }
 
-    /// Checks the bytes that arrived against the digest. The caller removes an upload that does not match.
+    /// Checks the bytes that arrived against the digest, and makes the upload durable. The bytes are durable already.
+    ///
+    /// # Errors
+    /// [`Fault::SpoolRead`]: the disk fails, and the upload stays as it is. After others, the caller removes it.
     fn finish(&self) -> Result<(), Fault> {
+        let disk = &*self.medium.disk;
         let part = self.file("part");
-        let found = self.announced.digest.of_same_kind(&part);
-        let found = found.map_err(|cause| io_fault("read", cause))?;
-        if found != self.announced.digest {
-            return Err(Fault::UploadDigest {
-                what: "the digest of what arrived",
-                promised: String::from(self.announced.digest.clone()),
-                found: found.into(),
-            });
+        let Announced { size, digest, .. } = &self.announced;
+        let read = || {
+            let found = disk.open(&part).and_then(|file| digest.of_same_kind(file, *size));
+            found.map_err(|cause| Fault::SpoolRead { cause })
+        };
+        // The upload is lost if its bytes are wrong, but not if they were only read wrong.
+        if read()? != *digest {
+            let found = read()?;
+            if found != *digest {
+                return Err(Fault::UploadDigest {
+                    what: "the digest of what arrived",
+                    promised: String::from(digest.clone()),
+                    found: found.into(),
+                });
+            }
         }
-        fs::rename(part, self.file("data")).map_err(|cause| io_fault("write to", cause))?;
+        disk.append(&self.file("json"))
+            .and_then(|mut announcement| announcement.sync())
+            .and_then(|()| disk.rename(&part, &self.file("data")))
+            .and_then(|()| disk.sync_dir(&self.medium.dir))
+            .map_err(write_fault)?;
         self.held.store(COMPLETE, Ordering::Release);
         Ok(())
     }
@@ -191,26 +218,28 @@ impl Upload {
     /// Renames the files, so that a new upload can have the same id at once. They are deleted when the
     /// result is dropped.
     pub(super) fn set_aside(&self) -> RemovedFiles {
-        RemovedFiles::of(&self.dir, &self.stem)
+        RemovedFiles::of(&self.medium, &self.stem)
     }
 
     /// Notes that the upload is used now.
     pub(super) fn touch(&self) {
-        *self.used.lock() = SystemTime::now();
+        self.used_us.store(self.medium.clock.now_us(), Ordering::Relaxed);
     }
 
     /// Time since the last byte arrived, or the upload was begun or found.
     pub(super) fn idle(&self) -> Duration {
-        self.active.lock().elapsed()
+        let active_us = self.active_us.load(Ordering::Relaxed);
+        let idle_us = self.medium.clock.monotonic_us() - active_us;
+        Duration::from_micros(u64::try_from(idle_us).unwrap_or_default())
     }
 
-    /// When the upload was last used.
-    pub(super) fn used(&self) -> SystemTime {
-        *self.used.lock()
+    /// When the upload was last used, in microseconds since 1970.
+    pub(super) fn used_us(&self) -> i64 {
+        self.used_us.load(Ordering::Relaxed)
     }
 
     fn file(&self, kind: &str) -> PathBuf {
-        self.dir.join(format!("{}.{kind}", self.stem))
+        path(&self.medium, &self.stem, kind)
     }
 }
 
@@ -218,7 +247,7 @@ impl Upload {
 pub(crate) struct Writer {
     upload: Arc<Upload>,
     _lock: OwnedMutexGuard<()>,
-    file: Option<File>,
+    file: Option<Box<dyn WriteFile>>,
 }
 
 impl Writer {
@@ -226,84 +255,129 @@ impl Writer {
     pub(crate) fn append(&mut self, bytes: &[u8]) -> Result<(), Fault> {
         let start = self.upload.offset();
         let written = self.file().and_then(|file| {
-            file.set_len(start)?;
+            file.truncate(start)?;
             file.write_all(bytes)
         });
         match written {
             Ok(()) => {
                 self.upload.held.store(start + bytes.len() as u64, Ordering::Release);
                 self.upload.touch();
-                *self.upload.active.lock() = Instant::now();
+                let now_us = self.upload.medium.clock.monotonic_us();
+                self.upload.active_us.store(now_us, Ordering::Relaxed);
                 Ok(())
             }
             Err(cause) => {
                 // The first error is the one to report; an error of this clean-up would only hide it.
-                let _ = self.file().and_then(|file| file.set_len(start));
-                Err(io_fault("write to", cause))
+                let _ = self.file().and_then(|file| file.truncate(start));
+                Err(write_fault(cause))
             }
         }
     }
 
     /// Discards all bytes from an offset on.
     pub(crate) fn truncate(&mut self, offset: u64) -> Result<(), Fault> {
-        let truncated = self.file().and_then(|file| file.set_len(offset));
-        truncated.map_err(|cause| io_fault("write to", cause))?;
+        let truncated = self.file().and_then(|file| file.truncate(offset));
+        truncated.map_err(write_fault)?;
         self.upload.held.store(offset, Ordering::Release);
         Ok(())
     }
 
     /// After the last byte: syncs the file, and checks it against the digest.
-    pub(crate) fn finish(mut self) -> Result<(), Fault> {
-        let synced = self.file().and_then(|file| file.sync_all());
-        synced.map_err(|cause| io_fault("write to", cause))?;
+    pub(crate) fn finish(&mut self) -> Result<(), Fault> {
+        let synced = self.file().and_then(|file| file.sync());
+        synced.map_err(write_fault)?;
         self.upload.finish()
     }
 
-    fn file(&mut self) -> io::Result<&mut File> {
-        if self.file.is_none() {
-            let path = self.upload.file("part");
-            self.file = Some(OpenOptions::new().append(true).open(path)?);
-        }
-        self.file.as_mut().ok_or_else(|| io::ErrorKind::NotFound.into())
+    fn file(&mut self) -> io::Result<&mut dyn WriteFile> {
+        let file = match self.file.take() {
+            Some(file) => file,
+            None => self.upload.medium.disk.append(&self.upload.file("part"))?,
+        };
+        Ok(&mut **self.file.insert(file))
     }
 }
 
-fn io_fault(action: &'static str, cause: io::Error) -> Fault {
+fn write_fault(cause: io::Error) -> Fault {
     if is_full(&cause) {
         return Fault::StorageFull { reason: format!("{cause}") };
     }
-    Fault::Spool { action, cause }
+    Fault::SpoolWrite { cause }
 }
 
 /// The file of an upload that was removed. It is deleted when this is dropped, which takes a while for
 /// tens of GB: not under a lock.
 #[must_use]
-pub(super) struct RemovedFiles(PathBuf);
+pub(super) struct RemovedFiles {
+    medium: SpoolMedium,
+    stem: String,
+}
 
 impl RemovedFiles {
-    pub(super) fn of(dir: &Path, stem: &str) -> Self {
-        let path = |kind: &str| dir.join(format!("{stem}.{kind}"));
+    pub(super) fn of(medium: &SpoolMedium, stem: &str) -> Self {
+        let path = |kind: &str| path(medium, stem, kind);
         let gone = path("gone");
         // The announcement is removed last: if the process is killed before, the next start removes the rest.
         for kind in ["part", "data"] {
-            log_error(&path(kind), fs::rename(path(kind), &gone));
+            log_error(&path(kind), medium.disk.rename(&path(kind), &gone));
         }
-        log_error(&path("json"), fs::remove_file(path("json")));
-        Self(gone)
+        remove_file(medium, stem, "json");
+        Self { medium: medium.clone(), stem: stem.to_owned() }
     }
 }
 
 impl Drop for RemovedFiles {
     fn drop(&mut self) {
-        log_error(&self.0, fs::remove_file(&self.0));
+        remove_file(&self.medium, &self.stem, "gone");
     }
+}
+
+/// Path of one of an upload's files.
+fn path(medium: &SpoolMedium, stem: &str, kind: &str) -> PathBuf {
+    medium.dir.join(format!("{stem}.{kind}"))
+}
+
+/// Removes one of an upload's files, if it exists.
+pub(super) fn remove_file(medium: &SpoolMedium, stem: &str, kind: &str) {
+    let path = path(medium, stem, kind);
+    log_error(&path, medium.disk.remove_file(&path));
 }
 
 /// Logs that a file could not be removed, unless it did not exist.
 fn log_error(path: &Path, removed: io::Result<()>) {
     if let Err(error) = removed
-        && error.kind() != io::ErrorKind::NotFound
+        && error.kind() != ErrorKind::NotFound
     {
         tracing::warn!("cannot remove {}: {error}", path.display());
+    }
+}
+
+/// What an upload's announcement says; `None` if there is none, or no whole one.
+fn announcement(medium: &SpoolMedium, stem: &str) -> io::Result<Option<AnnouncedBy>> {
+    let mut text = Vec::new();
+    match medium.disk.open(&path(medium, stem, "json")) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+        file => {
+            let file = file?;
+            let size = file.size_bytes()?;
+            if size > limits::ANNOUNCEMENT_BYTES {
+                let most = limits::ANNOUNCEMENT_BYTES;
+                let reason = format!("{stem}.json has {size} bytes, not at most {most}: remove it");
+                return Err(io::Error::new(ErrorKind::InvalidData, reason));
+            }
+            file.take(size).read_to_end(&mut text)?;
+            if (text.len() as u64) < size {
+                return Err(ErrorKind::UnexpectedEof.into());
+            }
+        }
+    }
+    Ok(serde_json::from_slice(&text).ok())
+}
+
+/// A file, if it exists.
+fn found_file(found: io::Result<FileInfo>) -> io::Result<Option<FileInfo>> {
+    match found {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        found => found.map(|found| Some(found).filter(|found| found.is_file)),
     }
 }

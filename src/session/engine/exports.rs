@@ -5,13 +5,13 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use wildcity_episode::{EpisodeFile, export_file, mcap_of, record_bytes};
+use wildcity_episode::{EpisodeFile, export_file, mcap_of, record_bytes, remove_leftovers};
 
 use crate::error::SessionError;
 use crate::limits;
@@ -38,17 +38,24 @@ struct State {
 }
 
 impl Exports {
-    /// Starts the thread. It ends after the last export when this is dropped.
+    /// Starts the thread. It first removes from the directory of the records what killed exports left there, and ends
+    /// after the last export when this is dropped.
     ///
     /// # Errors
     /// [`SessionError::Thread`].
-    pub(crate) fn start() -> Result<Self, SessionError> {
+    pub(crate) fn start(episodes: PathBuf) -> Result<Self, SessionError> {
         let (records, to_export) = channel();
         let shared = Arc::new(Shared::default());
         let of_thread = shared.clone();
         std::thread::Builder::new()
             .name("export".to_owned())
-            .spawn(move || of_thread.run(&to_export))
+            .spawn(move || {
+                if let Err(error) = remove_leftovers(&episodes, SystemTime::now()) {
+                    let dir = episodes.display();
+                    tracing::warn!("{dir}: leftovers of exports were not removed: {error}");
+                }
+                of_thread.run(&to_export);
+            })
             .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
         Ok(Self { records, shared })
     }

@@ -87,7 +87,7 @@ impl Engine {
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
         let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs, mcap } =
             settings;
-        let exports = mcap.then(Exports::start).transpose()?;
+        let exports = mcap.then(|| Exports::start(episodes.clone())).transpose()?;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),

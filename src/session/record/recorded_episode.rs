@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
-use wildcity_episode::{ActorsLine, ScenarioLine};
+use wildcity_episode::{ActorsLine, ScenarioLine, check_no_mcap};
 use wildcity_scene::appearance::Overlay;
 
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
@@ -71,6 +71,9 @@ impl RecordedEpisode {
                 // The recorder was interrupted: the line is of an answer that was never sent.
                 Some(_) if header.is_some() => break,
                 Some(_) => return Err(wrong("incomplete: it has no line break".to_owned())),
+            }
+            if number == 1 {
+                check_no_mcap(path, &text)?;
             }
 
             // The first line is the header, and nothing follows the end.

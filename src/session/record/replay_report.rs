@@ -3,6 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
+use wildcity_episode::ReadError;
 use wildcity_render::RenderError;
 use wildcity_repair::RepairError;
 use wildcity_scene::rig::{RigCamera, RigError};
@@ -118,6 +119,9 @@ pub enum ReplayError {
         /// What the operating system says.
         cause: io::Error,
     },
+    /// The file is no record.
+    #[error(transparent)]
+    NoRecord(#[from] ReadError),
     /// A line is damaged, incomplete or out of place.
     #[error("{}, line {line}: {reason}", path.display())]
     Line {

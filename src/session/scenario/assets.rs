@@ -20,11 +20,14 @@ pub(crate) struct FrameDetail<'a> {
     pub(crate) profile: &'a RenderProfile,
 }
 
-/// What a scenario needs to know about an asset, by its hash or its name; `None` unless there is exactly one.
-pub fn asset_info(catalog: &Catalog, name: &str) -> Option<AssetInfo> {
-    let actor = catalog.find_actor(name).ok()?;
+/// What a scenario needs to know about an asset, by its hash or its name.
+///
+/// # Errors
+/// There is none, or more than one, or it is damaged.
+pub fn asset_info(catalog: &Catalog, name: &str) -> Result<AssetInfo, String> {
+    let actor = catalog.find_actor(name).map_err(|error| error.to_string())?;
     let description = actor.description;
-    Some(AssetInfo { hash: actor.hash, class: description.class, box_: description.box_ })
+    Ok(AssetInfo { hash: actor.hash, class: description.class, box_: description.box_ })
 }
 
 impl ActorAssets {

@@ -163,7 +163,7 @@ impl Scenarios {
         seed: u64,
         (manifest, version_hash): (&Manifest, &str),
         latest: bool,
-        asset: &dyn Fn(&str) -> Option<AssetInfo>,
+        asset: &dyn Fn(&str) -> Result<AssetInfo, String>,
     ) -> Result<LoadedScenario, ScenarioError> {
         if file.twin.name != manifest.twin {
             return Err(ScenarioError::Twin {
@@ -216,7 +216,7 @@ impl Scenarios {
         values: &BTreeMap<String, Value>,
         seed: u64,
         version: (&Manifest, &str),
-        asset: &dyn Fn(&str) -> Option<AssetInfo>,
+        asset: &dyn Fn(&str) -> Result<AssetInfo, String>,
     ) -> Result<LoadedScenario, ScenarioError> {
         let document = self.document(source)?;
         let mut chosen = document.first_values();

@@ -68,7 +68,7 @@ impl SessionScenario {
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
         // Many actors have the same asset.
-        let known: RefCell<BTreeMap<String, Option<AssetInfo>>> = RefCell::default();
+        let known: RefCell<BTreeMap<String, Result<AssetInfo, String>>> = RefCell::default();
         let asset = |name: &str| {
             let mut known = known.borrow_mut();
             let found = known.entry(name.to_owned());
