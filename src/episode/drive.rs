@@ -10,7 +10,7 @@ use wildcity_score::{
     StaticContact, Track, TrackSample,
 };
 use wildcity_sim::contact::Body;
-use wildcity_sim::ego::EgoModel;
+use wildcity_sim::ego::{EgoModel, TimedPose};
 
 use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, Event, ScenarioLine};
@@ -123,8 +123,9 @@ fn plans(frames: &[&Frame]) -> Vec<Plan> {
     let of_pair = |pair: &[&Frame]| {
         let decided_us = pair[0].time_us - begin_us;
         let world_from_start = pair[0].poses.last()?;
-        let own = std::iter::once((0, Pose::IDENTITY)).chain(pair[1].plan()?);
-        let poses = own.map(|(time_us, start_from_rig)| {
+        let now = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
+        let own = std::iter::once(now).chain(pair[1].plan()?);
+        let poses = own.map(|TimedPose { time_us, start_from_rig }| {
             let world_from_rig = *world_from_start * start_from_rig;
             let forward = world_from_rig.rotation * DVec3::X;
             PlannedPose {

@@ -10,6 +10,7 @@ use serde::Deserialize;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
+use wildcity_sim::ego::TimedPose;
 
 use crate::limits;
 use crate::lines::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
@@ -149,7 +150,16 @@ pub enum ReadError {
         /// What is wrong with it.
         reason: String,
     },
+    /// It is the MCAP file beside a record.
+    #[error("{} is an MCAP export; only the record is read: {}", path.display(), path.with_extension("jsonl").display())]
+    Mcap {
+        /// The file.
+        path: PathBuf,
+    },
 }
+
+/// What every MCAP file begins with; its line break ends the first line.
+const MCAP_MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
 /// A line's kind. It is read before the line, since a tagged enum copies every value of it first: a third of the time.
 #[derive(Deserialize)]
@@ -171,15 +181,9 @@ enum Line {
 }
 
 impl Frame {
-    /// The agent's plan, if that was its command: times in microseconds since the begin of the step, and poses in the
-    /// rig's frame of then.
-    pub fn plan(&self) -> Option<Vec<(i64, Pose)>> {
-        let poses = self.command.as_ref()?.get("trajectory")?.as_array()?;
-        let read = |value: &serde_json::Value| {
-            let pose = Pose::deserialize(value.get("start_from_rig")?).ok()?;
-            Some((value.get("time_us")?.as_i64()?, pose))
-        };
-        poses.iter().map(read).collect()
+    /// The agent's plan, if that was its command.
+    pub fn plan(&self) -> Option<Vec<TimedPose>> {
+        Vec::deserialize(self.command.as_ref()?.get("trajectory")?).ok()
     }
 }
 
@@ -195,28 +199,9 @@ impl EpisodeFile {
     pub fn read(path: &Path) -> Result<Self, ReadError> {
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
-        let no_header = |reason: String| ReadError::Header { path: path.to_owned(), reason };
         let mut text = Vec::new();
-        let first = read_line(&mut reader, limits::HEAD_BYTES, &mut text).map_err(failed)?;
-        let header = match first.and_then(|_| parse(&text)) {
-            Ok(Line::Episode(header)) if header.format == Self::FORMAT && header.dt_us > 0 => {
-                *header
-            }
-            Ok(Line::Episode(header)) if header.format == Self::FORMAT => {
-                return Err(no_header(format!(
-                    "dt_us is {}; a step takes 1 µs at least",
-                    header.dt_us
-                )));
-            }
-            Ok(Line::Episode(header)) => {
-                let reason = format!("format {}; this build reads {}", header.format, Self::FORMAT);
-                return Err(no_header(reason));
-            }
-            Ok(_) => return Err(no_header("it is of another kind".to_owned())),
-            Err(reason) => return Err(no_header(reason)),
-        };
         let mut episode = Self {
-            header,
+            header: read_header(&mut reader, path, &mut text)?,
             scenario: None,
             frames: Vec::new(),
             actors: Vec::new(),
@@ -238,6 +223,16 @@ impl EpisodeFile {
             }
         }
         Ok(episode)
+    }
+
+    /// Reads the first line of an episode's file.
+    ///
+    /// # Errors
+    /// The file cannot be read, or its first line is no header.
+    pub fn header(path: &Path) -> Result<Header, ReadError> {
+        let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
+        let mut reader = BufReader::new(File::open(path).map_err(failed)?);
+        read_header(&mut reader, path, &mut Vec::new())
     }
 
     fn add(&mut self, line: Line) -> Result<(), String> {
@@ -299,19 +294,62 @@ impl EpisodeFile {
     /// The frames that the ego drove: the start and each step, in order. Where a session went back to an earlier
     /// step, the later ones replace it.
     pub fn driven(&self) -> Vec<&Frame> {
-        let mut driven: Vec<&Frame> = Vec::new();
-        let moves = |frame: &&Frame| frame.request != "observe" && !frame.poses.is_empty();
-        for frame in self.frames.iter().filter(moves) {
-            let kept = driven.partition_point(|before| before.step < frame.step);
-            driven.truncate(kept);
-            driven.push(frame);
-        }
-        driven
+        let moves = |frame: &Frame| frame.request != "observe" && !frame.poses.is_empty();
+        let steps = self.frames.iter().map(|frame| moves(frame).then_some(frame.step));
+        driven_indices(steps).into_iter().map(|index| &self.frames[index]).collect()
     }
 
     /// The name of the episode: that of its file without the extension.
     pub fn name_of(path: &Path) -> String {
         path.file_stem().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+    }
+}
+
+/// Indices of the frames that the ego drove. `steps` are those of all frames, in order; none of a frame that did not
+/// move the ego. Where a session went back to an earlier step, the later frames replace the earlier ones.
+pub fn driven_indices(steps: impl IntoIterator<Item = Option<u64>>) -> Vec<usize> {
+    let mut driven: Vec<(u64, usize)> = Vec::new();
+    for (index, step) in steps.into_iter().enumerate() {
+        let Some(step) = step else { continue };
+        driven.truncate(driven.partition_point(|(before, _)| *before < step));
+        driven.push((step, index));
+    }
+    driven.into_iter().map(|(_, index)| index).collect()
+}
+
+/// Refuses the first line of a file that is an MCAP export and no record.
+///
+/// # Errors
+/// [`ReadError::Mcap`].
+pub fn check_no_mcap(path: &Path, first_line: &[u8]) -> Result<(), ReadError> {
+    match first_line == MCAP_MAGIC {
+        true => Err(ReadError::Mcap { path: path.to_owned() }),
+        false => Ok(()),
+    }
+}
+
+/// Reads the first line, with `text` as its buffer.
+fn read_header(
+    reader: &mut BufReader<File>,
+    path: &Path,
+    text: &mut Vec<u8>,
+) -> Result<Header, ReadError> {
+    let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
+    let no_header = |reason: String| ReadError::Header { path: path.to_owned(), reason };
+    let first = read_line(reader, limits::HEAD_BYTES, text).map_err(failed)?;
+    check_no_mcap(path, text)?;
+    let header = match first.and_then(|_| parse(text)).map_err(no_header)? {
+        Line::Episode(header) => *header,
+        _ => return Err(no_header("it is of another kind".to_owned())),
+    };
+    let Header { format, dt_us, .. } = header;
+    match format == EpisodeFile::FORMAT {
+        true if dt_us > 0 => Ok(header),
+        true => Err(no_header(format!("dt_us is {dt_us}; a step takes 1 µs at least"))),
+        false => {
+            let known = EpisodeFile::FORMAT;
+            Err(no_header(format!("format {format}; this build reads {known}")))
+        }
     }
 }
 

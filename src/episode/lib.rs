@@ -28,9 +28,13 @@ mod scenario;
 pub use diff::{Difference, What, diff};
 pub use drive::{drive_record, off_model_us};
 pub use export::{
-    EpisodeExport, ExportError, Exported, ExportedImage, export, export_file, mcap_of, write_whole,
+    EpisodeExport, ExportError, Exported, ExportedImage, export, export_file, mcap_of,
+    remove_leftovers, write_whole,
 };
-pub use file::{CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead};
+pub use file::{
+    CameraHead, Cut, EndLine, EpisodeFile, Frame, Header, ReadError, RigHead, check_no_mcap,
+    driven_indices,
+};
 pub use lines::{
     ActorLine, ActorStateLine, ActorsLine, Collision, ContactEvent, EgoLine, EpisodeResult, Event,
     EventLine, FaultLine, LaneLine, RoutePoint, ScenarioLine, ScoreLine,

@@ -1,5 +1,7 @@
 //! Limits of this package, with the arithmetic behind each.
 
+use std::time::Duration;
+
 /// Longest line of an episode's file after the first, in bytes: 256 actors of 200 bytes and 256 image hashes of 67
 /// take 70 kB; the route of a scenario with a keyframe every 0.5 m takes 80 bytes a point, 8 MB for 50 km.
 pub const LINE_BYTES: usize = 16 << 20;
@@ -9,6 +11,10 @@ pub const HEAD_BYTES: usize = 96 << 20;
 
 /// Most steps of an episode: a day at 10 Hz.
 pub const STEPS: usize = 1 << 20;
+
+/// A temporary file of an export that nothing was written to for so long is left of a killed process: an export writes
+/// every second of the episode, and with images a second takes minutes on a slow machine.
+pub const LEFTOVER_AGE: Duration = Duration::from_secs(3600);
 
 /// Most episodes of a list.
 pub const LISTED: usize = 10_000;

@@ -2,7 +2,25 @@
 
 use super::record::DriveRecord;
 use super::scored::Score;
-use super::{alpasim, bench2drive, hugsim, navsim, neuroncap, own};
+use super::{alpasim, alpasim_plans, bench2drive, hugsim, navsim, neuroncap, own};
+
+/// The least and the greatest value that a score can have; infinite without a bound, and of a name that is none of
+/// [`score`]'s.
+pub fn range_of(name: &str) -> [f64; 2] {
+    let [deviation, collision, ades @ ..] = alpasim_plans::NAMES;
+    match name {
+        own::NAME | alpasim::NAME | alpasim::OFF_ROAD | alpasim::WRONG_LANE | navsim::NAME => {
+            [0.0, 1.0]
+        }
+        hugsim::NAME | bench2drive::SUCCESS | bench2drive::SMOOTHNESS => [0.0, 1.0],
+        neuroncap::NAME => [0.0, neuroncap::FREE],
+        bench2drive::DRIVING_SCORE => [0.0, 100.0],
+        bench2drive::EFFICIENCY => [0.0, bench2drive::MOST_PERCENT],
+        name if name == collision => [0.0, 1.0],
+        name if name == deviation || ades.contains(&name) => [0.0, f64::INFINITY],
+        _ => [f64::NEG_INFINITY, f64::INFINITY],
+    }
+}
 
 /// All scores of an episode, in a fixed order.
 pub fn score(record: &DriveRecord) -> Vec<Score> {

@@ -7,7 +7,7 @@ use wildcity_sim::contact::Footprint;
 
 use super::alpasim_box::RoundedBox;
 use super::alpasim_plans;
-use super::alpasim_road::{is_in_wrong_lane, is_off_road};
+use super::alpasim_road::{Road, is_in_wrong_lane};
 use super::record::DriveRecord;
 use super::scored::{Missing, Score};
 
@@ -138,6 +138,8 @@ impl Drive {
         let recorded_m = record.recorded_way_m().ok_or(no_drive)?;
         let rollout =
             Rollout { progress: 0.0, recorded_m, collision_at_fault: false, offroad: false };
+        let map = record.map.as_ref();
+        let road = map.map(Road::of);
         let mut drive = Self { rollout, least_gap_m: None, wrong_lane: None, cut_us: 0 };
         for (step, (sample, (station_m, off_m))) in record.ego.iter().zip(stations_m).enumerate() {
             let ego = RoundedBox::of(&shape, sample);
@@ -147,8 +149,7 @@ impl Drive {
             let sides: Vec<Side> = others.iter().filter_map(|other| side_of(&ego, other)).collect();
             let gaps_m = others.iter().map(|other| ego.distance_m(other));
             drive.least_gap_m = gaps_m.chain(drive.least_gap_m).reduce(f64::min);
-            let map = record.map.as_ref();
-            let off_road = map.is_some_and(|map| is_off_road(map, &ego));
+            let off_road = road.as_ref().is_some_and(|road| road.is_off(&ego));
             let wrong = map.and_then(|map| is_in_wrong_lane(map, ego.center_m(), sample.yaw_rad));
             drive.wrong_lane = wrong.map(|wrong| wrong || drive.wrong_lane == Some(true));
             let rollout = &mut drive.rollout;

@@ -47,17 +47,39 @@ impl RoundedBox {
         self.outline.center_m
     }
 
-    /// Points of its outline, in metres: five of each corner's arc, 22.5 degrees apart.
-    pub fn outline_m(&self) -> [DVec2; 4 * ARC_POINTS] {
+    /// Points of its outline, in metres: five of each corner's arc, 22.5 degrees apart, and those of the sides between,
+    /// no farther apart than `spacing_m`.
+    pub fn outline_m(&self, spacing_m: f64) -> Vec<DVec2> {
         let centers_m = self.core.corners_m();
-        std::array::from_fn(|k| {
+        let arcs = (0..4 * ARC_POINTS).map(|k| {
             let center_m = centers_m[k / ARC_POINTS];
             let out = center_m - self.core.center_m;
             let along = self.core.forward * out.dot(self.core.forward).signum();
             let aside = self.core.left() * out.dot(self.core.left()).signum();
             let angle_rad = FRAC_PI_2 * (k % ARC_POINTS) as f64 / (ARC_POINTS - 1) as f64;
             center_m + self.radius_m * (angle_rad.cos() * along + angle_rad.sin() * aside)
-        })
+        });
+        let Footprint { center_m, forward, length_m, width_m } = self.core;
+        let left = self.core.left();
+        // A side's way, and how far out it is.
+        let along = [length_m * forward, (0.5 * width_m + self.radius_m) * left];
+        let across = [width_m * left, (0.5 * length_m + self.radius_m) * forward];
+        let sides = [along, across].into_iter().flat_map(|[way_m, out_m]| {
+            let count = (way_m.length() / spacing_m).ceil() as usize;
+            let shares = (1..count).map(move |k| k as f64 / count as f64 - 0.5);
+            shares.flat_map(move |share| [-1.0, 1.0].map(|sign| share * way_m + sign * out_m))
+        });
+        arcs.chain(sides.map(|from_center_m| center_m + from_center_m)).collect()
+    }
+
+    /// No point of it is farther from its centre, in metres.
+    pub fn reach_m(&self) -> f64 {
+        0.5 * self.outline.length_m.hypot(self.outline.width_m)
+    }
+
+    /// Whether a point lies in it.
+    pub fn holds(&self, point_m: DVec2) -> bool {
+        self.core.distance_to_m(point_m) <= self.radius_m
     }
 
     /// Its distance from another box, in metres; 0 if they touch.

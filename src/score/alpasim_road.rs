@@ -7,27 +7,114 @@ use std::f64::consts::PI;
 
 use glam::DVec2;
 
+use wildcity_sim::contact::Footprint;
+
 use super::alpasim_box::RoundedBox;
-use super::map::LaneMap;
+use super::map::{Lane, LaneMap};
 use super::plan::turn_rad;
 
 /// A road edge that is nearer than this is touched, in metres.
 const EDGE_M: f64 = 1e-3;
+/// Lanes that are no farther apart than this have a seam between them and no edge of the road, in metres: lanes of one
+/// road are sampled at different places, and no median is so narrow.
+pub const SEAM_M: f64 = 0.2;
 /// Half of the length of line that gives its heading, in metres.
 const HEADING_M: f64 = 0.01;
 /// Headings that differ by more are of the wrong lane, in radians.
 const WRONG_RAD: f64 = PI * 2.0 / 3.0;
 
-/// Whether the ego is off the road: the lanes together do not hold it, and it touches their edge. An ego that is wholly
-/// outside is not off the road: it touches nothing.
-pub fn is_off_road(map: &LaneMap, ego: &RoundedBox) -> bool {
-    let outline_m = ego.outline_m();
-    let inside = outline_m.map(|point_m| map.lanes.iter().any(|lane| lane.holds(point_m)));
-    if !inside.contains(&false) {
+/// The lanes of a map, each with its bounds.
+#[derive(Clone, Debug)]
+pub struct Road<'a> {
+    lanes: Vec<BoundedLane<'a>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct BoundedLane<'a> {
+    lane: &'a Lane,
+    least_m: DVec2,
+    most_m: DVec2,
+}
+
+impl<'a> Road<'a> {
+    /// The road of a map.
+    pub fn of(map: &'a LaneMap) -> Self {
+        let bounded = |lane: &'a Lane| {
+            let points_m = lane.outline_m.iter().copied();
+            let least_m = points_m.clone().fold(DVec2::INFINITY, DVec2::min);
+            BoundedLane { lane, least_m, most_m: points_m.fold(DVec2::NEG_INFINITY, DVec2::max) }
+        };
+        Self { lanes: map.lanes.iter().map(bounded).collect() }
+    }
+
+    /// Whether the ego is off the road: neither one lane nor their union contains it, and it touches their edge. An ego that
+    /// is wholly outside is not off the road: it touches nothing.
+    ///
+    /// The original asks for the edge of the road, a layer of its own that our maps lack; here the edges of all lanes
+    /// are it. So a seam between two lanes must not count: an opening of at most 0.2 m ([`SEAM_M`]). The original tests
+    /// the whole polygon of the ego; here it is its outline and the surroundings of every lane's edge below it, in steps
+    /// of 0.2 m: a hole of 0.4 m by 0.4 m is always found.
+    pub fn is_off(&self, ego: &RoundedBox) -> bool {
+        let near: Vec<&Lane> = self.near(ego.center_m(), ego.reach_m() + SEAM_M).collect();
+        let touches = |edge| ego.distance_m(&edge) < EDGE_M;
+        !hold(&near, ego) && near.iter().any(|lane| lane.edges().any(touches))
+    }
+
+    /// The lanes whose bounds are not farther from a point than `reach_m`.
+    fn near(&self, point_m: DVec2, reach_m: f64) -> impl Iterator<Item = &'a Lane> {
+        let is_near = move |bounded: &&BoundedLane<'_>| {
+            let within_m = point_m.clamp(bounded.least_m, bounded.most_m);
+            within_m.distance(point_m) <= reach_m
+        };
+        self.lanes.iter().filter(is_near).map(|bounded| bounded.lane)
+    }
+}
+
+/// Whether one lane holds the ego, or all of them together.
+fn hold(lanes: &[&Lane], ego: &RoundedBox) -> bool {
+    let outline_m = ego.outline_m(SEAM_M);
+    // A lane has no hole.
+    if lanes.iter().any(|lane| outline_m.iter().all(|&point_m| lane.holds(point_m))) {
+        return true;
+    }
+    if !outline_m.iter().all(|&point_m| is_on_road(lanes, point_m)) {
         return false;
     }
-    let touches = |edge| ego.distance_m(&edge) < EDGE_M;
-    map.lanes.iter().any(|lane| lane.edges().any(touches))
+    // A hole below the ego has edges of lanes around it.
+    let below = |edge: &Footprint| {
+        let reach_m = ego.reach_m() + 0.5 * edge.length_m;
+        edge.center_m.distance(ego.center_m()) <= reach_m && ego.distance_m(edge) == 0.0
+    };
+    let edges = lanes.iter().flat_map(|lane| lane.edges()).filter(below);
+    let mut beside_m = edges.flat_map(points_beside_m).filter(|&at_m| ego.holds(at_m));
+    beside_m.all(|point_m| is_on_road(lanes, point_m))
+}
+
+/// Points on both sides of an edge, half a seam from it and no farther apart than a seam.
+fn points_beside_m(edge: Footprint) -> impl Iterator<Item = DVec2> {
+    let Footprint { center_m, forward, length_m, .. } = edge;
+    let aside_m = 0.5 * SEAM_M * edge.left();
+    let count = (length_m / SEAM_M).ceil().max(1.0) as usize;
+    (0..count).flat_map(move |k| {
+        let along_m = ((k as f64 + 0.5) / count as f64 - 0.5) * length_m * forward;
+        [center_m + along_m - aside_m, center_m + along_m + aside_m]
+    })
+}
+
+/// Whether a point lies in a lane, or in the seam between two.
+fn is_on_road(lanes: &[&Lane], point_m: DVec2) -> bool {
+    lanes.iter().any(|lane| lane.holds(point_m)) || is_in_seam(lanes, point_m)
+}
+
+/// Whether a point lies between two lanes that are no farther apart than a seam.
+fn is_in_seam(lanes: &[&Lane], point_m: DVec2) -> bool {
+    let way_m = |lane: &&Lane| Some(lane.nearest_on_outline_m(point_m)? - point_m);
+    let ways_m: Vec<DVec2> = lanes.iter().filter_map(way_m).collect();
+    ways_m.iter().any(|a_m| {
+        let is_opposite =
+            |b_m: &DVec2| a_m.dot(*b_m) < 0.0 && a_m.length() + b_m.length() <= SEAM_M;
+        ways_m.iter().any(is_opposite)
+    })
 }
 
 /// Whether the centre of the ego is in a lane of another direction; `None` if the lanes have no direction.

@@ -26,7 +26,7 @@ const SEGMENT: usize = 20;
 /// Window and order of its filter.
 const FILTER: (usize, usize) = (7, 2);
 /// Percentages beyond this are dropped from the efficiency.
-const MOST_PERCENT: f64 = 1000.0;
+pub(crate) const MOST_PERCENT: f64 = 1000.0;
 /// Check points of a route at which speeds are compared.
 const CHECK_POINTS: usize = 20;
 /// Contacts with the same actor within this time, or this distance, are one.

@@ -47,8 +47,27 @@ impl Lane {
 
     /// Whether a point lies within the lane or on its outline.
     pub(crate) fn holds(&self, point_m: DVec2) -> bool {
-        let on_edge = |(a, b)| is_on_edge(a, b, point_m);
-        edges(&self.outline_m).any(on_edge) || self.contains(point_m)
+        side(&self.outline_m, point_m) != Side::Outside
+    }
+
+    /// The point of its outline that is nearest to a point; `None` of a lane without points.
+    pub(crate) fn nearest_on_outline_m(&self, point_m: DVec2) -> Option<DVec2> {
+        let on_edge = |(a, b): (DVec2, DVec2)| {
+            let way = b - a;
+            let share = (point_m - a).dot(way) / way.length_squared().max(f64::MIN_POSITIVE);
+            a + share.clamp(0.0, 1.0) * way
+        };
+        let distance_m = |at_m: &DVec2| at_m.distance_squared(point_m);
+        edges(&self.outline_m).map(on_edge).min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))
+    }
+
+    /// Whether the bounds of its outline meet those from `least_m` to `most_m`: a pass over its points, where each test
+    /// of a point is one.
+    fn is_near(&self, least_m: DVec2, most_m: DVec2) -> bool {
+        let points_m = self.outline_m.iter().copied();
+        let own_least_m = points_m.clone().fold(DVec2::INFINITY, DVec2::min);
+        let own_most_m = points_m.fold(DVec2::NEG_INFINITY, DVec2::max);
+        own_least_m.cmple(most_m).all() && own_most_m.cmpge(least_m).all()
     }
 
     /// The edges of its outline, as boxes without width.
@@ -64,7 +83,9 @@ impl LaneMap {
         let mut lanes_with_corners = 0;
         let mut one_holds_all = false;
         let mut in_any = [false; 4];
-        for lane in &self.lanes {
+        let least_m = corners.into_iter().fold(DVec2::INFINITY, DVec2::min);
+        let most_m = corners.into_iter().fold(DVec2::NEG_INFINITY, DVec2::max);
+        for lane in self.lanes.iter().filter(|lane| lane.is_near(least_m, most_m)) {
             let inside = corners.map(|corner| lane.contains(corner));
             let count = inside.iter().filter(|&&inside| inside).count();
             lanes_with_corners += usize::from(count > 0);
@@ -97,12 +118,29 @@ impl LaneMap {
     }
 }
 
-/// Whether a point lies strictly within an outline: even-odd rule, without the outline itself.
+/// Where a point is to an outline.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Side {
+    Inside,
+    OnOutline,
+    Outside,
+}
+
+/// Whether a point lies strictly within an outline, without the outline itself.
 fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
+    side(outline_m, point_m) == Side::Inside
+}
+
+/// Where a point is, by the even-odd rule.
+fn side(outline_m: &[DVec2], point_m: DVec2) -> Side {
     let mut inside = false;
     for (a, b) in edges(outline_m) {
+        // Most edges lie above the point or below it.
+        if a.y.min(b.y) > point_m.y || a.y.max(b.y) < point_m.y {
+            continue;
+        }
         if is_on_edge(a, b, point_m) {
-            return false;
+            return Side::OnOutline;
         }
         let across = (b - a).perp_dot(point_m - a);
         let crosses = (a.y > point_m.y) != (b.y > point_m.y);
@@ -110,7 +148,7 @@ fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
             inside = !inside;
         }
     }
-    inside
+    if inside { Side::Inside } else { Side::Outside }
 }
 
 /// Whether a box and an outline have a point in common; both are closed sets.
@@ -138,6 +176,6 @@ fn edge(a: DVec2, b: DVec2) -> Footprint {
 }
 
 fn edges(outline_m: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {
-    let next = outline_m.iter().cycle().skip(1);
-    outline_m.iter().copied().zip(next.copied())
+    let next = |k: usize| if k + 1 == outline_m.len() { 0 } else { k + 1 };
+    (0..outline_m.len()).map(move |k| (outline_m[k], outline_m[next(k)]))
 }

@@ -17,9 +17,11 @@ pub const NAME: &str = "neuroncap.score@ecdcf28";
 pub const EGO: EgoShape = EgoShape { length_m: 4.018, width_m: 1.85, center_x_m: 0.5 };
 
 /// Stars without a contact.
-const FREE: f64 = 5.0;
+pub(crate) const FREE: f64 = 5.0;
 /// Stars after a contact at no speed.
 const TOUCHED: f64 = 4.0;
+/// Why some contacts have no stars.
+const LEFT_OUT: &str = "the first contact is with a pedestrian or an object, which the published check of contacts leaves out";
 /// End of the recording that gives the reference speed, in microseconds.
 const REFERENCE_US: i64 = 500_000;
 
@@ -54,22 +56,24 @@ pub fn first_touching_sub_step(
     })
 }
 
-/// The score of an episode. The reference speed is that of the recording's last 0.5 s, as in the code; the paper takes
-/// the impact of an undisturbed run.
+/// The score of an episode, by its first contact.
+///
+/// The published check of contacts (`neuro_ncap/evaluation/collision.py`, `COLLISION_CLASSES_TO_CHECK`) looks at
+/// vehicles and bicycles alone, and gives 5 to an ego that drives through a pedestrian or a barrier. So an episode whose
+/// first contact is with one of those has no value. The reference speed is that of the recording's last 0.5 s, as in
+/// the code; the paper takes the impact of an undisturbed run.
 pub fn ncap(record: &DriveRecord) -> Score {
     let contact = record.contacts.iter().find(|contact| !contact.at_start);
     let impact_mps = contact.map(|contact| contact.impact_mps);
     let reference_mps = record.reference.as_ref().and_then(reference_speed_mps);
-    let hit_pedestrian = contact.is_some_and(|contact| {
+    let is_left_out = contact.is_some_and(|contact| {
         let tracks = record.tracks.as_deref().unwrap_or_default();
-        let track = tracks.get(usize::from(contact.actor));
-        track.is_some_and(|track| track.class == ActorClass::Pedestrian)
+        let class = tracks.get(usize::from(contact.actor)).map(|track| track.class);
+        matches!(class, Some(ActorClass::Pedestrian | ActorClass::Object))
     });
     let value: Measured = match (&record.tracks, impact_mps, reference_mps) {
         (None, ..) => Err(Missing::new("needs the actors of a scenario")),
-        (Some(_), Some(_), _) if hit_pedestrian => {
-            Err(Missing::new("is not defined for pedestrians"))
-        }
+        (Some(_), Some(_), _) if is_left_out => Err(Missing::new(LEFT_OUT)),
         (Some(_), Some(_), None) => {
             Err(Missing::new("needs the speed of the recorded drive in its last 0.5 s"))
         }

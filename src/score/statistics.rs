@@ -23,9 +23,14 @@ pub fn wilson(passed: u64, runs: u64) -> [f64; 2] {
     [low, high]
 }
 
+/// A mean of fewer values has no interval: t is 12.7 for two, which says nothing of a score.
+pub const LEAST_VALUES: usize = 3;
+
 /// A mean, its standard deviation and half of its 95 % interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mean {
+    /// Number of the values.
+    pub count: usize,
     /// The mean.
     pub mean: f64,
     /// The standard deviation of the values (n - 1); `None` for a single one.
@@ -43,12 +48,20 @@ impl Mean {
         }
         let mean = values.iter().sum::<f64>() / n as f64;
         if n == 1 {
-            return Some(Self { mean, deviation: None, half_width: None });
+            return Some(Self { count: n, mean, deviation: None, half_width: None });
         }
         let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
         let deviation = (squares / (n - 1) as f64).sqrt();
         let half_width = student_t(n - 1) * deviation / (n as f64).sqrt();
-        Some(Self { mean, deviation: Some(deviation), half_width: Some(half_width) })
+        Some(Self { count: n, mean, deviation: Some(deviation), half_width: Some(half_width) })
+    }
+
+    /// The 95 % interval of the mean of values from `least` to `most`: that of Student (1908), mean ± t · deviation/√n,
+    /// clipped to the range. The mean cannot be beyond it, so the clipped interval contains it as often. `None` below
+    /// [`LEAST_VALUES`] values.
+    pub fn interval(&self, [least, most]: [f64; 2]) -> Option<[f64; 2]> {
+        let half_width = self.half_width.filter(|_| self.count >= LEAST_VALUES)?;
+        Some([(self.mean - half_width).max(least), (self.mean + half_width).min(most)])
     }
 }
 

@@ -98,7 +98,7 @@ fn means(result: &SuiteResult) -> Markup {
                 tr {
                     td { (name) }
                     td { (format!("{:.4}", mean.mean)) }
-                    td { @if let Some(half) = mean.half_width { "± " (format!("{half:.4}")) } }
+                    td { @if let Some([low, high]) = mean.interval { (format!("{low:.4} to {high:.4}")) } }
                     td { (mean.scenarios) }
                 }
             }
@@ -106,6 +106,7 @@ fn means(result: &SuiteResult) -> Markup {
                 tr { td { (name) } td colspan="3" { "none: " (reason) } }
             }
         }
+        p { "Intervals of means: Student's t over the scenarios, clipped to the range of the score; none below three." }
     }
 }
 
@@ -160,7 +161,14 @@ fn table(result: &SuiteResult) -> Markup {
                     }
                     td { (episode.steps) }
                     td { (format!("{:.1}", episode.distance_m)) }
-                    td { @if !episode.record.is_empty() { a href=(format!("episodes/{}", episode.record)) { (episode.record) } } }
+                    td {
+                        @if !episode.record.is_empty() { a href=(format!("episodes/{}", episode.record)) { (episode.record) } }
+                        @match &episode.mcap {
+                            Some(Ok(file)) => { " " a href=(format!("episodes/{file}")) { "MCAP" } }
+                            Some(Err(reason)) => { " no MCAP file: " (reason) }
+                            None => {}
+                        }
+                    }
                 }
             }
         }

@@ -7,8 +7,8 @@ use serde::Serialize;
 use serde_json::Value;
 
 use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
-use wildcity_score::own;
 use wildcity_score::statistics::{Mean, wilson};
+use wildcity_score::{own, range_of};
 use wildcity_session::Engine;
 
 use crate::case::Case;
@@ -73,13 +73,13 @@ pub struct Rate {
     pub interval: [f64; 2],
 }
 
-/// A mean with half of its 95 % interval (Student's t).
+/// A mean with its 95 % interval ([`Mean::interval`]).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MeanEntry {
     /// The mean.
     pub mean: f64,
-    /// Half of the interval; null for a single scenario.
-    pub half_width: Option<f64>,
+    /// The ends of the interval, within the range of the score; null below three scenarios.
+    pub interval: Option<[f64; 2]>,
     /// Number of scenarios with a value.
     pub scenarios: u64,
 }
@@ -117,12 +117,10 @@ pub struct EpisodeEntry {
     pub frames_hash: String,
     /// The file of its record, below `episodes`; empty if nothing was driven.
     pub record: String,
-    /// The MCAP file of its record, below `episodes`; absent if there is none.
-    #[serde(skip_serializing_if = "String::is_empty")]
-    pub mcap: String,
-    /// Why there is no MCAP file; absent if there is one, or none was asked for.
-    #[serde(skip_serializing_if = "String::is_empty")]
-    pub mcap_error: String,
+    /// The MCAP file of its record, below `episodes`, or why there is none; `None` if none was asked for. Not in
+    /// `result.json`: whether an export is ready at the end of a run depends on the clock.
+    #[serde(skip)]
+    pub mcap: Option<Result<String, String>>,
     /// Technical failures, of every attempt.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub errors: Vec<TechnicalEntry>,
@@ -249,11 +247,16 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
             }
         }
     }
-    let entry = |values: Vec<f64>| {
-        let Mean { mean, half_width, .. } = Mean::of(&values)?;
-        Some(MeanEntry { mean, half_width, scenarios: values.len() as u64 })
+    let entry = |name: &str, values: &[f64]| {
+        let mean = Mean::of(values)?;
+        let interval = mean.interval(range_of(name));
+        Some(MeanEntry { mean: mean.mean, interval, scenarios: values.len() as u64 })
     };
-    per_scenario.into_iter().filter_map(|(name, values)| Some((name, entry(values)?))).collect()
+    let entries = per_scenario.into_iter().filter_map(|(name, values)| {
+        let entry = entry(&name, &values)?;
+        Some((name, entry))
+    });
+    entries.collect()
 }
 
 impl Rate {
@@ -283,8 +286,7 @@ impl EpisodeEntry {
             distance_m: 0.0,
             frames_hash: String::new(),
             record: String::new(),
-            mcap: String::new(),
-            mcap_error: String::new(),
+            mcap: None,
             errors: errors.collect(),
         };
         if let Some(Finished { record, end, result, frames_hash }) = finished {
@@ -313,11 +315,16 @@ impl EpisodeEntry {
             return;
         }
         let mcap = mcap_of(Path::new(&self.record));
-        match engine.export_failure(&EpisodeFile::name_of(&mcap)) {
-            Some(reason) => self.mcap_error = reason,
-            None if episodes.join(&mcap).is_file() => self.mcap = mcap.display().to_string(),
-            None => self.mcap_error = "it was not ready at the end of the run".to_owned(),
-        }
+        self.mcap = Some(match engine.export_failure(&EpisodeFile::name_of(&mcap)) {
+            Some(reason) => Err(reason),
+            None if episodes.join(&mcap).is_file() => Ok(mcap.display().to_string()),
+            None => Err("it was not ready at the end of the run".to_owned()),
+        });
+    }
+
+    /// Why there is no MCAP file although one was asked for.
+    pub fn mcap_error(&self) -> Option<&str> {
+        self.mcap.as_ref()?.as_ref().err().map(String::as_str)
     }
 
     /// The faults in words, by time: `contact.pedestrian with walker at 4.615 s`.

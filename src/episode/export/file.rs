@@ -1,19 +1,29 @@
 //! The MCAP file of a record: written under another name first, so that a reader never finds half a file.
 
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write as _};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use tempfile::NamedTempFile;
 
 use crate::file::EpisodeFile;
+use crate::limits;
 
 use super::write::{ExportError, Exported, export};
+
+/// Ending of the files of records.
+const ENDING: &str = ".mcap";
+/// Ending of the name that a file has while it is written: `a-1.mcap.RANDOM.tmp` becomes `a-1.mcap`.
+const TEMPORARY: &str = ".tmp";
 
 /// The place of the MCAP file beside a record: `a-1.mcap` beside `a-1.jsonl`.
 pub fn mcap_of(record: &Path) -> PathBuf {
     record.with_extension("mcap")
 }
 
-/// Exports a record to a file. It is on disk when it gets its name; until then it is `mcap` with `.tmp` behind it.
+/// Exports a record to a file, as [`write_whole`] does.
 ///
 /// # Errors
 /// The record cannot be read or has no frame, or the file cannot be written: then nothing is left of it.
@@ -23,39 +33,90 @@ pub fn export_file(record: &Path, mcap: &Path) -> Result<Exported, ExportError> 
     write_whole(mcap, |out| export(&episode, rig.as_ref(), out))
 }
 
-/// Lets `write` write a file, and gives it its name when it is whole and on disk.
+/// Lets `write` write a file, and gives it its name when it is whole and on disk. Until then it has a name of its own,
+/// so that two exports to one place do not meet: the last one stays.
 ///
 /// # Errors
 /// The file cannot be created, `write` fails, or the file cannot be renamed: then nothing is left of it.
 pub fn write_whole<T>(
     path: &Path,
-    write: impl FnOnce(&mut BufWriter<File>) -> Result<T, ExportError>,
+    write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, ExportError>,
 ) -> Result<T, ExportError> {
-    let mut temporary = path.as_os_str().to_owned();
-    temporary.push(".tmp");
-    let temporary = PathBuf::from(temporary);
     let failed = |cause| ExportError::Io { path: path.to_owned(), cause };
-    let mut out = BufWriter::new(File::create(&temporary).map_err(failed)?);
-    let written = write(&mut out).and_then(|written| {
-        name_whole(out, &temporary, path).map_err(failed)?;
-        Ok(written)
-    });
-    if written.is_err() {
-        // The first error is the one to report.
-        let _ = fs::remove_file(&temporary);
-    }
-    written
+    let dir = match path.parent() {
+        Some(dir) if !dir.as_os_str().is_empty() => dir,
+        _ => Path::new("."),
+    };
+    // Removed when it is dropped without its name.
+    let mut temporary = create(dir, path).map_err(failed)?;
+    let mut out = BufWriter::new(temporary.as_file_mut());
+    let written = write(&mut out)?;
+    out.flush().map_err(failed)?;
+    drop(out);
+    name_whole(temporary, dir, path).map_err(failed)?;
+    Ok(written)
+}
+
+/// Creates the file under its temporary name, with the rights of any new file.
+fn create(dir: &Path, path: &Path) -> io::Result<NamedTempFile> {
+    let name = path.file_name().ok_or_else(|| io::Error::other("the path has no file name"))?;
+    let mut prefix = name.to_owned();
+    prefix.push(".");
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(&prefix).suffix(TEMPORARY);
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder.tempfile_in(dir)
 }
 
 /// Brings a file to disk and gives it its name, also on disk.
-fn name_whole(mut out: BufWriter<File>, temporary: &Path, path: &Path) -> io::Result<()> {
-    out.flush()?;
-    out.get_ref().sync_all()?;
-    fs::rename(temporary, path)?;
+fn name_whole(temporary: NamedTempFile, dir: &Path, path: &Path) -> io::Result<()> {
+    temporary.as_file().sync_all()?;
+    temporary.persist(path).map_err(|error| error.error)?;
     #[cfg(unix)]
-    if let Some(dir) = path.parent() {
-        let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-        File::open(dir)?.sync_all()?;
-    }
+    File::open(dir)?.sync_all()?;
     Ok(())
+}
+
+/// Removes the temporary files that killed exports left in a directory: those that nothing was written to for
+/// [`limits::LEFTOVER_AGE`] before `now`. A directory that does not exist has none. Returns how many were removed.
+///
+/// # Errors
+/// The directory cannot be read, or a file cannot be removed: the first one, and the others are removed.
+pub fn remove_leftovers(dir: &Path, now: SystemTime) -> io::Result<usize> {
+    let entries = match fs::read_dir(dir) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(0),
+        Err(error) => return Err(error),
+    };
+    let mut removed = 0;
+    let mut failed = None;
+    for entry in entries {
+        let entry = entry?;
+        if !is_temporary(&entry.file_name()) {
+            continue;
+        }
+        // A file may get its name meanwhile.
+        let Ok(metadata) = entry.metadata() else { continue };
+        let Ok(modified) = metadata.modified() else { continue };
+        let is_old = now.duration_since(modified).is_ok_and(|age| age >= limits::LEFTOVER_AGE);
+        if !metadata.is_file() || !is_old {
+            continue;
+        }
+        match fs::remove_file(entry.path()) {
+            Ok(()) => removed += 1,
+            // Another server removed it.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => failed = failed.or(Some(error)),
+        }
+    }
+    failed.map_or(Ok(removed), Err)
+}
+
+/// Whether a name is one of [`write_whole`]; earlier builds wrote no random part.
+fn is_temporary(name: &OsStr) -> bool {
+    let Some(name) = name.to_str().and_then(|name| name.strip_suffix(TEMPORARY)) else {
+        return false;
+    };
+    name.ends_with(ENDING) || name.rsplit_once('.').is_some_and(|(of, _)| of.ends_with(ENDING))
 }

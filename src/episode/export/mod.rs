@@ -25,5 +25,5 @@ mod output;
 mod parts;
 mod write;
 
-pub use file::{export_file, mcap_of, write_whole};
+pub use file::{export_file, mcap_of, remove_leftovers, write_whole};
 pub use write::{EpisodeExport, ExportError, Exported, ExportedImage, export};

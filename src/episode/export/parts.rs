@@ -69,15 +69,12 @@ pub(super) fn event_text(episode: &EpisodeFile, event: &Event) -> (i32, String) 
 /// The command without what `/plan` has: of a trajectory, the times of its poses are left. Poses as text would be two
 /// thirds of a file.
 pub(super) fn command_of(frame: &Frame) -> Option<Value> {
-    let command = frame.command.as_ref()?;
-    let Some(poses) = command.get("trajectory").and_then(Value::as_array) else {
-        return Some(command.clone());
-    };
-    let times_us: Vec<&Value> = poses.iter().filter_map(|pose| pose.get("time_us")).collect();
+    let Some(poses) = frame.plan() else { return frame.command.clone() };
+    let times_us: Vec<i64> = poses.iter().map(|pose| pose.time_us).collect();
     Some(json!({ "trajectory": { "times_us": times_us, "poses": "/plan" } }))
 }
 
 /// The agent's trajectory in the rig's frame, if that was its command.
 pub(super) fn plan_of(frame: &Frame) -> Option<Vec<foxglove::Pose>> {
-    Some(frame.plan()?.iter().map(|(_, start_from_rig)| pose(start_from_rig)).collect())
+    Some(frame.plan()?.iter().map(|timed| pose(&timed.start_from_rig)).collect())
 }

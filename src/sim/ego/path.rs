@@ -4,18 +4,49 @@ use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::limits;
-use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::{Pose, PoseError};
 
 use super::EgoError;
 
-/// A pose at a time.
+/// A pose at a time. In records it is a row: time, position, rotation (w, x, y, z).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(into = "Row", try_from = "RowOrNamed")]
 pub struct TimedPose {
     /// Time since the step's start, in microseconds.
     pub time_us: i64,
     /// `rig(start)_from_rig`: the pose in the frame of the rig at the start of the step.
     pub start_from_rig: Pose,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Row(i64, [f64; 3], [f64; 4]);
+
+/// Earlier builds wrote a name for each field: a quarter of a record with plans.
+#[derive(Deserialize)]
+#[serde(untagged, deny_unknown_fields)]
+enum RowOrNamed {
+    Row(Row),
+    Named { time_us: i64, start_from_rig: Pose },
+}
+
+impl From<TimedPose> for Row {
+    fn from(timed: TimedPose) -> Self {
+        let TimedPose { time_us, start_from_rig } = timed;
+        Self(time_us, start_from_rig.position_m.to_array(), start_from_rig.q_wxyz())
+    }
+}
+
+impl TryFrom<RowOrNamed> for TimedPose {
+    type Error = PoseError;
+
+    fn try_from(read: RowOrNamed) -> Result<Self, PoseError> {
+        Ok(match read {
+            RowOrNamed::Row(Row(time_us, xyz_m, q_wxyz)) => {
+                Self { time_us, start_from_rig: Pose::checked(xyz_m, q_wxyz)? }
+            }
+            RowOrNamed::Named { time_us, start_from_rig } => Self { time_us, start_from_rig },
+        })
+    }
 }
 
 /// 1 to [`limits::PATH_POSES`] poses in order of time. The trajectory starts at time 0 at the pose of the rig.

@@ -124,12 +124,7 @@ fn start_time_us(around: &Surroundings<'_>, start: Option<&EgoStart>) -> i64 {
 }
 
 fn asset_of(path: &str, name: &str, around: &Surroundings<'_>) -> Result<AssetInfo, FileError> {
-    (around.asset)(name).ok_or_else(|| {
-        let message = format!(
-            "there is no asset {name:?}; write the hash of one that `wildcity actor list` shows, or leave it out"
-        );
-        FileError::new(path, message)
-    })
+    (around.asset)(name).map_err(|reason| FileError::new(path, reason))
 }
 
 fn actor_of(

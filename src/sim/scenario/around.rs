@@ -19,8 +19,8 @@ pub struct Surroundings<'a> {
     pub tracks: Option<&'a TracksFile>,
     /// The map that the scenario names.
     pub map: Option<&'a Map>,
-    /// Looks up an asset by its hash or by the name of a built-in one.
-    pub asset: &'a dyn Fn(&str) -> Option<AssetInfo>,
+    /// Looks up an asset by its hash or its name. The error says why there is none.
+    pub asset: &'a dyn Fn(&str) -> Result<AssetInfo, String>,
 }
 
 /// What a scenario needs to know about an asset.
