@@ -11,6 +11,7 @@ use serde_json::json;
 
 use wildcity_render::gpu::devices;
 use wildcity_twin::residency::default_memory_bytes;
+use wildcity_twin::store::StoreError;
 
 use super::directories::{Episodes, Twins, Uploads};
 use super::exit::Exit;
@@ -99,7 +100,7 @@ impl Doctor {
         let bad = findings.iter().filter(|finding| finding.level == Level::Bad).count();
         if bad > 0 {
             let message = format!("{bad} of {} checks failed", findings.len());
-            return Err(Exit { code: 1, message }.into());
+            return Err(Exit::error(1, message).into());
         }
         Ok(())
     }
@@ -117,8 +118,12 @@ impl Doctor {
             false => vec![disk("twins", &dir)],
         };
         let begun = std::time::Instant::now();
-        match self.twins.catalog().and_then(|catalog| Ok(catalog.twins()?)) {
-            Ok(list) => {
+        let listed = self.twins.catalog().and_then(|catalog| {
+            let twins = catalog.twins()?;
+            Ok((twins, catalog.actors()?))
+        });
+        match listed {
+            Ok((list, actors)) => {
                 let text = format!(
                     "{} twins in {}, listed in {} ms",
                     list.twins.len(),
@@ -133,6 +138,10 @@ impl Doctor {
                         damaged.name, damaged.error, damaged.name
                     );
                     findings.push(Finding::new(Level::Bad, "twins", text));
+                }
+                for damaged in actors.damaged {
+                    let text = StoreError::from(damaged).to_string();
+                    findings.push(Finding::new(Level::Bad, "actors", text));
                 }
             }
             Err(error) => findings.extend(bad(format!("{}: {error:#}", dir.display()))),

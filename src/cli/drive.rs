@@ -125,7 +125,7 @@ impl Drive {
             Outcome::AgentLost if self.episodes == 1 => LOST_EXIT_CODE,
             _ => 1,
         };
-        Err(Exit { code, message }.into())
+        Err(Exit::error(code, message).into())
     }
 
     /// Drives all episodes, and returns the outcomes of those that did not complete.

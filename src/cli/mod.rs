@@ -132,8 +132,12 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
-            error.downcast_ref::<exit::Exit>().map_or(ExitCode::FAILURE, |exit| exit.code.into())
+            let exit = error.downcast_ref::<exit::Exit>();
+            match exit.is_some_and(|exit| exit.is_finding) {
+                true => eprintln!("{error}"),
+                false => eprintln!("error: {error:#}"),
+            }
+            exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }
     }
 }

@@ -131,7 +131,7 @@ impl Replay {
             let message = format!(
                 "the recording is cut, verified to step {step}: the episode still runs, or was interrupted"
             );
-            return Err(Exit { code: CUT_EXIT_CODE, message }.into());
+            return Err(Exit::error(CUT_EXIT_CODE, message).into());
         }
         Ok(())
     }

@@ -44,7 +44,7 @@ impl Generate {
 /// The assets of all generated models, made if need be.
 pub(in crate::cli) fn generated(catalog: &Catalog) -> anyhow::Result<Vec<StoredActor>> {
     let source = |name: &str| format!("generated {name}, revision {ACTOR_REVISION}");
-    let stored = catalog.actors()?;
+    let stored = catalog.actors()?.actors;
     let mut all = Vec::new();
     let mut missing = Vec::new();
     for name in ActorModel::NAMES {

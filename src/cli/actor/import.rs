@@ -48,7 +48,7 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity actor import car.glb --axes '0 0 1 1 0 0 0 1 0'
   wildcity actor import person.ply --class pedestrian --axes y-up-z-back --scale 0.01
-  wildcity actor import truck.glb --name truck --gaussians 400000
+  wildcity actor import truck.glb --name truck --axes '1 0 0 0 0 -1 0 1 0' --gaussians 400000
   wildcity actor import drive.usdz --tracked --name log7";
 
 impl Import {

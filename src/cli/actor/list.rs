@@ -3,10 +3,12 @@
 use std::io::{self, Write};
 
 use wildcity_scene::ActorBox;
+use wildcity_twin::store::{ActorList, DamagedActor};
 
 use crate::cli::directories::Twins;
 
-/// List the assets of actors: name, class, size, Gaussians, and hash.
+/// List the assets of actors: name, class, size, Gaussians, and hash. An asset that cannot be read is listed as damaged
+/// with the reason: make it again, or remove it, unless the disk or the object store failed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -20,9 +22,9 @@ pub(super) struct List {
 impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
-        let actors = catalog.actors()?;
+        let ActorList { actors, damaged } = catalog.actors()?;
         let mut out = io::stdout().lock();
-        if actors.is_empty() {
+        if actors.is_empty() && damaged.is_empty() {
             writeln!(
                 out,
                 "no actors in {}: make one with `wildcity actor import`",
@@ -39,6 +41,10 @@ impl List {
                 actor.gaussians(),
                 actor.hash,
             )?;
+        }
+        for DamagedActor { hash, name, reason } in damaged {
+            let name = name.as_deref().unwrap_or("-");
+            writeln!(out, "{name:<20} damaged: {reason}  {hash}")?;
         }
         Ok(())
     }

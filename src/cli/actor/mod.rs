@@ -7,12 +7,13 @@ mod import;
 mod list;
 mod picture;
 mod push;
+mod remove;
 mod show;
 mod summary;
 
 pub(super) use generate::generated;
 
-/// Make, list and look at assets of actors: what other vehicles and pedestrians are drawn from.
+/// Make, list, look at and remove assets of actors: what other vehicles and pedestrians are drawn from.
 ///
 /// Assets lie beside the twins and are shared by all of them. An asset is identified by the BLAKE3 of its content.
 #[derive(Debug, clap::Args)]
@@ -22,7 +23,8 @@ Examples:
   wildcity actor push car.glb --axes '0 0 1 1 0 0 0 1 0' --server http://sim:8080
   wildcity actor generate
   wildcity actor list
-  wildcity actor show car --picture car.png")]
+  wildcity actor show car --picture car.png
+  wildcity actor remove car")]
 pub(super) struct Actor {
     #[command(subcommand)]
     subcommand: Subcommand,
@@ -35,6 +37,7 @@ enum Subcommand {
     Generate(generate::Generate),
     List(list::List),
     Show(show::Show),
+    Remove(remove::Remove),
     Cut(cut::Cut),
 }
 
@@ -46,6 +49,7 @@ impl Actor {
             Subcommand::Generate(generate) => generate.run(),
             Subcommand::List(list) => list.run(),
             Subcommand::Show(show) => show.run(),
+            Subcommand::Remove(remove) => remove.run(),
             Subcommand::Cut(cut) => cut.run(),
         }
     }

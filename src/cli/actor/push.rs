@@ -37,8 +37,8 @@ pub(super) struct Push {
 const EXAMPLES: &str = "\
 Examples:
   wildcity actor push car.glb --axes '0 0 1 1 0 0 0 1 0'
-  wildcity actor push person.ply --class pedestrian --name walker --server http://sim:8080 --token-file token
-  wildcity actor push truck.gltf truck.bin textures/paint.png --gaussians 400000";
+  wildcity actor push person.ply --class pedestrian --axes y-down-z-forward --name walker --server http://sim:8080 --token-file token
+  wildcity actor push truck.gltf truck.bin textures/paint.png --axes '1 0 0 0 0 -1 0 1 0' --gaussians 400000";
 
 impl Push {
     pub(super) fn run(self) -> anyhow::Result<()> {

@@ -3,6 +3,8 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
+use anyhow::Context as _;
+
 use wildcity_scene::ActorBox;
 
 use super::picture;
@@ -20,7 +22,7 @@ pub(super) struct Show {
     #[arg(value_name = "ACTOR")]
     actor: String,
 
-    /// Write a PNG of the actor from ahead, from both sides and from behind, on grey.
+    /// Write a PNG of the actor from ahead on its left, from its right, from behind and from above, on grey.
     #[arg(long, value_name = "FILE")]
     picture: Option<PathBuf>,
 
@@ -46,7 +48,8 @@ fn parse_distance(text: &str) -> Result<f64, String> {
 impl Show {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
-        let actor = catalog.find_actor(&self.actor)?;
+        let found = catalog.find_actor(&self.actor);
+        let actor = found.with_context(|| format!("{}", catalog.dir().display()))?;
         if let Some(path) = &self.picture {
             let asset = catalog.actor(&actor.hash)?;
             let png = match self.distance {

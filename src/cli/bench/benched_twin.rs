@@ -1,10 +1,11 @@
 //! The twin of a benchmark, in an engine of this process.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::cli::backend_options::{self, BackendOptions};
 use crate::cli::directories::{TwinVersion, Twins};
+use wildcity_server::{Config, Directories, Limits};
 use wildcity_session::{Engine, EngineSettings, Outputs, Scenarios, SessionOptions};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, Version};
@@ -47,6 +48,22 @@ impl BenchedTwin {
             mcap: false,
         })?;
         Ok(engine)
+    }
+
+    /// A server for this process on a directory or URL of twins. Records, scenarios and uploads lie below `scratch`.
+    pub(super) fn server(&self, twins: PathBuf, scratch: &Path) -> anyhow::Result<Config> {
+        let directories = Directories {
+            twins,
+            episodes: scratch.join("episodes"),
+            scenarios: scratch.join("scenarios"),
+            uploads: scratch.join("uploads"),
+        };
+        let resident_bytes = self.memory_gib.map(backend_options::bytes_of_gib);
+        Ok(Config {
+            cache: self.twins.cache(),
+            limits: Limits { resident_bytes, ..Limits::default() },
+            ..Config::local(directories, Arc::from(self.backend.backend()?))
+        })
     }
 
     /// Options of a session on the twin.

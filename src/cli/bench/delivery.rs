@@ -1,8 +1,6 @@
 //! `wildcity bench delivery`.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -10,7 +8,6 @@ use anyhow::Context as _;
 use super::benched_twin::BenchedTwin;
 use super::processor::threads_processor_time;
 use super::timed::median;
-use crate::cli::backend_options::bytes_of_gib;
 use crate::cli::progress;
 use wildcity_client::{Client, ConnectOptions, Open, Pose as WirePose};
 use wildcity_protocol::message;
@@ -18,7 +15,7 @@ use wildcity_render::View;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
-use wildcity_server::{Config, Directories, Limits, Running};
+use wildcity_server::Running;
 use wildcity_session::{Encoding, Outputs, RigChoice, Session, Still, Stills};
 
 /// Measure what it costs to bring a step's raw images to an agent on the same machine.
@@ -72,20 +69,7 @@ impl Delivery {
         let trajectory = version.manifest.trajectories.first();
         let route = Route::new(trajectory.context("the twin has no trajectory")?)?;
         let directory = tempfile::tempdir()?;
-        let below = |name: &str| -> PathBuf { directory.path().join(name) };
-        let directories = Directories {
-            twins: self.twin.twins.dir()?,
-            episodes: below("episodes"),
-            scenarios: below("scenarios"),
-            uploads: below("uploads"),
-        };
-        let backend = Arc::from(self.twin.backend.backend()?);
-        let resident_bytes = self.twin.memory_gib.map(bytes_of_gib);
-        let config = Config {
-            cache: self.twin.twins.cache(),
-            limits: Limits { resident_bytes, ..Limits::default() },
-            ..Config::local(directories, backend)
-        };
+        let config = self.twin.server(self.twin.twins.dir()?, directory.path())?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let costs = runtime.block_on(async {
             let running = wildcity_server::start(config).await?;

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use wildcity_episode::diff;
 
 use crate::cli::directories::Episodes;
+use crate::cli::exit::Exit;
 
 /// Compare two episodes: the first step at which command, ego, actor or image differ.
 ///
@@ -35,7 +36,8 @@ impl Diff {
         let a = super::read(&self.a, &self.episodes)?;
         let b = super::read(&self.b, &self.episodes)?;
         if let Some(difference) = diff(&a, &b) {
-            anyhow::bail!("the episodes differ at {difference}");
+            let text = format!("the episodes differ at {difference}");
+            return Err(Exit::finding(1, text).into());
         }
         let steps = a.driven().last().map_or(0, |frame| frame.step);
         writeln!(io::stdout().lock(), "alike       {steps} steps")?;

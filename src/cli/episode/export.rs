@@ -105,7 +105,7 @@ impl Export {
         }
         let shown = driven(&recording.frames);
         for (index, frame) in recording.frames.iter_mut().enumerate() {
-            let cameras = if shown.contains(&index) { &wanted[..] } else { &[] };
+            let cameras = if shown.binary_search(&index).is_ok() { &wanted[..] } else { &[] };
             keep_cameras(frame, cameras, count);
         }
         let cache = Cache::new(self.twins.catalog()?);

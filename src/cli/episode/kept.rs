@@ -1,9 +1,8 @@
 //! Which images of a record are rendered again.
 
-use std::collections::BTreeSet;
-
 use anyhow::Context as _;
 
+use wildcity_episode::driven_indices;
 use wildcity_session::{FrameRecord, FrameRequest, RecordedEpisode};
 
 /// Index of the camera of a name.
@@ -36,16 +35,9 @@ pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_
     frame.cameras = cameras;
 }
 
-/// Indices of the frames that the ego drove last: where a session went back, the later frames replace the earlier ones.
-pub(super) fn driven(frames: &[FrameRecord]) -> BTreeSet<usize> {
-    let mut driven: Vec<usize> = Vec::new();
-    for (index, frame) in frames.iter().enumerate() {
-        if frame.request == FrameRequest::Observe || frame.poses.is_empty() {
-            continue;
-        }
-        let kept = driven.partition_point(|&before| frames[before].step < frame.step);
-        driven.truncate(kept);
-        driven.push(index);
-    }
-    driven.into_iter().collect()
+/// Indices of the frames that the ego drove last.
+pub(super) fn driven(frames: &[FrameRecord]) -> Vec<usize> {
+    let moves =
+        |frame: &FrameRecord| frame.request != FrameRequest::Observe && !frame.poses.is_empty();
+    driven_indices(frames.iter().map(|frame| moves(frame).then_some(frame.step)))
 }

@@ -140,14 +140,10 @@ impl Run {
         self.verified(&result, &episodes, &catalog, &*backend)?;
         match result.exit_code() {
             ExitCode::Passed => Ok(()),
-            code => {
-                let counts = &result.counts;
-                let text = format!(
-                    "of {} episodes {} failed, {} were not driven, {} left the trained area",
-                    counts.episodes, counts.failed, counts.technical, counts.off_model
-                );
-                Err(exit(code, text))
+            ExitCode::Driving => {
+                Err(Exit::finding(ExitCode::Driving as u8, ending(&result)).into())
             }
+            code => Err(exit(code, ending(&result))),
         }
     }
 
@@ -173,6 +169,9 @@ impl Run {
                 episode.errors.last().map(|error| format!("{}: {}", error.kind, error.message));
             let why = why.join(", ") + &error.unwrap_or_default();
             writeln!(out, "{:<12} {:<32} {why}", episode.status.name(), episode.name)?;
+            if let Some(reason) = episode.mcap_error() {
+                eprintln!("warning: no MCAP file of {}: {reason}", episode.name);
+            }
         }
         let rate = &result.pass_rate;
         let [low, high] = rate.interval.map(|end| 100.0 * end);
@@ -224,8 +223,24 @@ fn choice(agent: String) -> anyhow::Result<AgentChoice> {
     Ok(AgentChoice::Command { name: agent, line })
 }
 
+/// Why a run did not end as wanted.
+fn ending(result: &SuiteResult) -> String {
+    let counts = &result.counts;
+    let text = format!(
+        "of {} episodes {} failed, {} were not judged, {} were not driven, {} left the trained area",
+        counts.episodes, counts.failed, counts.not_judged, counts.technical, counts.off_model
+    );
+    let low = result.pass_rate.interval[0];
+    match result.at_least.filter(|least| low < *least) {
+        Some(least) => {
+            format!("{text}; the pass rate is at least {low:.3}, and {least} was wanted")
+        }
+        None => text,
+    }
+}
+
 fn exit(code: ExitCode, message: impl std::fmt::Display) -> anyhow::Error {
-    Exit { code: code as u8, message: format!("{message:#}") }.into()
+    Exit::error(code as u8, format!("{message:#}")).into()
 }
 
 fn usage(message: impl std::fmt::Display) -> anyhow::Error {

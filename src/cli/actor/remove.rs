@@ -1,0 +1,40 @@
+//! `wildcity actor remove`.
+
+use std::io::{self, Write};
+
+use anyhow::Context as _;
+
+use crate::cli::directories::Twins;
+
+/// Remove an asset, to make room or to free its name.
+///
+/// Episodes that run keep it in memory. From then on scenarios that name it are refused, and recorded episodes that drew
+/// it cannot be replayed, until the same asset is made again. No twin changes.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = "\
+Examples:
+  wildcity actor remove car --dry-run
+  wildcity actor remove 9f0c21ab")]
+pub(super) struct Remove {
+    /// The asset: its name if no other has it, or the first digits of its hash; a damaged one, too.
+    #[arg(value_name = "ACTOR")]
+    actor: String,
+
+    /// Only print what would be done.
+    #[arg(long)]
+    dry_run: bool,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+impl Remove {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let removed = catalog.remove_actor(&self.actor, self.dry_run);
+        let hash = removed.with_context(|| format!("{}", catalog.dir().display()))?;
+        let removed = if self.dry_run { "would remove" } else { "removed" };
+        writeln!(io::stdout(), "{removed} actor {}\nblake3 {hash}", self.actor)?;
+        Ok(())
+    }
+}
