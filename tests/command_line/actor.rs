@@ -1,4 +1,4 @@
-//! `wildcity actor import` and `wildcity actor show`: how sharp a mesh is as an actor.
+//! `wildcity actor`: how sharp a mesh is as an actor, damaged assets, and removing assets.
 
 use std::path::Path;
 
@@ -106,4 +106,58 @@ fn an_edge_of_a_mesh_at_eight_metres_is_sharp() {
     // Half as many would not do.
     let few = edges(dir.path(), &["--gaussians", "100000"]);
     assert!(few.width_px > 2.0, "{few:?}, {own:?}");
+}
+
+/// Runs `wildcity actor` on a directory. Returns whether it succeeded, and what it said.
+fn actor(twins: &Path, arguments: &[&str]) -> (bool, String) {
+    let output =
+        wildcity().arg("actor").args(arguments).arg("--twins").arg(twins).output().unwrap();
+    let said = [output.stdout, output.stderr].concat();
+    (output.status.success(), String::from_utf8(said).unwrap())
+}
+
+#[test]
+fn a_damaged_asset_is_listed_and_removed() {
+    let dir = tempfile::tempdir().unwrap();
+    let twins = dir.path().join("twins");
+    let file = dir.path().join("plate.glb");
+    std::fs::write(&file, plate()).unwrap();
+    let import = |name: &str| {
+        let file = file.to_str().unwrap();
+        let (done, said) = actor(&twins, &["import", file, "--name", name, "--gaussians", "1000"]);
+        assert!(done, "{said}");
+        said.trim_end().rsplit(' ').next().unwrap().to_owned()
+    };
+    let hashes = [import("good"), import("bad")];
+    let path = twins.join(".actors/objects").join(&hashes[1][..2]).join(&hashes[1]);
+    let mut bytes = std::fs::read(&path).unwrap();
+    *bytes.last_mut().unwrap() ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+
+    let (done, said) = actor(&twins, &["list"]);
+    let lines: Vec<&str> = said.lines().collect();
+    assert!(done && lines.len() == 2, "{said}");
+    assert!(lines[0].starts_with("good ") && lines[0].ends_with(&hashes[0]), "{said}");
+    assert!(lines[1].starts_with("bad ") && lines[1].ends_with(&hashes[1]), "{said}");
+    assert!(lines[1].contains("damaged: its bytes hash to"), "{said}");
+    let (done, said) = actor(&twins, &["show", "good"]);
+    assert!(done && said.contains(&hashes[0]), "{said}");
+    let (done, said) = actor(&twins, &["show", "bad"]);
+    let remove = format!("wildcity actor remove {}", &hashes[1][..12]);
+    assert!(!done && said.contains("is damaged") && said.contains(&remove), "{said}");
+    // The command line says where it looked.
+    let (done, said) = actor(&twins, &["show", "bus"]);
+    assert!(!done && said.contains(&*twins.to_string_lossy()) && said.contains("good"), "{said}");
+    let found = wildcity().arg("doctor").arg("--twins").arg(&twins).output().unwrap();
+    let found = String::from_utf8(found.stdout).unwrap();
+    assert!(found.contains(&remove), "{found}");
+
+    let (done, said) = actor(&twins, &["remove", "bad", "--dry-run"]);
+    assert!(done && said.starts_with("would remove") && path.exists(), "{said}");
+    let (done, said) = actor(&twins, &["remove", "bad"]);
+    assert!(done && said.starts_with("removed") && !path.exists(), "{said}");
+    let (done, said) = actor(&twins, &["remove", "bad"]);
+    assert!(!done && said.contains("there is no actor"), "{said}");
+    let (done, said) = actor(&twins, &["list"]);
+    assert!(done && said.lines().count() == 1, "{said}");
 }

@@ -11,8 +11,12 @@ use crate::versions::{commit, street};
 use crate::wildcity;
 
 fn demo(dir: &Path) -> Output {
+    demo_with(dir, &[])
+}
+
+fn demo_with(dir: &Path, arguments: &[&str]) -> Output {
     let mut command = wildcity();
-    command.args(["demo", "--steps", "1", "--twins"]).arg(dir.join("twins"));
+    command.args(["demo", "--steps", "1"]).args(arguments).arg("--twins").arg(dir.join("twins"));
     command.arg("--out").arg(dir.join("out")).output().unwrap()
 }
 
@@ -31,6 +35,29 @@ fn a_twin_of_the_same_name_is_left_alone() {
     );
     assert!(said.contains("give another directory with --twins"), "{said}");
     assert_eq!(Catalog::open(&twins).unwrap().version("demo", None).unwrap(), mine.unwrap());
+}
+
+#[test]
+fn a_demo_with_traffic_makes_its_assets_and_mends_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
+    let mut pictures = Vec::new();
+    for scenario in ["cut-in", "traffic"] {
+        let output = demo_with(dir.path(), &["--scenario", scenario]);
+        assert!(output.status.success(), "{output:?}");
+        pictures.push(fs::read(dir.path().join("out/step_0000.png")).unwrap());
+        let list = catalog.actors().unwrap();
+        let names: Vec<&str> = list.actors.iter().map(|actor| &*actor.description.name).collect();
+        assert_eq!(names, ["hatchback", "pedestrian", "sedan", "van"], "{scenario}");
+        assert_eq!(list.damaged, []);
+        // The next one finds a damaged asset.
+        let hash = &list.actors[0].hash;
+        let path = dir.path().join("twins/.actors/objects").join(&hash[..2]).join(hash);
+        fs::write(path, "damaged").unwrap();
+    }
+    assert!(demo(dir.path()).status.success());
+    pictures.push(fs::read(dir.path().join("out/step_0000.png")).unwrap());
+    assert!(pictures[0] != pictures[1] && pictures[1] != pictures[2] && pictures[0] != pictures[2]);
 }
 
 #[test]

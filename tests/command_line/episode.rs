@@ -42,8 +42,27 @@ fn a_suite_is_driven_and_its_records_are_read() {
     let stand = run("stand", "stand");
     assert_eq!(stand.status.code(), Some(1), "{}", stdout(&stand));
     assert!(stdout(&stand).contains("progress"), "{}", stdout(&stand));
-    assert_eq!(run("log", "log").status.code(), Some(2), "the directory has another run");
+    // A verdict is no error of the program.
+    let verdict = String::from_utf8(stand.stderr).unwrap();
+    assert!(verdict.starts_with("of 1 episodes 1 failed, "), "{verdict}");
+    let wanted = ["run", "short.json", "--twins", twins, "--at-least", "0.9", "--out", "wanted"];
+    let wanted = wildcity(&[&wanted[..], &["--backend", "cpu"]].concat(), dir.path());
+    assert_eq!(wanted.status.code(), Some(1), "{}", stdout(&wanted));
+    let verdict = String::from_utf8(wanted.stderr).unwrap();
+    // Wilson: 1 of 1 is 0.207 to 1.
+    assert!(verdict.contains("the pass rate is at least 0.207, and 0.9 was wanted"), "{verdict}");
+    let again = run("log", "log");
+    assert_eq!(again.status.code(), Some(2), "the directory has another run");
+    assert!(again.stderr.starts_with(b"error: "), "{}", String::from_utf8_lossy(&again.stderr));
     assert_eq!(wildcity(&["run", "nowhere.json"], dir.path()).status.code(), Some(2));
+    // An export that cannot be written is told on standard error and in the report, not in the result.
+    std::fs::create_dir_all(dir.path().join("told/episodes/short-0-1.mcap")).unwrap();
+    let told = run("log", "told");
+    assert_eq!(told.status.code(), Some(0), "{}", stdout(&told));
+    let warning = String::from_utf8(told.stderr).unwrap();
+    assert!(warning.contains("warning: no MCAP file of short-0: cannot write"), "{warning}");
+    let result = |run: &str| std::fs::read(dir.path().join(run).join("result.json")).unwrap();
+    assert_eq!(result("told"), result("log"));
 
     let records = ["log", "stand"].map(|run| format!("{run}/episodes"));
     let listed = stdout(&wildcity(&["list", "--episodes", &records[0]], dir.path()));
@@ -61,7 +80,15 @@ fn a_suite_is_driven_and_its_records_are_read() {
     let other = wildcity(&["diff", &files[0], &files[1]], dir.path());
     assert_eq!(other.status.code(), Some(1));
     let error = String::from_utf8(other.stderr).unwrap();
-    assert!(error.contains("step 1: ego"), "{error}");
+    assert!(error.starts_with("the episodes differ at step 1: ego"), "{error}");
+    let exported = wildcity(&["diff", &files[0], "log/episodes/short-0-1.mcap"], dir.path());
+    let error = String::from_utf8(exported.stderr).unwrap();
+    assert!(error.contains("short-0-1.mcap is an MCAP export"), "{error}");
+    assert!(error.contains("log/episodes/short-0-1.jsonl"), "{error}");
+    let mut replay = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+    let replayed = replay.args(["replay", "log/episodes/short-0-1.mcap"]).current_dir(dir.path());
+    let error = String::from_utf8(replayed.output().unwrap().stderr).unwrap();
+    assert!(error.contains("short-0-1.mcap is an MCAP export"), "{error}");
 
     let video = ["video", &files[0], "--out", "frames", "--twins", twins, "--backend", "cpu"];
     let text = stdout(&wildcity(&video, dir.path()));

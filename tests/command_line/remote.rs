@@ -5,8 +5,9 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use crate::places::commit;
-use crate::s3::{S3, keys};
+use crate::s3::{Fault, S3, keys};
 use crate::scene_files::{gaussians, inria_columns, ply};
+use crate::served::Served;
 use crate::wildcity;
 
 #[test]
@@ -66,6 +67,61 @@ fn a_killed_import_leaves_the_old_version_or_the_new_one() {
     assert!(killed_on_the_way >= 2, "only {killed_on_the_way} were killed on the way");
     assert!(import(&s3, &source).status().unwrap().success());
     assert_eq!(catalog.version("street", None).unwrap().manifest.gaussians(), 20_000);
+}
+
+/// Pushes of assets to a server whose twins are in an object store.
+#[test]
+fn an_actor_is_pushed_to_an_object_store() {
+    let s3 = S3::start();
+    let dir = tempfile::tempdir().unwrap();
+    let served = Served::at(S3::url().as_ref(), tempfile::tempdir().unwrap(), |command| {
+        s3.environment(command).env("XDG_CACHE_HOME", dir.path())
+    });
+    let url = format!("http://{}", served.address);
+    let file = |name: &str, seed: u64| {
+        let path = dir.path().join(format!("{name}.ply"));
+        std::fs::write(&path, ply(&gaussians(500, 0, 2.0, seed), &inria_columns(0, false)))
+            .unwrap();
+        path.display().to_string()
+    };
+    let run = |arguments: &[&str]| {
+        let mut command = wildcity();
+        command.arg("actor").args(arguments).env("XDG_CACHE_HOME", dir.path());
+        let output = s3.environment(&mut command).output().unwrap();
+        let said = |bytes: &[u8]| String::from_utf8(bytes.to_owned()).unwrap();
+        (output.status.success(), said(&output.stdout), said(&output.stderr))
+    };
+    let objects = || keys(&s3.twins().join(".actors")).len();
+    let listed = || run(&["list", "--twins", &S3::url()]).1;
+    let car = file("car", 1);
+
+    // An object that cannot be written: nothing is there. The server tries more often than a test would.
+    s3.fail("PUT", "/.actors/objects/", 100, Fault::Status(403));
+    let (done, _, error) = run(&["push", &car, "--server", &url]);
+    assert!(!done && error.contains("cannot push the actor"), "{error}");
+    assert!(objects() == 0 && listed().starts_with("no actors in s3://"), "{}", listed());
+    s3.forgive();
+
+    let (done, pushed, error) = run(&["push", &car, "--server", &url]);
+    assert!(done, "{error}");
+    let own = dir.path().join("own").display().to_string();
+    let (_, imported, error) = run(&["import", &car, "--twins", &own]);
+    assert_eq!(pushed, imported, "{error}");
+    let hash = pushed.trim_end().rsplit(' ').next().unwrap();
+    assert!(objects() == 1 && listed().contains(hash), "{}", listed());
+    // The same again, another content of this name, and one whose answer is lost.
+    assert_eq!(run(&["push", &car, "--server", &url]).1, pushed);
+    let van = file("van", 2);
+    let (done, _, error) = run(&["push", &van, "--name", "car", "--server", &url]);
+    assert!(!done && error.contains("another content"), "{error}");
+    s3.fail("PUT", "/.actors/objects/", 1, Fault::AnswerLost);
+    let (done, _, error) = run(&["push", &van, "--server", &url]);
+    assert!(done && s3.to_fail() == 0, "{error}");
+    assert_eq!((objects(), listed().lines().count()), (2, 2));
+
+    let (done, removed, error) = run(&["remove", "car", "--twins", &S3::url()]);
+    assert!(done && removed == format!("removed actor car\nblake3 {hash}\n"), "{removed}{error}");
+    assert_eq!((objects(), listed().lines().count()), (1, 1));
 }
 
 fn import(s3: &S3, source: &Path) -> Command {

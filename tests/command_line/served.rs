@@ -1,5 +1,6 @@
 //! A server as a process of its own, with a twin of its own.
 
+use std::ffi::OsStr;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
 use std::process::{Child, Command, Stdio};
@@ -13,7 +14,7 @@ use crate::support::{self, Agent};
 pub(crate) struct Served {
     child: Child,
     pub(crate) address: SocketAddr,
-    _twins: tempfile::TempDir,
+    _dir: tempfile::TempDir,
     _episodes: tempfile::TempDir,
 }
 
@@ -24,16 +25,27 @@ impl Served {
 
     /// With more arguments.
     pub(crate) fn with(arguments: &[&str]) -> Self {
-        let (twins, episodes) = (support::twins(), tempfile::tempdir().unwrap());
-        let mut child = Command::new(env!("CARGO_BIN_EXE_wildcity"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--log", "warn", "--threads", "1"])
-            .args(arguments)
+        let twins = support::twins();
+        let at = twins.path().as_os_str().to_owned();
+        Self::at(&at, twins, |command| command.args(arguments))
+    }
+
+    /// With twins at a directory or URL, and its uploads in `dir`.
+    pub(crate) fn at(
+        twins: &OsStr,
+        dir: tempfile::TempDir,
+        change: impl FnOnce(&mut Command) -> &mut Command,
+    ) -> Self {
+        let episodes = tempfile::tempdir().unwrap();
+        let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+        command.args(["serve", "--listen", "127.0.0.1:0", "--log", "warn", "--threads", "1"]);
+        let mut child = change(&mut command)
             .arg("--twins")
-            .arg(twins.path())
+            .arg(twins)
             .arg("--episodes")
             .arg(episodes.path())
             .arg("--uploads")
-            .arg(twins.path().join(".uploads"))
+            .arg(dir.path().join(".uploads"))
             .stdout(Stdio::piped())
             .spawn()
             .unwrap();
@@ -43,7 +55,7 @@ impl Served {
             .strip_prefix("listening on ws://")
             .and_then(|rest| rest.trim_end().strip_suffix("/v1/session"));
         let address = address.expect(&line).parse().unwrap();
-        Self { child, address, _twins: twins, _episodes: episodes }
+        Self { child, address, _dir: dir, _episodes: episodes }
     }
 
     /// Resident memory, in bytes.

@@ -127,7 +127,7 @@ fn run(text: &[u8]) -> Result<usize, String> {
     let drives = [drive()];
     let tracks = TracksFile::parse(tracks().to_string().as_bytes()).unwrap();
     let map = Map::new(map()).unwrap();
-    let nothing = |_: &str| None;
+    let nothing = |_: &str| Err("there is none".to_owned());
     let around =
         Surroundings { drives: &drives, tracks: Some(&tracks), map: Some(&map), asset: &nothing };
     let scenario = Scenario::resolve(file, 3, &around).map_err(refused)?;

@@ -125,7 +125,7 @@ pub(crate) fn settings() -> Settings {
 }
 
 fn resolved(file: ScenarioFile) -> Scenario {
-    let nothing = |_: &str| None;
+    let nothing = |_: &str| Err("there is none".to_owned());
     let around = Surroundings { drives: &[], tracks: None, map: None, asset: &nothing };
     Scenario::resolve(file, 1, &around).unwrap()
 }

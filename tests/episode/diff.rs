@@ -48,5 +48,5 @@ fn lengths_and_setups_differ() {
     let mut lines = whole.lines();
     lines[0]["seed"] = json!(8);
     let found = diff(&whole.read(), &written::read(&lines)).unwrap();
-    assert_eq!((found.what, found.how.as_str()), (What::Setup, "seed 7, 8"));
+    assert_eq!((found.what, found.how.as_str()), (What::Setup, "seed 7 against 8"));
 }

@@ -1,10 +1,15 @@
 //! Export as MCAP: what a reader finds, and how large the file is.
 
-use std::io::Cursor;
+use std::io::{Cursor, Write as _};
+use std::path::Path;
+use std::time::{Duration, SystemTime};
 
 use prost::Message as _;
 use serde_json::{Value, json};
-use wildcity_episode::{EpisodeExport, EpisodeFile, ExportedImage, export, export_file, mcap_of};
+use wildcity_episode::{
+    EpisodeExport, EpisodeFile, ExportError, ExportedImage, export, export_file, mcap_of,
+    remove_leftovers, write_whole,
+};
 
 use crate::written::{self, Made};
 
@@ -217,4 +222,86 @@ fn images_are_between_the_steps_in_the_order_of_time() {
     let stream = mcap::MessageStream::new(&bytes).unwrap();
     let times: Vec<u64> = stream.map(|message| message.unwrap().log_time).collect();
     assert!(times.is_sorted(), "{times:?}");
+}
+
+/// All of them write at the same time: each closure waits for the others.
+#[test]
+fn exports_to_one_name_at_once_do_not_meet() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.mcap");
+    let all_write = std::sync::Barrier::new(4);
+    std::thread::scope(|scope| {
+        for content in [b'a', b'b', b'c', b'd'] {
+            let (path, all_write) = (&path, &all_write);
+            scope.spawn(move || {
+                let written = write_whole(path, |out| {
+                    all_write.wait();
+                    for _ in 0..50_000 {
+                        out.write_all(&[content]).map_err(ExportError::Output)?;
+                    }
+                    all_write.wait();
+                    Ok(())
+                });
+                written.unwrap();
+            });
+        }
+    });
+    let bytes = std::fs::read(&path).unwrap();
+    assert_eq!(bytes.len(), 50_000);
+    assert!(bytes.iter().all(|&byte| byte == bytes[0]), "one of them, whole");
+    let left = std::fs::read_dir(dir.path()).unwrap().count();
+    assert_eq!(left, 1, "no temporary file");
+}
+
+#[cfg(unix)]
+#[test]
+fn an_export_has_the_rights_of_any_new_file() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let dir = tempfile::tempdir().unwrap();
+    let [by_hand, exported] = ["by-hand", "a.mcap"].map(|name| dir.path().join(name));
+    std::fs::write(&by_hand, b"").unwrap();
+    write_whole(&exported, |_| Ok(())).unwrap();
+    let mode = |path: &Path| std::fs::metadata(path).unwrap().permissions().mode();
+    assert_eq!(mode(&exported), mode(&by_hand));
+}
+
+#[test]
+fn an_export_that_fails_leaves_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let fails = |out: &mut std::io::BufWriter<&mut std::fs::File>| {
+        out.write_all(b"half").map_err(ExportError::Output)?;
+        Err::<(), _>(ExportError::Empty)
+    };
+    assert!(write_whole(&dir.path().join("a.mcap"), fails).is_err());
+    std::fs::create_dir(dir.path().join("taken.mcap")).unwrap();
+    let error = write_whole(&dir.path().join("taken.mcap"), |_| Ok(())).unwrap_err().to_string();
+    assert!(error.contains("cannot write") && error.contains("taken.mcap"), "{error}");
+    let nowhere = write_whole(&dir.path().join("none/a.mcap"), |_| Ok(())).unwrap_err();
+    assert!(nowhere.to_string().contains("none/a.mcap"), "{nowhere}");
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+}
+
+#[test]
+fn only_old_temporary_files_of_exports_are_leftovers() {
+    let dir = tempfile::tempdir().unwrap();
+    let now = SystemTime::now();
+    let [old, new] = [3700, 3500].map(|age_s| now - Duration::from_secs(age_s));
+    let files = [
+        ("a-1.mcap.Xy12Zw.tmp", old, false),
+        ("a-1.mcap.tmp", old, false),
+        ("b-1.mcap.Xy12Zw.tmp", new, true),
+        ("a-1.mcap", old, true),
+        ("a-1.jsonl", old, true),
+        ("a-1.jsonl.Xy12Zw.tmp", old, true),
+        ("mcap.tmp", old, true),
+    ];
+    for (name, modified, _) in files {
+        let file = std::fs::File::create(dir.path().join(name)).unwrap();
+        file.set_modified(modified).unwrap();
+    }
+    assert_eq!(remove_leftovers(dir.path(), now).unwrap(), 2);
+    for (name, _, stays) in files {
+        assert_eq!(dir.path().join(name).exists(), stays, "{name}");
+    }
+    assert_eq!(remove_leftovers(&dir.path().join("none"), now).unwrap(), 0);
 }

@@ -12,6 +12,7 @@ use wildcity_episode::{
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::contact::Contact;
+use wildcity_sim::ego::TimedPose;
 use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox};
 
 /// An episode of `steps` steps of 0.1 s.
@@ -116,7 +117,7 @@ impl Made {
             let ahead_m = self.speed_mps * time_s * (0.5 * turned).cos();
             let position_m = DVec3::new(ahead_m, 0.5 * turned * time_s, 1e-3 * turned);
             let start_from_rig = Pose { position_m, rotation: DQuat::from_rotation_z(turned) };
-            json!({ "time_us": 100_000 * k, "start_from_rig": start_from_rig })
+            json!(TimedPose { time_us: 100_000 * i64::from(k), start_from_rig })
         };
         (1..=self.plan_poses).map(pose).collect()
     }
@@ -142,7 +143,8 @@ pub(crate) fn write(path: &Path, lines: &[Value]) {
 }
 
 fn tagged(kind: &str, line: &impl serde::Serialize) -> Value {
-    let mut value = serde_json::to_value(line).unwrap();
+    // By its text: as a value, an f32 would have the digits of an f64.
+    let mut value: Value = serde_json::from_str(&serde_json::to_string(line).unwrap()).unwrap();
     value["kind"] = kind.into();
     value
 }

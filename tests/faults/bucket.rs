@@ -7,7 +7,7 @@
 //! Requests run on one thread, each with its repetitions in the order in which they begin, so that a history follows
 //! from its seed.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::ops::Bound;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -31,9 +31,13 @@ use wildcity_twin::store::{Catalog, RetryPolicy, StoreError};
 use crate::disk::{Fault, Plant, SimClock};
 use crate::medium::Medium;
 use crate::random::Random;
+use crate::reads::{BadReads, Carries, ReadFault};
 
 /// Prefix of the twins' keys.
 const PREFIX: &str = "twins";
+
+/// The most attempts of a request.
+const TRIES: u32 = 3;
 
 /// Writes of a push of three cells, about: fewer than on a disk, where each has a dozen.
 const WRITES: u64 = 12;
@@ -46,7 +50,7 @@ struct Object {
 
 /// A put that has no effect yet.
 #[derive(Debug)]
-struct Late {
+struct DelayedPut {
     key: Key,
     bytes: Bytes,
     mode: PutMode,
@@ -62,12 +66,17 @@ struct State {
     /// Of [`Fault::Full`]: how many more writes are refused, and whether they have their effect.
     refusals: Option<(u64, bool)>,
     /// The last put of a process that was stopped.
-    last: Option<Late>,
+    last: Option<DelayedPut>,
     /// Puts of earlier processes that are still on their way.
-    late: Vec<Late>,
+    delayed: Vec<DelayedPut>,
     plant: Option<Plant>,
     /// Objects whose put was answered and is not done ([`Plant::RecordBeforeObjects`]).
     withheld: Vec<(Key, Bytes)>,
+    bad_reads: Option<BadReads>,
+    /// Number of reads that failed or were damaged.
+    failed_reads: u64,
+    /// What counts as absent ([`Plant::FailedReadIsAbsent`]).
+    absent: BTreeSet<Key>,
 }
 
 /// The store as one process sees it. The handle is dead after the process was stopped.
@@ -90,6 +99,10 @@ fn refused() -> Error {
     Error::Generic { store: "simulation", source: "the request failed".into() }
 }
 
+fn not_found(key: &Key) -> Error {
+    Error::NotFound { path: key.to_string(), source: "there is none".into() }
+}
+
 fn unsupported(what: &str) -> Error {
     Error::NotSupported { source: what.into() }
 }
@@ -101,9 +114,12 @@ impl SimBucket {
             fault: None,
             refusals: None,
             last: None,
-            late: Vec::new(),
+            delayed: Vec::new(),
             plant,
             withheld: Vec::new(),
+            bad_reads: None,
+            failed_reads: 0,
+            absent: BTreeSet::new(),
         };
         Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
     }
@@ -112,9 +128,36 @@ impl SimBucket {
         self.state.lock().expect("no test thread panics with it")
     }
 
-    /// The state for a read.
-    fn read(&self) -> Result<MutexGuard<'_, State>> {
+    /// The state, unless the process was stopped.
+    fn living(&self) -> Result<MutexGuard<'_, State>> {
         if self.is_stopped() { Err(refused()) } else { Ok(self.lock_state()) }
+    }
+
+    /// The state for a read, unless it fails; and what is wrong with the bytes that are read.
+    fn read(
+        &self,
+        key: &Key,
+        carries: Carries,
+    ) -> Result<(MutexGuard<'_, State>, Option<ReadFault>)> {
+        let mut state = self.living()?;
+        if state.absent.contains(key) {
+            return Err(not_found(key));
+        }
+        let fault = BadReads::next(&mut state.bad_reads, carries);
+        match fault {
+            None => {}
+            Some(ReadFault::Slow) => self.clock.wait(ReadFault::SLOW_US),
+            Some(fault) => {
+                state.failed_reads += 1;
+                if state.plant == Some(Plant::FailedReadIsAbsent) {
+                    state.absent.insert(key.clone());
+                }
+                if fault == ReadFault::Error {
+                    return Err(refused());
+                }
+            }
+        }
+        Ok((state, fault))
     }
 
     /// The state for a write, and what becomes of the write. `put` is what it puts.
@@ -122,9 +165,9 @@ impl SimBucket {
         &self,
         put: Option<(&Key, &Bytes, &PutMode)>,
     ) -> Result<(MutexGuard<'_, State>, Outcome)> {
-        let mut state = self.read()?;
+        let mut state = self.living()?;
         let now_us = self.clock.now_us();
-        state.land_late(now_us);
+        state.apply_due_puts(now_us);
         if let Some((left, has_effect)) = state.refusals {
             state.refusals = (left > 1).then_some((left - 1, has_effect));
             return Ok((state, if has_effect { Outcome::AnswerLost } else { Outcome::Refused }));
@@ -145,7 +188,7 @@ impl SimBucket {
             }
             Some((0, Fault::PowerCut)) => {
                 self.is_dead.store(true, Ordering::Relaxed);
-                state.last = put.map(|(key, bytes, mode)| Late {
+                state.last = put.map(|(key, bytes, mode)| DelayedPut {
                     key: key.clone(),
                     bytes: bytes.clone(),
                     mode: mode.clone(),
@@ -173,8 +216,8 @@ impl SimBucket {
     }
 
     fn find(&self, prefix: Option<&Key>) -> Result<Vec<ObjectMeta>> {
-        let state = self.read()?;
         let prefix = prefix.cloned().unwrap_or_default();
+        let (state, _) = self.read(&prefix, Carries::Names)?;
         let is_below =
             |key: &Key| key.prefix_match(&prefix).is_some_and(|mut rest| rest.next().is_some());
         let found = state.objects.range((Bound::Included(prefix.clone()), Bound::Unbounded));
@@ -210,10 +253,10 @@ impl State {
     }
 
     /// Lets the puts of earlier processes arrive that are due at this write.
-    fn land_late(&mut self, now_us: i64) {
-        for Late { key, bytes, mode, writes } in std::mem::take(&mut self.late) {
+    fn apply_due_puts(&mut self, now_us: i64) {
+        for DelayedPut { key, bytes, mode, writes } in std::mem::take(&mut self.delayed) {
             if writes > 0 {
-                self.late.push(Late { key, bytes, mode, writes: writes - 1 });
+                self.delayed.push(DelayedPut { key, bytes, mode, writes: writes - 1 });
             } else {
                 // No process waits for the answer.
                 let _ = self.put(&key, bytes, &mode, now_us);
@@ -225,7 +268,9 @@ impl State {
     fn end_process(&mut self, random: &mut Random, now_us: i64) {
         self.fault = None;
         self.refusals = None;
+        self.bad_reads = None;
         self.withheld.clear();
+        self.absent.clear();
         let Some(last) = self.last.take() else { return };
         let replaces_nothing =
             matches!(last.mode, PutMode::Create) || last.key.as_ref().contains("/objects/");
@@ -234,7 +279,7 @@ impl State {
             1 | 2 if replaces_nothing => {
                 // Before the next commit's record, or after it.
                 let writes = random.below(2) * WRITES + random.below(WRITES);
-                self.late.push(Late { writes, ..last });
+                self.delayed.push(DelayedPut { writes, ..last });
             }
             _ => {
                 let _ = self.put(&last.key, last.bytes, &last.mode, now_us);
@@ -246,9 +291,9 @@ impl State {
 impl Medium for SimBucket {
     fn open(&self, clock: &Arc<SimClock>) -> std::result::Result<Catalog, StoreError> {
         let retry = RetryPolicy {
-            tries: 3,
+            tries: TRIES,
             backoff: Duration::ZERO,
-            section_tries: 3,
+            section_tries: TRIES,
             threads: 1,
             ..RetryPolicy::default()
         };
@@ -265,10 +310,24 @@ impl Medium for SimBucket {
         self.lock_state().fault = Some((writes % WRITES, fault));
     }
 
+    fn fail_reads(&self, reads: BadReads) {
+        self.lock_state().bad_reads = Some(reads);
+    }
+
+    fn stop_failing_reads(&self) {
+        self.lock_state().bad_reads = None;
+    }
+
+    fn take_failed_reads(&self) -> bool {
+        // A single request is repeated.
+        std::mem::take(&mut self.lock_state().failed_reads) >= u64::from(TRIES)
+    }
+
     fn stop_failing(&self) {
         let mut state = self.lock_state();
         state.fault = None;
         state.refusals = None;
+        state.bad_reads = None;
     }
 
     fn is_stopped(&self) -> bool {
@@ -288,10 +347,10 @@ impl Medium for SimBucket {
         })
     }
 
-    fn end_late(&self) {
+    fn apply_delayed_puts(&self) {
         let mut state = self.lock_state();
-        state.late.iter_mut().for_each(|late| late.writes = 0);
-        state.land_late(self.clock.now_us());
+        state.delayed.iter_mut().for_each(|put| put.writes = 0);
+        state.apply_due_puts(self.clock.now_us());
     }
 
     fn commits_left(&self) -> Vec<String> {
@@ -364,16 +423,20 @@ impl ObjectStore for SimBucket {
     }
 
     async fn get_opts(&self, key: &Key, options: GetOptions) -> Result<GetResult> {
-        let state = self.read()?;
-        let not_found =
-            || Error::NotFound { path: key.to_string(), source: "there is none".into() };
-        let object = state.objects.get(key).ok_or_else(not_found)?;
+        let carries = match key.as_ref().contains("/objects/") {
+            _ if options.head => Carries::Names,
+            true => Carries::Digested,
+            false => Carries::Content,
+        };
+        let (state, fault) = self.read(key, carries)?;
+        let object = state.objects.get(key).ok_or_else(|| not_found(key))?;
         let meta = Self::meta(key, object);
         let range = match &options.range {
             Some(range) => range.as_range(meta.size).map_err(|_| refused())?,
             None => 0..meta.size,
         };
         let bytes = object.bytes.slice(range.start as usize..range.end as usize);
+        let bytes = fault.map_or(bytes.clone(), |fault| fault.damaged(bytes.into()).into());
         Ok(GetResult {
             payload: GetResultPayload::Stream(stream::once(async { Ok(bytes) }).boxed()),
             meta,

@@ -1,5 +1,5 @@
-//! A disk in memory that forgets what was not synced, fails, and stops the process between two writes; and a clock
-//! that jumps.
+//! A disk in memory that forgets what was not synced, fails at reads and writes, and stops the process between two
+//! writes; and a clock that jumps.
 //!
 //! The disk has two states. The *live* one is what processes see. The *durable* one has the files as they were last
 //! synced, and the names as of the last sync of their directory. After a power cut, each name that was not synced is old
@@ -13,9 +13,12 @@ use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use wildcity_twin::store::clock::Clock;
-use wildcity_twin::store::disk::{Disk, FileInfo, Lock, ReadFile, Wait, WriteFile};
+use wildcity_twin::store::disk::{
+    Disk, FileInfo, Lock, ReadFile, Wait, WriteFile, check_truncation,
+};
 
-use crate::random::Random;
+use super::random::Random;
+use super::reads::{BadReads, Carries, ReadFault};
 
 /// The root of the disk.
 pub(crate) const ROOT: &str = "/twins";
@@ -31,6 +34,12 @@ pub(crate) enum Plant {
     LeakedLease,
     /// In an object store, a log record is put in place of another one.
     RecordReplaced,
+    /// What the process once failed to read counts as absent until it ends.
+    FailedReadIsAbsent,
+    /// The content of files is not synced.
+    UnsyncedFiles,
+    /// An unfinished upload counts with the bytes that were announced, and not with those that arrived.
+    AnnouncedCounted,
 }
 
 /// What happens at a write.
@@ -47,22 +56,38 @@ pub(crate) enum Fault {
 
 /// The time of a simulation.
 #[derive(Debug)]
-pub(crate) struct SimClock(AtomicI64);
+pub(crate) struct SimClock {
+    now_us: AtomicI64,
+    monotonic_us: AtomicI64,
+}
+
+/// How far the time goes on with each look at the clock, so that no two events have the same.
+const TICK_US: i64 = 1_000;
 
 impl SimClock {
     pub(crate) fn new() -> Self {
-        Self(AtomicI64::new(1_700_000_000_000_000))
+        Self { now_us: AtomicI64::new(1_700_000_000_000_000), monotonic_us: AtomicI64::new(0) }
     }
 
+    /// Changes the time of day.
     pub(crate) fn jump(&self, us: i64) {
-        self.0.fetch_add(us, Ordering::Relaxed);
+        self.now_us.fetch_add(us, Ordering::Relaxed);
+    }
+
+    /// Lets time pass.
+    pub(crate) fn wait(&self, us: i64) {
+        self.jump(us);
+        self.monotonic_us.fetch_add(us, Ordering::Relaxed);
     }
 }
 
 impl Clock for SimClock {
     fn now_us(&self) -> i64 {
-        // Time goes on, so that no two events have the same.
-        self.0.fetch_add(1_000, Ordering::Relaxed)
+        self.now_us.fetch_add(TICK_US, Ordering::Relaxed)
+    }
+
+    fn monotonic_us(&self) -> i64 {
+        self.monotonic_us.fetch_add(TICK_US, Ordering::Relaxed)
     }
 }
 
@@ -96,6 +121,11 @@ struct State {
     plant: Option<Plant>,
     /// Directories whose sync is withheld until the record's ([`Plant::RecordBeforeObjects`]).
     withheld: Vec<PathBuf>,
+    bad_reads: Option<BadReads>,
+    /// Number of reads that failed or were damaged.
+    failed_reads: u64,
+    /// What counts as absent ([`Plant::FailedReadIsAbsent`]).
+    absent: BTreeSet<PathBuf>,
 }
 
 /// The disk as one process sees it. The handle is dead after the process was stopped.
@@ -108,6 +138,11 @@ pub(crate) struct SimDisk {
 
 fn stopped() -> io::Error {
     io::Error::other("the process was stopped")
+}
+
+fn failed_read() -> io::Error {
+    const EIO: i32 = 5;
+    io::Error::from_raw_os_error(EIO)
 }
 
 fn not_found() -> io::Error {
@@ -126,6 +161,9 @@ impl SimDisk {
             stopped_by: None,
             plant,
             withheld: Vec::new(),
+            bad_reads: None,
+            failed_reads: 0,
+            absent: BTreeSet::new(),
         };
         Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
     }
@@ -133,6 +171,21 @@ impl SimDisk {
     /// Lets a fault happen at the write after so many others, or none.
     pub(crate) fn set_fault(&self, fault: Option<(u64, Fault)>) {
         self.lock_state().fault = fault;
+    }
+
+    /// Lets some reads fail, or none.
+    pub(crate) fn set_bad_reads(&self, reads: Option<BadReads>) {
+        self.lock_state().bad_reads = reads;
+    }
+
+    /// Number of reads that failed or were damaged since this was last called.
+    pub(crate) fn take_failed_reads(&self) -> u64 {
+        std::mem::take(&mut self.lock_state().failed_reads)
+    }
+
+    /// Whether a fault waits for its write.
+    pub(crate) fn has_fault(&self) -> bool {
+        self.lock_state().fault.is_some()
     }
 
     /// Whether the process was stopped.
@@ -151,7 +204,9 @@ impl SimDisk {
         let mut state = self.lock_state();
         state.locked.clear();
         state.fault = None;
+        state.bad_reads = None;
         state.withheld.clear();
+        state.absent.clear();
         if state.stopped_by.take() == Some(Fault::PowerCut) {
             state.lose_power(random);
         }
@@ -160,26 +215,58 @@ impl SimDisk {
         Self { state: self.state.clone(), clock: self.clock.clone(), is_dead }
     }
 
-    /// The files below a directory.
-    pub(crate) fn files_below(&self, dir: &str) -> Vec<PathBuf> {
+    /// The files below a directory, and their sizes in bytes.
+    pub(crate) fn files_below(&self, dir: &str) -> Vec<(PathBuf, u64)> {
         let state = self.lock_state();
-        let files = state.live.iter().filter(|(_, node)| matches!(node, Node::File(_)));
-        let below = files.filter(|(path, _)| path.starts_with(Path::new(ROOT).join(dir)));
-        below.map(|(path, _)| path.clone()).collect()
+        let dir = Path::new(ROOT).join(dir);
+        let below = state.live.iter().filter(|(path, _)| path.starts_with(&dir));
+        let file = |(path, node): (&PathBuf, &Node)| match node {
+            Node::File(index) => Some((path.clone(), state.contents[*index].bytes.len() as u64)),
+            Node::Dir => None,
+        };
+        below.filter_map(file).collect()
     }
 
     fn lock_state(&self) -> MutexGuard<'_, State> {
         self.state.lock().expect("no test thread panics with it")
     }
 
-    /// The state for a read.
-    fn read(&self) -> io::Result<MutexGuard<'_, State>> {
+    /// The state, unless the process was stopped.
+    fn living(&self) -> io::Result<MutexGuard<'_, State>> {
         if self.is_stopped() { Err(stopped()) } else { Ok(self.lock_state()) }
+    }
+
+    /// The state for a read, unless it fails; and what is wrong with the bytes that are read.
+    fn read(
+        &self,
+        path: &Path,
+        carries: Carries,
+    ) -> io::Result<(MutexGuard<'_, State>, Option<ReadFault>)> {
+        let mut state = self.living()?;
+        if state.absent.contains(path) {
+            return Err(not_found());
+        }
+        let fault = BadReads::next(&mut state.bad_reads, carries);
+        match fault {
+            None => {}
+            Some(ReadFault::Slow) => self.clock.wait(ReadFault::SLOW_US),
+            Some(fault) => {
+                state.failed_reads += 1;
+                if state.plant == Some(Plant::FailedReadIsAbsent) {
+                    state.absent.insert(path.to_owned());
+                }
+                // What has content may fail later, when that is read.
+                if fault == ReadFault::Error && carries == Carries::Names {
+                    return Err(failed_read());
+                }
+            }
+        }
+        Ok((state, fault))
     }
 
     /// The state for a write, unless the fault is due.
     fn write(&self) -> io::Result<MutexGuard<'_, State>> {
-        let mut state = self.read()?;
+        let mut state = self.living()?;
         match &mut state.fault {
             Some((0, Fault::Full)) => {
                 state.fault = None;
@@ -216,6 +303,15 @@ impl State {
             Some(Node::Dir) => Err(io::Error::other("it is not a regular file")),
             None => Err(not_found()),
         }
+    }
+
+    /// What the announcement beside an unfinished upload says.
+    fn announced_bytes(&self, path: &Path) -> Option<u64> {
+        path.extension().filter(|kind| *kind == "part")?;
+        let announcement = self.file(&path.with_extension("json")).ok()?;
+        let announcement: serde_json::Value =
+            serde_json::from_slice(&self.contents[announcement].bytes).ok()?;
+        announcement["size"].as_u64()
     }
 
     fn has_children(&self, dir: &Path) -> bool {
@@ -270,7 +366,7 @@ impl State {
 
 impl Disk for SimDisk {
     fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
-        let state = self.read()?;
+        let (state, _) = self.read(dir, Carries::Names)?;
         match state.live.get(dir) {
             Some(Node::Dir) => {}
             Some(Node::File(_)) => return Err(ErrorKind::NotADirectory.into()),
@@ -281,28 +377,48 @@ impl Disk for SimDisk {
     }
 
     fn info(&self, path: &Path) -> io::Result<FileInfo> {
-        let state = self.read()?;
+        let (state, _) = self.read(path, Carries::Names)?;
         let node = state.live.get(path).ok_or_else(not_found)?;
         Ok(match node {
             Node::Dir => FileInfo { bytes: 0, modified_us: 0, is_file: false, is_dir: true },
             Node::File(index) => {
                 let Content { bytes, modified_us, .. } = &state.contents[*index];
-                let bytes = bytes.len() as u64;
+                let announced = match state.plant {
+                    Some(Plant::AnnouncedCounted) => state.announced_bytes(path),
+                    _ => None,
+                };
+                let bytes = announced.unwrap_or(bytes.len() as u64);
                 FileInfo { bytes, modified_us: *modified_us, is_file: true, is_dir: false }
             }
         })
     }
 
     fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>> {
-        let state = self.read()?;
+        let is_upload = path.extension().is_some_and(|kind| kind == "part" || kind == "data");
+        let has_digest = is_upload || path.components().any(|part| part.as_os_str() == "objects");
+        let carries = if has_digest { Carries::Digested } else { Carries::Content };
+        let (state, fault) = self.read(path, carries)?;
         let index = state.file(path)?;
-        Ok(Box::new(OpenFile(Cursor::new(state.contents[index].bytes.clone()))))
+        let bytes = state.contents[index].bytes.clone();
+        let size_bytes = bytes.len() as u64;
+        // Half of the files fail when they are opened, the others when they are read.
+        if fault == Some(ReadFault::Error) && size_bytes.is_multiple_of(2) {
+            return Err(failed_read());
+        }
+        let bytes = fault.map_or(bytes.clone(), |fault| fault.damaged(bytes));
+        let fails = fault == Some(ReadFault::Error);
+        Ok(Box::new(OpenFile { bytes: Cursor::new(bytes), size_bytes, fails }))
     }
 
     fn create(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
         let mut state = self.write()?;
         state.check_parent(path)?;
         let index = state.add_file(path, self.clock.now_us());
+        Ok(Box::new(WrittenFile { disk: self.clone(), index }))
+    }
+
+    fn append(&self, path: &Path) -> io::Result<Box<dyn WriteFile>> {
+        let index = self.living()?.file(path)?;
         Ok(Box::new(WrittenFile { disk: self.clone(), index }))
     }
 
@@ -363,7 +479,7 @@ impl Disk for SimDisk {
     fn remove_all(&self, dir: &Path) -> io::Result<()> {
         // One file after the other: the process may be stopped in between.
         let below: Vec<PathBuf> = {
-            let state = self.read()?;
+            let state = self.living()?;
             let below = state.live.keys().filter(|path| path.starts_with(dir));
             below.rev().cloned().collect()
         };
@@ -403,7 +519,7 @@ impl Disk for SimDisk {
     }
 
     fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>> {
-        let mut state = self.read()?;
+        let (mut state, _) = self.read(path, Carries::Names)?;
         if state.file(path).is_err() {
             if wait == Wait::NoAndExisting {
                 return Err(not_found());
@@ -439,23 +555,28 @@ impl Drop for HeldLock {
 }
 
 #[derive(Debug)]
-struct OpenFile(Cursor<Vec<u8>>);
+struct OpenFile {
+    bytes: Cursor<Vec<u8>>,
+    size_bytes: u64,
+    /// Whether its bytes cannot be read.
+    fails: bool,
+}
 
 impl Read for OpenFile {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        self.0.read(buffer)
+        if self.fails { Err(failed_read()) } else { self.bytes.read(buffer) }
     }
 }
 
 impl Seek for OpenFile {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
-        self.0.seek(to)
+        self.bytes.seek(to)
     }
 }
 
 impl ReadFile for OpenFile {
     fn size_bytes(&self) -> io::Result<u64> {
-        Ok(self.0.get_ref().len() as u64)
+        Ok(self.size_bytes)
     }
 }
 
@@ -470,6 +591,7 @@ impl Write for WrittenFile {
         let mut state = self.disk.write()?;
         let content = &mut state.contents[self.index];
         content.bytes.extend_from_slice(bytes);
+        content.modified_us = self.disk.clock.now_us();
         Ok(bytes.len())
     }
 
@@ -479,8 +601,19 @@ impl Write for WrittenFile {
 }
 
 impl WriteFile for WrittenFile {
+    fn truncate(&mut self, bytes: u64) -> io::Result<()> {
+        let mut state = self.disk.write()?;
+        let content = &mut state.contents[self.index];
+        check_truncation(content.bytes.len() as u64, bytes)?;
+        content.bytes.truncate(bytes as usize);
+        Ok(())
+    }
+
     fn sync(&mut self) -> io::Result<()> {
         let mut state = self.disk.write()?;
+        if state.plant == Some(Plant::UnsyncedFiles) {
+            return Ok(());
+        }
         let content = &mut state.contents[self.index];
         content.synced = Some(content.bytes.clone());
         Ok(())

@@ -1,10 +1,12 @@
 //! Histories: what is done, in what order, and what fails meanwhile.
 
 use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use crate::disk::{Fault, Plant};
 use crate::medium::Kind;
 use crate::random::Random;
+use crate::reads::{BadReads, ReadFault};
 use crate::world::World;
 
 /// One thing that is done.
@@ -20,6 +22,8 @@ pub(crate) enum Operation {
     Rollback { back: u64 },
     /// Opens the version so many before the latest in a session.
     Open { back: u64 },
+    /// Reads all of the version so many before the latest.
+    Read { back: u64 },
     /// Renews the leases of all sessions.
     Renew,
     /// Closes the oldest session.
@@ -40,6 +44,8 @@ pub(crate) struct Step {
     pub(crate) operation: Operation,
     /// The writes before the fault, and the fault.
     pub(crate) fault: Option<(u64, Fault)>,
+    /// Reads that fail, in a step without another fault.
+    pub(crate) bad_reads: Option<BadReads>,
 }
 
 /// What happens in one simulation.
@@ -60,12 +66,23 @@ pub(crate) struct Failure {
 /// Writes of a push of three cells, about: a fault after more does not happen.
 const WRITES: u64 = 60;
 
+/// Reads of a push, about.
+const READS: u64 = 40;
+
+/// Reads of a version, about: the latest is looked up, then the version, and then its sections are read.
+const SECTION_READS: u64 = 16;
+
+/// Reads of a garbage collection that removes objects, about: it looks at each object twice.
+const COLLECTION_READS: u64 = 120;
+
 impl History {
     /// The history of a seed.
     pub(crate) fn of(seed: u64) -> Self {
         let mut random = Random::new(seed);
         let count = 3 + random.below(8);
-        let operations = (0..count).map(|_| Step::random(&mut random)).collect();
+        // Garbage is removed only by the second collection, so that some histories have many.
+        let collects = random.once_in(4);
+        let operations = (0..count).map(|_| Step::random(&mut random, collects)).collect();
         Self { seed, operations }
     }
 
@@ -74,6 +91,11 @@ impl History {
     /// # Errors
     /// Says which promise is broken.
     pub(crate) fn run(&self, kind: Kind, plant: Option<Plant>) -> Result<(), String> {
+        let run = AssertUnwindSafe(|| self.run_steps(kind, plant));
+        catch_unwind(run).unwrap_or_else(|_| Err("the store panicked".to_owned()))
+    }
+
+    fn run_steps(&self, kind: Kind, plant: Option<Plant>) -> Result<(), String> {
         let mut world = World::new(kind, plant)?;
         for (index, step) in self.operations.iter().enumerate() {
             world.run(step).map_err(|reason| format!("operation {index}: {reason}"))?;
@@ -92,11 +114,13 @@ impl History {
                 shorter.operations.remove(index);
                 shorter
             });
-            let calmer = (0..history.operations.len()).filter_map(|index| {
-                let mut calmer = history.clone();
-                calmer.operations[index].fault.take().map(|_| calmer)
+            let without_fault = (0..history.operations.len()).filter_map(|index| {
+                let mut without_fault = history.clone();
+                let Step { fault, bad_reads, .. } = &mut without_fault.operations[index];
+                let had_fault = fault.take().is_some() || bad_reads.take().is_some();
+                had_fault.then_some(without_fault)
             });
-            let candidates: Vec<Self> = without.chain(calmer).collect();
+            let candidates: Vec<Self> = without.chain(without_fault).collect();
             let found =
                 candidates.into_iter().find_map(|shorter| Some((fails(&shorter)?, shorter)));
             let Some(smaller) = found else { return Failure { history, reason } };
@@ -106,10 +130,12 @@ impl History {
 }
 
 impl Step {
-    fn random(random: &mut Random) -> Self {
+    fn random(random: &mut Random, collects: bool) -> Self {
         let cells = 1 + random.below(7) as u8;
         let content = 1 + random.below(6);
-        let operation = match random.below(20) {
+        let kinds = if collects { 32 } else { 22 };
+        let operation = match random.below(kinds) {
+            20 | 21 => Operation::Read { back: random.below(3) },
             0..8 => Operation::Push { cells, content },
             8 => Operation::Prepare { cells, content },
             9 | 10 => Operation::PublishPrepared,
@@ -117,7 +143,7 @@ impl Step {
             12 | 13 => Operation::Open { back: random.below(3) },
             14 => Operation::Close,
             15 => Operation::Renew,
-            16 | 17 => Operation::Collect {
+            16 | 17 | 22.. => Operation::Collect {
                 keep: 1 + random.below(2) as usize,
                 grace_s: [0, 3_600][random.below(2) as usize],
             },
@@ -127,19 +153,41 @@ impl Step {
         let faults = [Fault::Kill, Fault::PowerCut, Fault::PowerCut, Fault::Full];
         let fault = faults[random.below(4) as usize];
         let fault = random.once_in(3).then(|| (random.below(WRITES), fault));
-        Self { seed: random.next(), operation, fault }
+        let reads = match operation {
+            Operation::Read { .. } => SECTION_READS,
+            Operation::Collect { .. } => COLLECTION_READS,
+            _ => READS,
+        };
+        let bad_reads = BadReads::random(random, reads);
+        let one_in = if collects { 2 } else { 3 };
+        let bad_reads = Some(bad_reads).filter(|_| fault.is_none() && random.once_in(one_in));
+        Self { seed: random.next(), operation, fault, bad_reads }
+    }
+}
+
+impl BadReads {
+    fn random(random: &mut Random, reads: u64) -> Self {
+        let faults = [ReadFault::Error, ReadFault::Short, ReadFault::Flip, ReadFault::Slow];
+        Self {
+            after: random.below(reads),
+            fault: faults[random.below(4) as usize],
+            times: 1 + random.below(3),
+        }
     }
 }
 
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "seed {}: {}", self.history.seed, self.reason)?;
-        for (index, Step { operation, fault, .. }) in self.history.operations.iter().enumerate() {
-            write!(f, "  {index} {operation:?}")?;
-            match fault {
-                Some((writes, fault)) => writeln!(f, ", {fault:?} after {writes} writes")?,
-                None => writeln!(f)?,
+        for (index, step) in self.history.operations.iter().enumerate() {
+            write!(f, "  {index} {:?}", step.operation)?;
+            if let Some((writes, fault)) = step.fault {
+                write!(f, ", {fault:?} after {writes} writes")?;
             }
+            if let Some(BadReads { after, fault, times }) = step.bad_reads {
+                write!(f, ", {times} reads after {after} are {fault:?}")?;
+            }
+            writeln!(f)?;
         }
         Ok(())
     }

@@ -1,17 +1,28 @@
-//! Simulated faults: thousands of histories of commits, leases, garbage collections and rollbacks on a disk that
+//! Simulated faults: thousands of histories of commits, leases, garbage collections, rollbacks and reads on a disk that
 //! fails, and in an object store that refuses requests and loses answers, with a clock that jumps, in a process that is
 //! killed between any two writes. After each history nothing that was acknowledged is lost, no version is mixed,
 //! nothing in use is removed, and the store goes on working.
+//!
+//! Reads fail, too: with an error, too early an end, wrong bits, or after a minute. A read that fails is an error of
+//! what needed it, and never another content; after it, the same read succeeds. Wrong bits are simulated in objects
+//! alone: log records, leases and the state of garbage collection have no digest.
+//!
+//! Not simulated: two processes that write at once, requests to the object store in another order than that in which
+//! they began, the disk cache of remote twins, and wrong bits that stay.
+//!
+//! Uploads and connections are simulated in the package of the server, over the same disk: `tests/faults/server`.
 //!
 //! A history follows from its seed alone. A failure prints the seed and the shortest history that still fails; `SEED=n
 //! cargo test -p wildcity-twin --test faults one_history` runs one on both, and `HISTORIES=n ... many_histories` any
 //! number.
 
 mod bucket;
+#[allow(dead_code, reason = "the simulation of uploads uses another part of it")]
 mod disk;
 mod history;
 mod medium;
 mod random;
+mod reads;
 mod world;
 
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -21,11 +32,11 @@ use disk::Plant;
 use history::{Failure, History};
 use medium::Kind;
 
-/// Histories in the gate, on a disk.
-const HISTORIES: u64 = 10_000;
+/// Histories in the gate, on a disk. With those of uploads and connections there are 10,000.
+const HISTORIES: u64 = 4_000;
 
 /// Histories in the gate, in an object store, whose requests run on a thread of their own.
-const BUCKET_HISTORIES: u64 = 3_000;
+const BUCKET_HISTORIES: u64 = 1_500;
 
 /// Histories within which a planted fault must be found.
 const HISTORIES_TO_FIND: u64 = 1_000;
@@ -95,6 +106,9 @@ fn planted_faults_are_found() {
         (Kind::Disk, Plant::MissingSync),
         (Kind::Disk, Plant::RecordBeforeObjects),
         (Kind::Disk, Plant::LeakedLease),
+        (Kind::Disk, Plant::UnsyncedFiles),
+        (Kind::Disk, Plant::FailedReadIsAbsent),
+        (Kind::Bucket, Plant::FailedReadIsAbsent),
         (Kind::Bucket, Plant::RecordBeforeObjects),
         (Kind::Bucket, Plant::LeakedLease),
         (Kind::Bucket, Plant::RecordReplaced),

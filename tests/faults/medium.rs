@@ -9,6 +9,7 @@ use wildcity_twin::store::{Catalog, StoreError};
 use crate::bucket::SimBucket;
 use crate::disk::{Fault, Plant, ROOT, SimClock, SimDisk};
 use crate::random::Random;
+use crate::reads::BadReads;
 
 /// The media that a history can run on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,7 +31,16 @@ pub(crate) trait Medium: Debug {
     /// Lets a fault happen at the write after so many others.
     fn fail_after(&self, writes: u64, fault: Fault);
 
-    /// Takes back a fault that has not happened.
+    /// Lets some reads fail.
+    fn fail_reads(&self, reads: BadReads);
+
+    /// Takes back reads that have not failed.
+    fn stop_failing_reads(&self);
+
+    /// Whether reads failed since this was last called, so often that an operation may fail.
+    fn take_failed_reads(&self) -> bool;
+
+    /// Takes back faults that have not happened.
     fn stop_failing(&self);
 
     /// Whether the process was stopped.
@@ -43,7 +53,7 @@ pub(crate) trait Medium: Debug {
     fn restarted(&self, random: &mut Random) -> Box<dyn Medium>;
 
     /// Lets the writes of stopped processes that are on their way have their effect.
-    fn end_late(&self);
+    fn apply_delayed_puts(&self);
 
     /// The files of commits that are neither published nor removed.
     fn commits_left(&self) -> Vec<String>;
@@ -77,8 +87,21 @@ impl Medium for SimDisk {
         self.set_fault(Some((writes, fault)));
     }
 
+    fn fail_reads(&self, reads: BadReads) {
+        self.set_bad_reads(Some(reads));
+    }
+
+    fn stop_failing_reads(&self) {
+        self.set_bad_reads(None);
+    }
+
+    fn take_failed_reads(&self) -> bool {
+        Self::take_failed_reads(self) > 0
+    }
+
     fn stop_failing(&self) {
         self.set_fault(None);
+        self.set_bad_reads(None);
     }
 
     fn is_stopped(&self) -> bool {
@@ -93,19 +116,19 @@ impl Medium for SimDisk {
         Box::new(Self::restarted(self, random))
     }
 
-    fn end_late(&self) {}
+    fn apply_delayed_puts(&self) {}
 
     fn commits_left(&self) -> Vec<String> {
         let staging = Path::new(ROOT).join(".staging");
         let files = self.files_below(".staging").into_iter();
         // Files of the folder itself are locks.
-        let left = files.filter(|path| path.parent() != Some(&staging));
-        left.map(|path| path.display().to_string()).collect()
+        let left = files.filter(|(path, _)| path.parent() != Some(&staging));
+        left.map(|(path, _)| path.display().to_string()).collect()
     }
 
     fn leases_left(&self) -> Vec<String> {
         let files = self.files_below("city/leases").into_iter();
-        files.map(|path| path.display().to_string()).collect()
+        files.map(|(path, _)| path.display().to_string()).collect()
     }
 
     fn has_locks(&self) -> bool {

@@ -55,6 +55,19 @@ pub(crate) struct World {
 
 type Promise = Result<(), String>;
 
+/// Why an operation did not end well.
+enum Failed {
+    Refused(StoreError),
+    /// A promise is broken.
+    Broken(String),
+}
+
+impl From<StoreError> for Failed {
+    fn from(error: StoreError) -> Self {
+        Self::Refused(error)
+    }
+}
+
 fn storage() -> StorageOptions {
     StorageOptions { record: RecordFormat::F32, levels: false }
 }
@@ -115,23 +128,34 @@ impl World {
         if let Some((writes, fault)) = step.fault {
             self.medium.fail_after(writes, fault);
         }
+        if let Some(reads) = step.bad_reads {
+            self.medium.fail_reads(reads);
+        }
         let is_full = matches!(step.fault, Some((_, Fault::Full)));
         let done = self.carry_out(step.operation);
         self.medium.settle(&self.catalog);
         if self.medium.is_stopped() {
             return self.restart(step.seed);
         }
-        // What is full refuses; without a fault everything works.
-        match done {
-            Err(error) if !is_full => return Err(format!("{error} without a fault")),
-            _ => {}
-        }
+        let has_failed_reads = self.medium.take_failed_reads();
         self.medium.stop_failing();
-        self.check_sessions()
+        match done {
+            Ok(()) => {}
+            Err(Failed::Broken(promise)) => return Err(promise),
+            // What is full refuses; without a fault everything works.
+            Err(Failed::Refused(_)) if is_full => {}
+            // A read that fails is an error of the file, and never says that something does not exist.
+            Err(Failed::Refused(StoreError::Io { .. } | StoreError::Damaged { .. }))
+                if has_failed_reads => {}
+            Err(Failed::Refused(error)) => return Err(format!("{error} without a fault")),
+        }
+        // After reads that failed the same reads succeed, and nothing is lost.
+        if has_failed_reads { self.check() } else { self.check_sessions() }
     }
 
-    fn carry_out(&mut self, operation: Operation) -> Result<(), StoreError> {
+    fn carry_out(&mut self, operation: Operation) -> Result<(), Failed> {
         match operation {
+            Operation::Read { back } => return self.read(back),
             Operation::Push { cells, content } => self.push(&cells_of(cells, content)),
             Operation::Prepare { cells, content } => self.prepare(cells_of(cells, content)),
             Operation::PublishPrepared => self.publish_prepared(),
@@ -154,7 +178,8 @@ impl World {
                 self.medium.stop(fault);
                 Ok(())
             }
-        }
+        }?;
+        Ok(())
     }
 
     /// The latest version, if there is one.
@@ -183,9 +208,9 @@ impl World {
     ) -> Result<(), StoreError> {
         // Until the answer is there, the version may be or not be.
         let below = self.possible.get(&(before + 1)).cloned().unwrap_or_default();
-        let mut may = vec![(before + 1, content(base))];
-        may.extend(below.iter().map(|cells| (before + 2, content(cells))));
-        for (number, cells) in &may {
+        let mut candidates = vec![(before + 1, content(base))];
+        candidates.extend(below.iter().map(|cells| (before + 2, content(cells))));
+        for (number, cells) in &candidates {
             self.possible.entry(*number).or_default().push(cells.clone());
         }
         let result = commit(self);
@@ -195,10 +220,12 @@ impl World {
                 Err(StoreError::NotSynced { .. } | StoreError::OutcomeUnknown { .. })
             );
         if !is_unknown {
-            for (number, _) in may {
+            for (number, _) in candidates {
                 self.possible.entry(number).or_default().pop();
             }
         }
+        // What follows is not part of the commit.
+        self.medium.stop_failing_reads();
         let version = match result {
             Err(StoreError::NotSynced { .. } | StoreError::OutcomeUnknown { .. }) => return Ok(()),
             Err(StoreError::Overlap { latest, .. }) if latest > before => return Ok(()),
@@ -289,25 +316,61 @@ impl World {
         Ok(())
     }
 
+    /// Reads a version as one does that leased nothing.
+    fn read(&self, back: u64) -> Result<(), Failed> {
+        let Some(number) = self.number_before_latest(back)? else { return Ok(()) };
+        let version = match self.catalog.version(TWIN, Some(number)) {
+            Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&number) => {
+                return Ok(());
+            }
+            version => version?,
+        };
+        self.read_all(&version)
+    }
+
+    /// Reads all sections of a version, and compares them with what was pushed.
+    fn read_all(&self, version: &Version) -> Result<(), Failed> {
+        for chunk in &version.manifest.chunks {
+            // By their bits: a wrong bit may be worth a micrometre.
+            let bits = |mean_m: [f64; 3]| mean_m.map(|m| (m + 0.0).to_bits());
+            let mut read = BTreeSet::new();
+            for section in &chunk.sections {
+                let gaussians = self.catalog.section(version, chunk, section)?.to_gaussians();
+                read.extend(gaussians.means_m.into_iter().map(bits));
+            }
+            let count = chunk.count;
+            let x_m = 64.0 * f64::from(chunk.cell[0]);
+            let pushed = (0..count).map(|index| bits([x_m, index as f64, count as f64]));
+            let pushed: BTreeSet<[u64; 3]> = pushed.collect();
+            if read != pushed {
+                let promise =
+                    format!("version {} has {read:?} in place of {pushed:?}", version.number);
+                return Err(Failed::Broken(promise));
+            }
+        }
+        Ok(())
+    }
+
     /// Lets the clock jump. Where a lease alone protects a session's version, a process that lives renews it in time.
     fn jump(&mut self, seconds: i64) -> Result<(), StoreError> {
-        self.medium.end_late();
+        self.medium.apply_delayed_puts();
         self.clock.jump(seconds * 1_000_000);
         if self.medium.has_locks() {
             return Ok(());
         }
         let mut renewed = Ok(());
-        self.sessions.retain_mut(|session| {
-            let result = session.lease.renew();
-            let is_renewed = result.is_ok();
-            renewed = std::mem::replace(&mut renewed, Ok(())).and(result);
-            is_renewed
-        });
+        for mut session in std::mem::take(&mut self.sessions) {
+            match session.lease.renew() {
+                Ok(()) => self.sessions.push(session),
+                // The session ends.
+                Err(error) => renewed = Err(error),
+            }
+        }
         renewed
     }
 
     fn collect(&mut self, keep: Retention) -> Result<(), StoreError> {
-        self.medium.end_late();
+        self.medium.apply_delayed_puts();
         // Without locks, garbage must not be collected while a commit is in preparation.
         if !self.medium.has_locks() {
             self.prepared = None;
@@ -343,12 +406,10 @@ impl World {
         for Session { number, cells, .. } in &self.sessions {
             let version = self.catalog.version(TWIN, Some(*number));
             let version = version.map_err(|e| format!("a session's version {number}: {e}"))?;
-            for chunk in &version.manifest.chunks {
-                for section in &chunk.sections {
-                    let read = self.catalog.section(&version, chunk, section);
-                    read.map_err(|e| format!("a session's version {number}: {e}"))?;
-                }
-            }
+            self.read_all(&version).map_err(|failed| match failed {
+                Failed::Refused(error) => format!("a session's version {number}: {error}"),
+                Failed::Broken(promise) => promise,
+            })?;
             if content_of(&version) != *cells {
                 return Err(format!("a session's version {number} changed"));
             }
@@ -379,7 +440,10 @@ impl World {
             let content = content_of(&version);
             let is_possible = match self.acknowledged.get(&number) {
                 Some(told) => *told == content,
-                None => self.possible.get(&number).is_some_and(|may| may.contains(&content)),
+                None => self
+                    .possible
+                    .get(&number)
+                    .is_some_and(|candidates| candidates.contains(&content)),
             };
             if !is_possible {
                 return Err(format!("version {number} has {content:?}, which no push made"));

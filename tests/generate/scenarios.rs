@@ -25,11 +25,12 @@ fn drive(file: &str, seed: u64, seconds: u32) -> Driven {
     let document = Document::parse(&text).unwrap();
     assert!(document.cases().len() >= 5);
     let asset = |name: &str| {
-        ActorModel::NAMES.contains(&name).then_some(AssetInfo {
+        let info = AssetInfo {
             hash: "0".repeat(64),
             class: ActorClass::Vehicle,
             box_: ActorBox::PEDESTRIAN,
-        })
+        };
+        ActorModel::NAMES.contains(&name).then_some(info).ok_or_else(|| name.to_owned())
     };
     let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), asset: &asset };
     let scenario =

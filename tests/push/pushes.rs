@@ -184,6 +184,20 @@ async fn views_before_and_after_are_compared() {
     assert_eq!(again.state, PushState::Ready, "{again:?}");
 }
 
+/// No agent waits for a preview: on a busy server its frames may take longer than a step may.
+#[tokio::test]
+async fn a_preview_has_more_time_than_a_step() {
+    let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
+    let server = TestServer::configured(|config| {
+        config.backend = cpu;
+        config.limits.step = Duration::from_nanos(1);
+    })
+    .await;
+    let pushed = push(&server, &in_cell([0, 0], 400, 1), |_| {}).await;
+    assert_eq!(pushed.state, PushState::Ready, "{pushed:?}");
+    assert_eq!(pushed.report.unwrap().previews.len(), 4);
+}
+
 /// A push with `min_psnr_db` is refused if there is nothing to compare it with.
 #[tokio::test]
 async fn a_psnr_that_cannot_be_measured_is_refused() {

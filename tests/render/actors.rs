@@ -7,12 +7,13 @@ use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, Readout, RenderError, Target, View};
-use wildcity_scene::actor::PlacedChunk;
+use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{Rays, RenderProfile, Scene};
 
 use crate::images::{cpu, render, render_one};
 use crate::placed;
+use crate::vectors::{cases, number, numbers};
 
 #[test]
 fn an_actor_is_drawn_as_if_the_twin_contained_it() {
@@ -34,6 +35,20 @@ fn a_moving_actor_is_drawn_as_by_a_moving_camera() {
 #[test]
 fn tints_and_contact_shadows_are_those_of_the_reference() {
     placed::check_light(&cpu(), &Reference);
+}
+
+#[test]
+fn contact_shadows_are_as_in_the_vectors() {
+    let Some(cases) = cases("own", "contact shadow") else { return };
+    for case in cases {
+        let [length_m, width_m] =
+            ["length", "width"].map(|field| number(&case.input[field]) as f32);
+        let at_m = DVec3::from_slice(&numbers(&case.input["at"]));
+        let found = ContactShadow { length_m, width_m }.factor(at_m);
+        let wanted = number(&case.expected["factor"]);
+        // The size is in f32.
+        assert!((found - wanted).abs() < 1e-6, "{}: {found}, not {wanted}", case.name);
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use wildcity_scene::ActorClass;
 use wildcity_score::own::{Fault, Judgement, verdict};
 use wildcity_score::{
     DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
-    Track, TrackSample, score,
+    Track, TrackSample, range_of, score,
 };
 use wildcity_sim::contact::{CollisionType, Contact, Footprint};
 
@@ -317,11 +317,46 @@ fn what_is_missing_is_null_with_the_reason_and_never_0() {
         assert_eq!(score.value, None, "{}", score.name);
         assert!(score.reason.is_some_and(|reason| reason.len() > 10), "{}", score.name);
     }
-    // NeuroNCAP is not defined for pedestrians, and its reference speed not for short recordings.
+}
+
+#[test]
+fn neuroncap_has_no_stars_for_contacts_that_its_check_leaves_out() {
+    const NAME: &str = "neuroncap.score@ecdcf28";
     let mut record = drive(10.0);
-    record.tracks.as_mut().unwrap()[0].class = ActorClass::Pedestrian;
-    record.contacts.push(contact(2_000_000, 10.0, true));
-    assert_eq!(value(&record, "neuroncap.score@ecdcf28"), None);
+    record.contacts.push(contact(2_000_000, 4.0, true));
+    for (class, stars) in [
+        (ActorClass::Vehicle, Some(4.0 * 0.6)),
+        (ActorClass::Bicycle, Some(4.0 * 0.6)),
+        (ActorClass::Pedestrian, None),
+        (ActorClass::Object, None),
+    ] {
+        record.tracks.as_mut().unwrap()[0].class = class;
+        let found = value(&record, NAME);
+        assert_eq!(found.map(|stars| (10.0 * stars).round()), stars.map(|stars| 10.0 * stars));
+        let scores = score(&record);
+        let reason = scores.iter().find(|score| score.name == NAME).unwrap().reason.as_deref();
+        assert_eq!(reason.is_some_and(|reason| reason.contains("leaves out")), stars.is_none());
+    }
+}
+
+#[test]
+fn every_score_has_a_range_and_stays_in_it() {
+    let mut hit = drive(14.0);
+    hit.contacts.push(contact(2_000_000, 10.0, true));
+    for record in [drive(10.0), drive(0.0), hit] {
+        for score in score(&record) {
+            let [least, most] = range_of(score.name);
+            assert_eq!(least, 0.0, "{} has no range", score.name);
+            let is_within = score.value.is_none_or(|value| (least..=most).contains(&value));
+            assert!(is_within, "{}: {:?} in {least}..{most}", score.name, score.value);
+        }
+    }
+    // Shares, stars, percents and metres.
+    assert_eq!(range_of("wildcity.verdict@1"), [0.0, 1.0]);
+    assert_eq!(range_of("neuroncap.score@ecdcf28"), [0.0, 5.0]);
+    assert_eq!(range_of("bench2drive.driving@7ec25d1"), [0.0, 100.0]);
+    assert_eq!(range_of("alpasim.open_loop_collision@3032e0c"), [0.0, 1.0]);
+    assert_eq!(range_of("alpasim.min_ade_5s@3032e0c"), [0.0, f64::INFINITY]);
 }
 
 #[test]
@@ -348,6 +383,15 @@ fn thirty_seconds_are_scored_in_milliseconds() {
     let track = record.tracks.as_ref().unwrap()[0].clone();
     let many = (0..30).map(|_| Track { samples: vec![track.samples[0]; 301], ..track.clone() });
     record.tracks = Some(many.collect());
+    // 30 lanes of 120 corners: the ego, on the line between two of them, is in both.
+    let strip = |lane: i32| {
+        let side = |edge: i32| {
+            (0..60).map(move |k| DVec2::new(f64::from(6 * k) - 50.0, 3.0 * f64::from(edge)))
+        };
+        let outline_m = side(lane).chain(side(lane + 1).rev()).collect();
+        Lane { outline_m, center: None, is_on_route: true, is_intersection: false }
+    };
+    record.map = Some(map((-15..15).map(strip).collect()));
     let points_m = (0..600).map(|k| DVec2::new(0.5 * f64::from(k), 0.0)).collect();
     record.reference = Some(ReferenceDrive {
         line: Polyline::new(points_m).unwrap(),

@@ -273,12 +273,38 @@ fn an_ego_is_off_the_road_where_it_crosses_the_edge_of_all_lanes() {
     assert_value(&on(vec![strip([-3.0, 0.3]), strip([0.3, 3.0])]), OFF_ROAD, 0.0);
     // A gap between lanes is no edge of the road.
     assert_value(&on(vec![strip([-3.0, 0.3]), strip([0.4, 3.0])]), OFF_ROAD, 0.0);
+    // An edge that is left by less than a seam is, also where one lane follows another.
+    let half = |x_m: [f64; 2]| {
+        let [from, to] = x_m;
+        lane(&[[from, -0.9], [to, -0.9], [to, 3.0], [from, 3.0]], &[])
+    };
+    assert_value(&on(vec![half([-50.0, 1.0]), half([1.0, 150.0])]), OFF_ROAD, 1.0);
+    // A median of 0.9 m below the ego is, although the arcs of its corners, 0.98 m apart, are in the two lanes.
+    assert_value(&on(vec![strip([-3.0, -0.45]), strip([0.45, 3.0])]), OFF_ROAD, 1.0);
     // Wholly beside the road it touches no edge, so that it counts as on it; a millimetre is a touch.
     assert_value(&on(vec![strip([5.0, 8.0])]), OFF_ROAD, 0.0);
     assert_value(&on(vec![strip([0.9805, 8.0])]), OFF_ROAD, 1.0);
     assert_value(&on(vec![strip([0.9815, 8.0])]), OFF_ROAD, 0.0);
     // The score of the scene is 0 then.
     assert_value(&on(vec![strip([-0.975, 0.985])]), "alpasim.scene@3032e0c", 0.0);
+}
+
+#[test]
+fn a_hole_in_the_road_below_the_ego_is_off_the_road() {
+    // The box of a standing ego reaches from -0.96 m to 2.96 m. The hole is 0.5 m square, between four lanes.
+    let standing = |hole_x_m: f64| {
+        let [from, to] = [hole_x_m - 0.25, hole_x_m + 0.25];
+        let rest =
+            |from: f64, to: f64| lane(&[[from, -0.25], [to, -0.25], [to, 0.25], [from, 0.25]], &[]);
+        let lanes =
+            vec![strip([-3.0, -0.25]), strip([0.25, 3.0]), rest(-50.0, from), rest(to, 150.0)];
+        let mut record = on(lanes);
+        record.ego.iter_mut().for_each(|sample| sample.origin_m.x = 0.0);
+        record
+    };
+    assert_value(&standing(1.0), OFF_ROAD, 1.0);
+    assert_value(&standing(2.5), OFF_ROAD, 1.0);
+    assert_value(&standing(3.3), OFF_ROAD, 0.0);
 }
 
 #[test]

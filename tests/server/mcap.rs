@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -119,14 +119,20 @@ async fn what_was_cut_has_no_mcap_file_until_it_is_exported_by_hand() {
     assert_eq!((cut, cut), (exported.messages, whole));
 }
 
-/// Writing `a-1.mcap` blocks, since its temporary file is a pipe that nothing reads.
+/// The export of `a-1` blocks, since a pipe that nothing writes to has the name of its record; the session goes on
+/// writing the record itself.
 #[tokio::test]
 async fn no_request_waits_for_an_export() {
     let server = TestServer::start().await;
-    let pipe = server.episodes.path().join("a-1.mcap.tmp");
+    let mut first = server.driver("a").await;
+    first.step(1.0).await;
+    let pipe = server.episodes.path().join("a-1.jsonl");
+    let record = server.twins.path().join("a-1.jsonl");
+    std::fs::rename(&pipe, &record).unwrap();
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     let driven = async {
-        drive(&server, "a").await;
+        first.step(2.0).await;
+        first.ask(json!({ "type": "close" })).await;
         let mut agent = server.driver("b").await;
         agent.step(1.0).await;
         agent.look(json!({ "type": "reset", "seed": 2 })).await;
@@ -134,18 +140,41 @@ async fn no_request_waits_for_an_export() {
         agent.ask(json!({ "type": "close" })).await;
     };
     timeout(TEST_TIMEOUT / 2, driven).await.expect("requests are answered");
-    assert_eq!(
-        names(server.episodes.path()),
-        ["a-1.jsonl", "a-1.mcap.tmp", "b-1.jsonl", "b-2.jsonl"]
-    );
-    assert_eq!(listed(&server, "b-2").await["outcome"], "completed");
+    assert_eq!(names(server.episodes.path()), ["a-1.jsonl", "b-1.jsonl", "b-2.jsonl"]);
+    let text = std::fs::read_to_string(server.episodes.path().join("b-2.jsonl")).unwrap();
+    assert!(text.lines().last().unwrap().contains("\"outcome\":\"completed\""), "{text}");
 
-    // A pipe cannot be brought to disk: this export fails, and the others follow.
-    let reader = std::thread::spawn(move || std::fs::read(pipe).unwrap());
+    // What comes out of the pipe is no record: this export fails, and the others follow.
+    let writer = std::thread::spawn(move || {
+        std::fs::write(&pipe, "no record\n").unwrap();
+        std::fs::rename(&record, &pipe).unwrap();
+    });
     let (status, _, _) = get(&server, "/v1/episodes/b-2/mcap").await;
     assert_eq!(status, 200);
-    assert!(!reader.join().unwrap().is_empty());
-    assert!(refused(&server, "/v1/episodes/a-1/mcap").await.contains("cannot write"));
+    writer.join().unwrap();
+    assert!(refused(&server, "/v1/episodes/a-1/mcap").await.contains("no header"));
+    let entry = listed(&server, "a-1").await;
+    assert_eq!((&entry["outcome"], &entry["steps"]), (&"completed".into(), &2.into()), "{entry}");
+}
+
+#[tokio::test]
+async fn a_server_removes_what_killed_exports_left() {
+    let server = TestServer::start().await;
+    let config = server.config();
+    let TestServer { running, painter, twins, episodes } = server;
+    running.stop().await;
+    for (name, age_s) in [("a-1.mcap.Xy12Zw.tmp", 7200), ("b-1.mcap.Xy12Zw.tmp", 0)] {
+        let file = std::fs::File::create(episodes.path().join(name)).unwrap();
+        file.set_modified(SystemTime::now() - Duration::from_secs(age_s)).unwrap();
+    }
+    let running = wildcity_server::start(config).await.unwrap();
+    let server = TestServer { running, painter, twins, episodes };
+    drive(&server, "c").await;
+    let (status, _, _) = get(&server, "/v1/episodes/c-1/mcap").await;
+    assert_eq!(status, 200);
+    // The directory was swept before the first export.
+    let left = names(server.episodes.path());
+    assert_eq!(left, ["b-1.mcap.Xy12Zw.tmp", "c-1.jsonl", "c-1.mcap"]);
 }
 
 #[tokio::test]

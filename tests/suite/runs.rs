@@ -59,7 +59,7 @@ async fn records_are_whole_and_score_to_the_same_result() {
     let read = |name: &str| EpisodeFile::read(&bench.path("log").join(name)).unwrap();
     let [car_3, car_4] = ["car-3-1.jsonl", "car-4-1.jsonl"].map(read);
     assert_eq!(diff(&car_3, &car_3), None);
-    assert!(diff(&car_3, &car_4).unwrap().how.contains("scenario"));
+    assert_eq!(diff(&car_3, &car_4).unwrap().how, "seed 3 against 4");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -68,12 +68,12 @@ async fn each_record_becomes_an_mcap_file_beside_it() {
     let run = bench.run_built_in(BuiltIn::Log, "log").await;
     for entry in &run.episodes {
         let record = bench.path("log").join(&entry.record);
-        assert_eq!(entry.mcap, entry.record.replace(".jsonl", ".mcap"));
-        assert_eq!(entry.mcap_error, "");
+        let mcap = entry.mcap.as_ref().unwrap().as_ref().unwrap();
+        assert_eq!(*mcap, entry.record.replace(".jsonl", ".mcap"));
         let by_hand = bench.path("by-hand.mcap");
         export_file(&record, &by_hand).unwrap();
         // With its end and result. The order of the index differs from file to file, its size does not.
-        let bytes = [by_hand, bench.path("log").join(&entry.mcap)]
+        let bytes = [by_hand, bench.path("log").join(mcap)]
             .map(|path| std::fs::metadata(path).unwrap().len());
         assert_eq!(bytes[0], bytes[1], "{}", entry.name);
     }
@@ -81,20 +81,25 @@ async fn each_record_becomes_an_mcap_file_beside_it() {
     settings.mcap = false;
     let cases = bench.cases(&bench.suite()).unwrap();
     let without = wildcity_suite::run(settings, cases).await.unwrap();
-    assert!(!without.to_json().contains("mcap"), "{}", without.to_json());
+    assert!(without.episodes.iter().all(|episode| episode.mcap.is_none()));
     assert!(!bench.path("without").join("car-3-1.mcap").exists());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_export_that_fails_is_in_the_result_and_fails_no_episode() {
+async fn an_export_that_fails_is_in_the_report_and_changes_no_byte_of_the_result() {
     let bench = Bench::new();
     std::fs::create_dir_all(bench.path("log").join("car-3-1.mcap")).unwrap();
     let run = bench.run_built_in(BuiltIn::Log, "log").await;
     assert_eq!((run.counts.passed, run.exit_code()), (4, ExitCode::Passed), "{}", run.to_json());
-    let told: Vec<bool> = run.episodes.iter().map(|e| e.mcap.is_empty()).collect();
+    let told: Vec<bool> = run.episodes.iter().map(|e| e.mcap_error().is_some()).collect();
     assert_eq!(told, [true, false, false, false]);
-    assert!(run.episodes[0].mcap_error.contains("cannot write"), "{:?}", run.episodes[0]);
-    assert!(run.to_json().contains("\"mcap_error\": \"cannot write"), "{}", run.to_json());
+    assert!(run.episodes[0].mcap_error().unwrap().contains("cannot write"), "{run:?}");
+    let html = page(&run, &[], &bench.path("log"));
+    assert_eq!(html.matches("no MCAP file: cannot write").count(), 1, "{html}");
+    assert_eq!(html.matches("episodes/car-4-1.mcap").count(), 1, "{html}");
+
+    let whole = bench.run_built_in(BuiltIn::Log, "whole").await;
+    assert_eq!(whole.to_json(), run.to_json());
 }
 
 #[tokio::test(flavor = "multi_thread")]

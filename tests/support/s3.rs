@@ -84,6 +84,11 @@ impl S3 {
         self.rules.lock().unwrap().push(rule);
     }
 
+    /// No request fails any more.
+    pub(crate) fn forgive(&self) {
+        self.rules.lock().unwrap().clear();
+    }
+
     /// How many requests are still to fail.
     pub(crate) fn to_fail(&self) -> usize {
         self.rules.lock().unwrap().iter().map(|rule| rule.times).sum()

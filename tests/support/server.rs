@@ -114,6 +114,11 @@ pub(crate) fn commit_twin(dir: &Path) {
 
 /// As [`commit_twin`], with Gaussians of this opacity before the sigmoid: another opacity makes another version.
 pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
+    commit_twin_to(&Catalog::open(dir).expect("a directory"), logit_opacity);
+}
+
+/// As [`commit_twin_of`], to a catalog.
+pub(crate) fn commit_twin_to(catalog: &Catalog, logit_opacity: f32) {
     let gaussians = Gaussians {
         sh_degree: 0,
         means_m: (0..64).map(|i| [f64::from(i), f64::from(i % 5) - 2.0, 1.0]).collect(),
@@ -135,7 +140,7 @@ pub(crate) fn commit_twin_of(dir: &Path, logit_opacity: f32) {
         trajectories: vec![log],
         ..NewVersion::of("test", &gaussians, Provenance::of("test".to_owned()))
     };
-    Catalog::open(dir).and_then(|catalog| catalog.commit(new, &mut |_, _| {})).expect("a twin");
+    catalog.commit(new, &mut |_, _| {}).expect("a twin");
 }
 
 /// The cameras of the twin `test`: `front`, 8 x 6 px, and `rear`, 5 x 4 px.

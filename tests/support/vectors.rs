@@ -1,5 +1,7 @@
 //! The vectors of contacts and scores in the real data: inputs, and what the published definitions make of them.
 
+#![allow(dead_code, reason = "every test binary uses another part of it")]
+
 use serde_json::Value;
 
 use crate::data;

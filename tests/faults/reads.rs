@@ -1,0 +1,77 @@
+//! Reads that fail, that are slow, or that return the wrong bytes.
+
+/// What is wrong with a read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum ReadFault {
+    /// It fails.
+    Error,
+    /// It ends early.
+    Short,
+    /// Some bits are wrong. Only in what has a digest.
+    Flip,
+    /// It takes a minute.
+    Slow,
+}
+
+/// What a read returns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Carries {
+    /// Names and sizes.
+    Names,
+    /// The content of a file without a digest: log records, leases, the state of garbage collection,
+    /// announcements of uploads.
+    Content,
+    /// The content of a file with a digest.
+    Digested,
+}
+
+/// Reads that fail.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct BadReads {
+    /// Reads before the first of them.
+    pub(crate) after: u64,
+    pub(crate) fault: ReadFault,
+    /// How many, one after the other.
+    pub(crate) times: u64,
+}
+
+impl BadReads {
+    /// What is wrong with the next read, of the reads that are planned.
+    pub(crate) fn next(planned: &mut Option<Self>, carries: Carries) -> Option<ReadFault> {
+        let reads = planned.as_mut()?;
+        if reads.after > 0 {
+            reads.after -= 1;
+            return None;
+        }
+        let fault = reads.fault;
+        let is_possible = match fault {
+            ReadFault::Error | ReadFault::Slow => true,
+            ReadFault::Short => carries != Carries::Names,
+            ReadFault::Flip => carries == Carries::Digested,
+        };
+        if !is_possible {
+            return None;
+        }
+        reads.times -= 1;
+        if reads.times == 0 {
+            *planned = None;
+        }
+        Some(fault)
+    }
+}
+
+impl ReadFault {
+    /// How long a slow read takes.
+    pub(crate) const SLOW_US: i64 = 60_000_000;
+
+    /// What is read in place of some bytes.
+    pub(crate) fn damaged(self, mut bytes: Vec<u8>) -> Vec<u8> {
+        match self {
+            Self::Error | Self::Slow => {}
+            Self::Short => bytes.truncate(bytes.len() / 2),
+            // So many that each section has one.
+            Self::Flip => bytes.iter_mut().step_by(16).for_each(|byte| *byte ^= 0x41),
+        }
+        bytes
+    }
+}

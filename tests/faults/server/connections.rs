@@ -1,0 +1,449 @@
+//! Histories of connections: agents drive, each with a session of its own, over connections that are cut at any byte.
+//! They resume, and repeat the request whose answer they did not get.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use futures_util::future::join_all;
+use futures_util::{SinkExt as _, StreamExt as _};
+use glam::{DQuat, DVec3};
+use serde_json::{Value, json};
+use tokio::io::DuplexStream;
+use tokio::time::timeout;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
+use wildcity_scene::geometry::Pose;
+
+use crate::config::Limits;
+
+use super::machine::{CLIENT_TIMEOUT, Machine, SimServer};
+use super::network::{Cut, CutStream};
+use super::random::Random;
+use super::support::{Painter, Seen, pose, rig};
+
+/// WebSocket connections at once.
+const CONNECTIONS: usize = 32;
+
+/// Connections of an agent after which it must have ended: each of its cuts costs one, and so may a takeover.
+const MOST_CONNECTIONS: usize = 40;
+
+/// Names of sessions are used once: the episodes of all histories are in one directory.
+static NAMES: AtomicU64 = AtomicU64::new(0);
+
+/// A fault of a connection, as it shows at the client.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Plant {
+    /// A request that was carried out is carried out again after `resume`.
+    StepsTwice,
+}
+
+/// A request of an agent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Request {
+    Step { x_m: u8 },
+    Reset,
+}
+
+/// What happens to one connection.
+#[derive(Clone, Copy, Debug)]
+struct ConnectionFaults {
+    cut: Cut,
+    /// Whether the server hears nothing of the cut.
+    is_unclosed: bool,
+    /// Whether each request is sent twice.
+    repeats: bool,
+    /// Bytes that are on their way at once.
+    buffer_bytes: usize,
+    /// Whether the client waits before it connects.
+    waits: bool,
+}
+
+/// An agent: its requests, and its connections.
+#[derive(Clone, Debug)]
+struct Agent {
+    requests: Vec<Request>,
+    /// The last connection is not cut.
+    connections: Vec<ConnectionFaults>,
+}
+
+/// A history of connections.
+#[derive(Clone)]
+pub(super) struct Connections {
+    seed: u64,
+    agents: Vec<Agent>,
+}
+
+impl Connections {
+    /// Number of requests and of connections that are cut.
+    pub(super) fn parts(&self) -> usize {
+        self.agents.iter().map(|agent| agent.requests.len() + agent.connections.len()).sum()
+    }
+}
+
+impl super::History for Connections {
+    type Plant = Plant;
+
+    fn of(seed: u64) -> Self {
+        let mut random = Random::new(seed);
+        let count = 1 + random.below(3);
+        let agents = (0..count as u8).map(|index| Agent::random(&mut random, index)).collect();
+        Self { seed, agents }
+    }
+
+    fn run(&self, machine: &Machine, plant: Option<Plant>) -> Result<(), String> {
+        machine.runtime.block_on(async {
+            let limits = Limits { connections: CONNECTIONS, ..Limits::default() };
+            let server = machine.server(limits, None, Err("no uploads here".to_owned()));
+            let network = Network { server, unclosed: RefCell::default() };
+            let agents = self.agents.iter().map(|agent| {
+                let name = format!("agent-{}", NAMES.fetch_add(1, Ordering::Relaxed));
+                let network = &network;
+                async move {
+                    let driven = timeout(CLIENT_TIMEOUT, agent.drive(network, &name, plant)).await;
+                    let driven = driven.unwrap_or_else(|_| Err("does not end".to_owned()));
+                    driven.map_err(|reason| format!("{name}: {reason}"))
+                }
+            });
+            join_all(agents).await.into_iter().collect::<Result<Vec<()>, String>>()?;
+            let steps: usize = self.agents.iter().map(Agent::steps).sum();
+            network.finish(steps as u64).await
+        })
+    }
+
+    fn shorter(&self) -> Vec<Self> {
+        let mut all = Vec::new();
+        for index in 0..self.agents.len() {
+            let mut change = |change: &dyn Fn(&mut Vec<Agent>)| {
+                let mut shorter = self.clone();
+                change(&mut shorter.agents);
+                all.push(shorter);
+            };
+            change(&|agents| {
+                agents.remove(index);
+            });
+            for request in 0..self.agents[index].requests.len() {
+                change(&|agents| {
+                    agents[index].requests.remove(request);
+                });
+            }
+            for connection in 0..self.agents[index].connections.len() {
+                change(&|agents| {
+                    agents[index].connections.remove(connection);
+                });
+            }
+        }
+        all
+    }
+}
+
+impl fmt::Display for Connections {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "seed {}", self.seed)?;
+        for Agent { requests, connections } in &self.agents {
+            writeln!(f, "  {requests:?}")?;
+            for faults in connections {
+                writeln!(f, "    {faults:?}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Agent {
+    fn random(random: &mut Random, index: u8) -> Self {
+        let count = 1 + random.below(5);
+        // Agents are at different places, so that no answer fits another agent.
+        let request = |random: &mut Random| match random.below(6) {
+            0 => Request::Reset,
+            _ => Request::Step { x_m: 1 + 3 * index + random.below(3) as u8 },
+        };
+        let requests = (0..count).map(|_| request(random)).collect();
+        let count = random.below(5);
+        let connections = (0..count).map(|_| ConnectionFaults::random(random)).collect();
+        Self { requests, connections }
+    }
+
+    fn steps(&self) -> usize {
+        self.requests.iter().filter(|request| matches!(request, Request::Step { .. })).count()
+    }
+}
+
+impl ConnectionFaults {
+    /// The connection that nothing happens to.
+    const NONE: Self = Self {
+        cut: Cut::Never,
+        is_unclosed: false,
+        repeats: false,
+        buffer_bytes: 64 << 10,
+        waits: false,
+    };
+
+    fn random(random: &mut Random) -> Self {
+        // The handshake has about 200 bytes each way, a request 150, an observation 2,000.
+        let cut = match random.below(3) {
+            0 => Cut::Sent(random.below(1_200)),
+            1 => Cut::Received(random.below(900)),
+            _ => Cut::Received(random.below(12_000)),
+        };
+        let is_unclosed = random.once_in(4);
+        let buffer_bytes = [17, 300, 64 << 10][random.below(3) as usize];
+        let repeats = random.once_in(4);
+        // The server waits for a client that does not read what it is sent: a simulation would wait, too.
+        let buffer_bytes = if is_unclosed || repeats { 64 << 10 } else { buffer_bytes };
+        Self { cut, is_unclosed, repeats, buffer_bytes, waits: random.once_in(4) }
+    }
+}
+
+/// A server, and the connections to it that no client uses any more.
+struct Network {
+    server: SimServer,
+    unclosed: RefCell<Vec<DuplexStream>>,
+}
+
+/// One connection of an agent.
+struct Link {
+    socket: WebSocketStream<CutStream>,
+    faults: ConnectionFaults,
+}
+
+/// The connection is cut.
+struct Lost;
+
+/// Where an agent is in its requests.
+struct Progress<'a> {
+    name: &'a str,
+    /// Number of the request `open`, once that is carried out.
+    opened_seq: Option<u64>,
+    /// Requests that were answered, `close` included.
+    answered: usize,
+    /// Steps since the last reset.
+    steps: u64,
+}
+
+impl Agent {
+    /// Opens a session, sends all requests, and closes it. Returns which promise is broken.
+    async fn drive(
+        &self,
+        network: &Network,
+        name: &str,
+        plant: Option<Plant>,
+    ) -> Result<(), String> {
+        let mut progress = Progress { name, opened_seq: None, answered: 0, steps: 0 };
+        let mut connections = self.connections.iter();
+        for _ in 0..MOST_CONNECTIONS {
+            let faults = *connections.next().unwrap_or(&ConnectionFaults::NONE);
+            if faults.waits {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+            let Ok(mut link) = network.connect(faults).await else { continue };
+            let driven = self.drive_link(&mut link, &mut progress, plant).await;
+            if faults.is_unclosed {
+                network.unclosed.borrow_mut().push(link.socket.into_inner().into_unclosed());
+            }
+            match driven {
+                Ok(Ok(())) => return Ok(()),
+                Ok(Err(promise)) => return Err(promise),
+                Err(Lost) => {}
+            }
+        }
+        Err(format!("not at the end after {MOST_CONNECTIONS} connections"))
+    }
+
+    /// Drives on over one connection.
+    async fn drive_link(
+        &self,
+        link: &mut Link,
+        progress: &mut Progress<'_>,
+        plant: Option<Plant>,
+    ) -> Result<Result<(), String>, Lost> {
+        let client = json!({ "name": "simulation", "version": "1" });
+        let hello = json!({ "type": "hello", "client": client, "protocols": ["wildcity.v1"] });
+        link.ask(0, hello).await?;
+        let open = json!({
+            "type": "open", "twin": "test", "session": progress.name,
+            "outputs": { "encoding": "raw" },
+        });
+        let mut seq = 1;
+
+        // Continues the session, if it was opened.
+        let last_seq = progress.opened_seq.map_or(0, |opened| opened + progress.answered as u64);
+        let resume = json!({ "type": "resume", "session": progress.name, "last_seq": last_seq });
+        let resumed = link.ask_once(seq, resume).await?;
+        let carried_out = resumed["last_seq"].as_u64();
+        match (resumed["type"].as_str(), resumed["code"].as_str(), carried_out) {
+            (Some("resumed"), _, Some(carried_out)) => {
+                let opened = *progress.opened_seq.get_or_insert(carried_out);
+                let next = opened + progress.answered as u64 + 1;
+                if carried_out + 1 != next && carried_out != next {
+                    return Ok(Err(format!("{carried_out} was carried out before {next}")));
+                }
+                if plant == Some(Plant::StepsTwice) && carried_out == next {
+                    progress.opened_seq = Some(opened + 1);
+                }
+            }
+            (_, Some("unknown_session"), _) if progress.opened_seq.is_none() => {
+                seq += 1;
+                let opened = link.ask(seq, open).await?;
+                match (opened["type"].as_str(), opened["code"].as_str()) {
+                    (Some("opened"), _) => progress.opened_seq = Some(seq),
+                    // The request of an earlier connection arrived meanwhile.
+                    (_, Some("session_exists")) => return Err(Lost),
+                    _ => return Ok(Err(format!("open is answered with {opened}"))),
+                }
+            }
+            _ => return Ok(Err(format!("resume is answered with {resumed}"))),
+        }
+
+        while progress.answered < self.requests.len() {
+            let request = self.requests[progress.answered];
+            let next = progress.next_seq();
+            let body = match request {
+                Request::Step { x_m } => json!({ "type": "step", "pose": pose(x_m.into()) }),
+                Request::Reset => json!({ "type": "reset" }),
+            };
+            let seen = match link.observe(next, body).await? {
+                Ok(seen) => seen,
+                Err(said) => return Ok(Err(format!("request {next} is answered with {said}"))),
+            };
+            progress.steps = if request == Request::Reset { 0 } else { progress.steps + 1 };
+            if let Err(promise) = progress.check(&seen, next, request) {
+                return Ok(Err(promise));
+            }
+            progress.answered += 1;
+        }
+        let next = progress.next_seq();
+        let closed = link.ask(next, json!({ "type": "close" })).await?;
+        match closed["type"].as_str() {
+            Some("closed") if closed["summary"]["steps"] == json!(progress.steps) => Ok(Ok(())),
+            _ => Ok(Err(format!("close after {} steps is answered with {closed}", progress.steps))),
+        }
+    }
+}
+
+impl Progress<'_> {
+    /// Number of the next request of the session.
+    fn next_seq(&self) -> u64 {
+        self.opened_seq.unwrap_or_default() + self.answered as u64 + 1
+    }
+
+    /// Compares an observation with that of a session over one connection.
+    fn check(&self, seen: &Seen, seq: u64, request: Request) -> Result<(), String> {
+        let time_us = 100_000 * self.steps;
+        let found = [&seen.meta["seq"], &seen.meta["step"], &seen.meta["time_us"]];
+        let expected = [json!(seq), json!(self.steps), json!(time_us)];
+        if found.into_iter().ne(expected.iter()) {
+            return Err(format!("{request:?}: seq, step and time are {found:?}, not {expected:?}"));
+        }
+        let Request::Step { x_m } = request else { return Ok(()) };
+        let world_from_rig =
+            Pose { position_m: DVec3::new(x_m.into(), 0.0, 0.0), rotation: DQuat::IDENTITY };
+        let tensors = seen.tensors();
+        for (name, image) in images(&world_from_rig) {
+            if tensors.tensor(&name).ok().is_none_or(|tensor| tensor.data() != image) {
+                return Err(format!("{request:?}: {name} is not the image of that place"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The images of all cameras from a place, by the names of their tensors.
+fn images(world_from_rig: &Pose) -> BTreeMap<String, Vec<u8>> {
+    let cameras = rig().cameras;
+    let image = |camera: &wildcity_scene::rig::RigCamera| {
+        let world_from_camera = *world_from_rig * camera.rig_from_camera;
+        (format!("camera/{}/rgb", camera.name), Painter::image(&world_from_camera, &camera.camera))
+    };
+    cameras.iter().map(image).collect()
+}
+
+impl Network {
+    async fn connect(&self, faults: ConnectionFaults) -> Result<Link, Lost> {
+        let (stream, _) = self.server.connect(faults.buffer_bytes).await;
+        let stream = CutStream::new(stream, faults.cut);
+        let mut request = "ws://localhost/v1/session".into_client_request().map_err(|_| Lost)?;
+        let subprotocol = "wildcity.v1".parse().map_err(|_| Lost)?;
+        request.headers_mut().insert("Sec-WebSocket-Protocol", subprotocol);
+        let (socket, _) =
+            tokio_tungstenite::client_async(request, stream).await.map_err(|_| Lost)?;
+        Ok(Link { socket, faults })
+    }
+
+    /// Checks that each step was carried out once, and that nothing is left of the connections and sessions.
+    async fn finish(self, steps: u64) -> Result<(), String> {
+        let Self { server, unclosed } = self;
+        drop(unclosed);
+        let state = &server.state;
+        let ended = async {
+            while state.sessions.count() > 0
+                || state.websocket_permits.available_permits() < CONNECTIONS
+            {
+                tokio::time::sleep(Duration::from_millis(1)).await;
+            }
+        };
+        if timeout(CLIENT_TIMEOUT, ended).await.is_err() {
+            let sessions = state.sessions.count();
+            let permits = state.websocket_permits.available_permits();
+            return Err(format!("{sessions} sessions stay, and {permits} permits are free"));
+        }
+        match state.metrics.steps.get() {
+            carried_out if carried_out == steps => Ok(()),
+            carried_out => Err(format!("{carried_out} steps were made, not {steps}")),
+        }
+    }
+}
+
+impl Link {
+    /// Sends a request so many times. Each is answered, with the same bytes.
+    async fn exchange(
+        &mut self,
+        seq: u64,
+        mut request: Value,
+        times: usize,
+    ) -> Result<Message, Lost> {
+        request["seq"] = seq.into();
+        let text = request.to_string();
+        for _ in 0..times {
+            self.socket.send(Message::text(text.clone())).await.map_err(|_| Lost)?;
+        }
+        let mut answers = Vec::new();
+        for _ in 0..times {
+            match self.socket.next().await {
+                Some(Ok(message @ (Message::Text(_) | Message::Binary(_)))) => {
+                    answers.push(message);
+                }
+                _ => return Err(Lost),
+            }
+        }
+        answers.dedup();
+        assert_eq!(answers.len(), 1, "a repeated request has two answers: {answers:?}");
+        answers.pop().ok_or(Lost)
+    }
+
+    fn times(&self) -> usize {
+        if self.faults.repeats { 2 } else { 1 }
+    }
+
+    async fn ask(&mut self, seq: u64, request: Value) -> Result<Value, Lost> {
+        let answer = self.exchange(seq, request, self.times()).await?;
+        serde_json::from_slice(&answer.into_data()).map_err(|_| Lost)
+    }
+
+    /// As [`Link::ask`], for a request after which the numbers go on elsewhere.
+    async fn ask_once(&mut self, seq: u64, request: Value) -> Result<Value, Lost> {
+        let answer = self.exchange(seq, request, 1).await?;
+        serde_json::from_slice(&answer.into_data()).map_err(|_| Lost)
+    }
+
+    /// An observation, or what is said in its place.
+    async fn observe(&mut self, seq: u64, request: Value) -> Result<Result<Seen, String>, Lost> {
+        Ok(match self.exchange(seq, request, self.times()).await? {
+            Message::Binary(bytes) => Ok(Seen::decode(bytes)),
+            other => Err(other.to_string()),
+        })
+    }
+}

@@ -1,0 +1,718 @@
+//! Histories of uploads: two tokens begin, send, cut off, continue and delete uploads, while the process is killed, the
+//! power fails, the disk is full, reads fail, are slow, end early or have wrong bits, and the clock jumps.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::time::timeout;
+use wildcity_twin::store::clock::Clock as _;
+
+use crate::auth::Tokens;
+use crate::config::{Limits, SpoolLimits};
+use crate::limits;
+use crate::spool::{Spool, SpoolMedium};
+
+use super::disk::{Fault, Plant, ROOT, SimClock, SimDisk};
+use super::machine::{CLIENT_TIMEOUT, Machine, SimServer};
+use super::network::{Cut, CutStream};
+use super::random::Random;
+use super::reads::{BadReads, ReadFault};
+
+/// The names of the tokens.
+const OWNERS: [&str; 2] = ["a", "b"];
+
+/// Sizes of the files that are uploaded, in bytes.
+const SIZES: [u64; 4] = [0, 40, 100, 160];
+
+/// How long an upload is kept, in seconds.
+const AGE_S: i64 = 86_400;
+
+/// Room for about three uploads of a token.
+const LIMITS: SpoolLimits = SpoolLimits {
+    uploads: 6,
+    upload_bytes: 1_000,
+    bytes: 500,
+    token_bytes: Some(250),
+    age: Duration::from_secs(AGE_S as u64),
+};
+
+/// Uploads of one token, at most: its share of [`LIMITS`].
+const OWN_UPLOADS: usize = 3;
+
+/// Writes of a request, about.
+const WRITES: u64 = 8;
+
+/// What is this close to a time-out may be on either side of it: a slow read takes a minute.
+const SLACK_US: i64 = 70_000_000;
+
+/// One of the files of one of the tokens.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Name {
+    owner: usize,
+    file: usize,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Operation {
+    Begin(Name),
+    /// Sends up to so many of the missing bytes, cut off after so many bytes of the request if it is cut.
+    Append {
+        name: Name,
+        bytes: u64,
+        cut: Option<u64>,
+    },
+    /// Sends bytes for another offset than the upload's.
+    WrongOffset(Name),
+    Delete(Name),
+    /// Deletes and continues another token's upload.
+    Foreign(Name),
+    /// Removes what is too old.
+    Expire,
+    /// Changes the time of day.
+    Jump {
+        seconds: i64,
+    },
+    /// Lets time pass.
+    Wait {
+        seconds: i64,
+    },
+    /// Ends the process between two requests.
+    Stop(Fault),
+}
+
+/// An operation, and what fails meanwhile.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Step {
+    seed: u64,
+    operation: Operation,
+    fault: Option<(u64, Fault)>,
+    bad_reads: Option<BadReads>,
+}
+
+/// A history of uploads.
+#[derive(Clone)]
+pub(super) struct Uploads {
+    seed: u64,
+    pub(super) steps: Vec<Step>,
+}
+
+impl super::History for Uploads {
+    type Plant = Plant;
+
+    fn of(seed: u64) -> Self {
+        let mut random = Random::new(seed);
+        let count = 4 + random.below(12);
+        let steps = (0..count).map(|_| Step::random(&mut random)).collect();
+        Self { seed, steps }
+    }
+
+    fn run(&self, machine: &Machine, plant: Option<Plant>) -> Result<(), String> {
+        machine.runtime.block_on(async {
+            let mut world = World::new(machine, plant)?;
+            for (index, step) in self.steps.iter().enumerate() {
+                let done = world.run(step).await;
+                done.map_err(|reason| format!("operation {index}: {reason}"))?;
+            }
+            world.finish().await.map_err(|reason| format!("at the end: {reason}"))
+        })
+    }
+
+    fn shorter(&self) -> Vec<Self> {
+        let without_step = (0..self.steps.len()).map(|index| {
+            let mut shorter = self.clone();
+            shorter.steps.remove(index);
+            shorter
+        });
+        let without_fault = (0..self.steps.len()).filter_map(|index| {
+            let mut without_fault = self.clone();
+            let Step { fault, bad_reads, .. } = &mut without_fault.steps[index];
+            let had_fault = fault.take().is_some() || bad_reads.take().is_some();
+            had_fault.then_some(without_fault)
+        });
+        without_step.chain(without_fault).collect()
+    }
+}
+
+impl fmt::Display for Uploads {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "seed {}", self.seed)?;
+        for (index, Step { operation, fault, bad_reads, .. }) in self.steps.iter().enumerate() {
+            writeln!(f, "  {index} {operation:?}, fault {fault:?}, reads {bad_reads:?}")?;
+        }
+        Ok(())
+    }
+}
+
+impl Step {
+    fn random(random: &mut Random) -> Self {
+        let name = Name { owner: random.below(2) as usize, file: random.below(4) as usize };
+        let bytes = random.below(SIZES[name.file] + 2);
+        let bytes = if random.once_in(2) { SIZES[name.file] } else { bytes };
+        let operation = match random.below(24) {
+            0..7 => Operation::Begin(name),
+            7..15 => {
+                // A request has about 200 bytes before its body.
+                let cut = random.once_in(3).then(|| random.below(400));
+                Operation::Append { name, bytes, cut }
+            }
+            15 => Operation::WrongOffset(name),
+            16 | 17 => Operation::Delete(name),
+            18 => Operation::Foreign(name),
+            19 => Operation::Expire,
+            20 => Operation::Jump { seconds: [-3_600, 3_600, AGE_S][random.below(3) as usize] },
+            21 => Operation::Wait { seconds: [60, 130, 700][random.below(3) as usize] },
+            _ => Operation::Stop([Fault::Kill, Fault::PowerCut][random.below(2) as usize]),
+        };
+        let faults = [Fault::Kill, Fault::PowerCut, Fault::PowerCut, Fault::Full];
+        let fault = faults[random.below(4) as usize];
+        let fault = random.once_in(3).then(|| (random.below(WRITES), fault));
+        let faults = [ReadFault::Error, ReadFault::Short, ReadFault::Flip, ReadFault::Slow];
+        let bad = faults[random.below(4) as usize];
+        let bad_reads = BadReads { after: 0, fault: bad, times: 1 };
+        let bad_reads = Some(bad_reads).filter(|_| fault.is_none() && random.once_in(4));
+        Self { seed: random.next(), operation, fault, bad_reads }
+    }
+}
+
+/// What is known of an upload.
+#[derive(Clone, Copy, Debug)]
+struct Known {
+    /// Bytes that the server has said that it has.
+    held: u64,
+    is_complete: bool,
+    /// When its files were last written, and when it was last announced or written, by the time of day.
+    written_us: i64,
+    used_us: i64,
+    /// When bytes last came, by the clock that never jumps.
+    active_us: i64,
+}
+
+/// The machine, and what its clients were promised.
+struct World<'a> {
+    machine: &'a Machine,
+    clock: Arc<SimClock>,
+    disk: SimDisk,
+    server: SimServer,
+    known: BTreeMap<Name, Known>,
+    /// Whether the disk may have files that a full disk kept from being removed.
+    has_leftovers: bool,
+}
+
+/// What may have become of the uploads at an operation.
+#[derive(Default)]
+struct Allowed {
+    /// Those that may be gone.
+    gone: BTreeSet<Name>,
+    /// Those that may have more bytes than before, or be new: up to so many.
+    grown: BTreeMap<Name, u64>,
+}
+
+/// An answer of the server.
+struct Answer {
+    status: u16,
+    body: Value,
+}
+
+/// The promise that is broken, if one is.
+type Promise = Result<(), String>;
+
+/// How an operation ended.
+type Outcome = Result<(), Failure>;
+
+/// Why an operation was not carried out.
+enum Failure {
+    /// The server refused it, as it may after a fault.
+    Refused(String),
+    /// A promise is broken.
+    Broken(String),
+}
+
+impl Failure {
+    /// An answer that is not expected without a fault.
+    fn of(what: &str, Answer { status, body }: &Answer) -> Self {
+        let reason = format!("{what} is answered with {status}: {body}");
+        let is_panic = reason.contains("a task crashed");
+        if matches!(status, 500 | 507) && !is_panic {
+            Self::Refused(reason)
+        } else {
+            Self::Broken(reason)
+        }
+    }
+}
+
+impl From<String> for Failure {
+    fn from(reason: String) -> Self {
+        Self::Broken(reason)
+    }
+}
+
+impl From<Failure> for String {
+    fn from(failure: Failure) -> Self {
+        match failure {
+            Failure::Refused(reason) | Failure::Broken(reason) => reason,
+        }
+    }
+}
+
+fn content(file: usize) -> Vec<u8> {
+    (0..SIZES[file]).map(|index| (index * 7 + file as u64) as u8).collect()
+}
+
+fn digest(file: usize) -> blake3::Hash {
+    blake3::hash(&content(file))
+}
+
+fn id(file: usize) -> String {
+    format!("blake3-{}", digest(file).to_hex())
+}
+
+fn tokens() -> Tokens {
+    let token = |name: &str| json!({"name": name, "role": "push", "token": secret(name)});
+    let tokens = json!({ "tokens": OWNERS.map(token) });
+    Tokens::parse(tokens.to_string().as_bytes()).expect("tokens")
+}
+
+fn secret(owner: &str) -> String {
+    format!("{owner}-0123456789abcdef")
+}
+
+fn open(machine: &Machine, disk: &SimDisk, clock: &Arc<SimClock>) -> Result<SimServer, String> {
+    let disk = Arc::new(disk.clone());
+    let dir = Path::new(ROOT).join("uploads");
+    let medium = SpoolMedium { dir, disk, clock: clock.clone() };
+    let spool = Spool::open(medium, LIMITS, OWNERS.len(), BTreeMap::new());
+    let spool = spool.map_err(|error| format!("the spool does not open: {error}"))?;
+    let limits = Limits { spool: LIMITS, ..Limits::default() };
+    Ok(machine.server(limits, Some(tokens()), Ok(Arc::new(spool))))
+}
+
+impl<'a> World<'a> {
+    fn new(machine: &'a Machine, plant: Option<Plant>) -> Result<Self, String> {
+        let clock = Arc::new(SimClock::new());
+        let disk = SimDisk::new(clock.clone(), plant);
+        let server = open(machine, &disk, &clock)?;
+        Ok(Self { machine, clock, disk, server, known: BTreeMap::new(), has_leftovers: false })
+    }
+
+    /// Carries out one step. If it stops the process, starts the next one.
+    async fn run(&mut self, step: &Step) -> Promise {
+        self.disk.set_fault(step.fault);
+        self.disk.set_bad_reads(step.bad_reads);
+        let mut allowed = Allowed::default();
+        let done = self.carry_out(step.operation, &mut allowed).await;
+        let was_full = matches!(step.fault, Some((_, Fault::Full))) && !self.disk.has_fault();
+        let has_bad_reads = self.disk.take_failed_reads() > 0;
+        self.disk.set_bad_reads(None);
+        match done {
+            Err(Failure::Refused(_)) if was_full || has_bad_reads || self.disk.is_stopped() => {}
+            done => done?,
+        }
+        if self.disk.is_stopped() {
+            return self.restart(step, &allowed);
+        }
+        self.disk.set_fault(None);
+        self.has_leftovers |= was_full;
+        if was_full && let Some(name) = step.operation.name() {
+            // A full disk keeps nothing of the upload that it refused.
+            allowed.gone.insert(name);
+        }
+        self.compare(&allowed)
+    }
+
+    async fn carry_out(&mut self, operation: Operation, allowed: &mut Allowed) -> Outcome {
+        match operation {
+            Operation::Begin(name) => self.begin(name, allowed).await,
+            Operation::Append { name, bytes, cut } => self.append(name, bytes, cut, allowed).await,
+            Operation::WrongOffset(name) => self.wrong_offset(name).await,
+            Operation::Delete(name) => self.delete(name, allowed).await,
+            Operation::Foreign(name) => self.foreign(name).await,
+            Operation::Expire => Ok(self.expire(allowed)?),
+            Operation::Jump { seconds } => {
+                self.clock.jump(seconds * 1_000_000);
+                Ok(())
+            }
+            Operation::Wait { seconds } => {
+                self.clock.wait(seconds * 1_000_000);
+                Ok(())
+            }
+            Operation::Stop(fault) => {
+                self.disk.stop(fault);
+                Ok(())
+            }
+        }
+    }
+
+    /// Sends a request as the owner of a name. `None` if it is cut.
+    async fn request(
+        &self,
+        owner: usize,
+        head: &str,
+        body: &[u8],
+        cut: Option<u64>,
+    ) -> Result<Option<Answer>, String> {
+        let (stream, served) = self.server.connect(64 << 10).await;
+        let mut stream = CutStream::new(stream, cut.map_or(Cut::Never, Cut::Sent));
+        let secret = secret(OWNERS[owner]);
+        let length = body.len();
+        let head = format!(
+            "{head}\r\nhost: localhost\r\nauthorization: Bearer {secret}\r\nconnection: close\r\n\
+             content-length: {length}\r\n\r\n"
+        );
+        let exchanged = async {
+            stream.write_all(&[head.as_bytes(), body].concat()).await.ok()?;
+            let mut answer = Vec::new();
+            stream.read_to_end(&mut answer).await.ok()?;
+            Some(answer)
+        };
+        let answer =
+            timeout(CLIENT_TIMEOUT, exchanged).await.map_err(|_| format!("no answer: {head}"))?;
+        drop(stream);
+        let ended = timeout(CLIENT_TIMEOUT, served).await;
+        let ended = ended.map_err(|_| format!("the connection does not end: {head}"))?;
+        ended.map_err(|error| format!("the task of the connection failed: {error}: {head}"))?;
+        let Some(answer) = answer else { return Ok(None) };
+        let answer = String::from_utf8_lossy(&answer).into_owned();
+        let status = answer.get(9..12).and_then(|status| status.parse().ok());
+        let status = status.ok_or_else(|| format!("{answer:?} is no answer to {head}"))?;
+        let body = answer.split_once("\r\n\r\n").map_or("", |(_, body)| body);
+        Ok(Some(Answer { status, body: serde_json::from_str(body).unwrap_or_default() }))
+    }
+
+    /// What others may lose because an upload needs room; `None` if there is enough.
+    fn pressure(&self, name: Name) -> Option<BTreeSet<Name>> {
+        let others = || self.known.keys().filter(|other| **other != name);
+        let own = || others().filter(|other| other.owner == name.owner);
+        let bytes_of = |names: &mut dyn Iterator<Item = &Name>| -> u64 {
+            names.map(|other| SIZES[other.file]).sum()
+        };
+        let size = SIZES[name.file];
+        let is_own_full = own().count() >= OWN_UPLOADS
+            || bytes_of(&mut own()) + size > LIMITS.token_bytes.unwrap_or(LIMITS.bytes);
+        let is_full =
+            others().count() >= LIMITS.uploads || bytes_of(&mut others()) + size > LIMITS.bytes;
+        if !is_own_full && !is_full {
+            return None;
+        }
+        let now_us = self.clock.monotonic_us();
+        let is_removable = |other: &&Name| {
+            let known = self.known[*other];
+            let is_empty = known.held == 0 && !known.is_complete;
+            let wait = if is_empty { limits::RESERVED_FOR } else { limits::KEPT_FOR };
+            let is_idle = now_us - known.active_us >= wait.as_micros() as i64 - SLACK_US;
+            is_idle || (other.owner == name.owner && known.is_complete)
+        };
+        Some(others().filter(is_removable).copied().collect())
+    }
+
+    async fn begin(&mut self, name: Name, allowed: &mut Allowed) -> Outcome {
+        let pressure = self.pressure(name);
+        allowed.gone.extend(pressure.iter().flatten());
+        allowed.grown.insert(name, 0);
+        let size = SIZES[name.file];
+        let digest = format!("blake3:{}", digest(name.file).to_hex());
+        let body = json!({ "name": "scene.ply", "size": size, "digest": digest }).to_string();
+        let answer = self.request(name.owner, "POST /v1/uploads HTTP/1.1", body.as_bytes(), None);
+        let Some(answer) = answer.await? else { return Ok(()) };
+        match answer.status {
+            status @ (200 | 201) => {
+                let now_us = self.clock.now_us();
+                let active_us = self.clock.monotonic_us();
+                let is_complete = status == 200;
+                let new =
+                    Known { held: 0, is_complete, written_us: now_us, used_us: now_us, active_us };
+                self.known.entry(name).or_insert(new).used_us = now_us;
+                Ok(self.expect_offset(name, &answer.body)?)
+            }
+            507 if pressure.is_some() => Ok(()),
+            _ => Err(Failure::of("an announcement", &answer)),
+        }
+    }
+
+    /// Compares the offset in an answer with what is known.
+    fn expect_offset(&self, name: Name, body: &Value) -> Promise {
+        let held = self.known.get(&name).map_or(0, |known| known.held);
+        if body["offset"].as_u64() == Some(held) {
+            return Ok(());
+        }
+        Err(format!("{name:?} has {held} bytes, and the answer is {body}"))
+    }
+
+    async fn append(
+        &mut self,
+        name: Name,
+        bytes: u64,
+        cut: Option<u64>,
+        allowed: &mut Allowed,
+    ) -> Outcome {
+        let held = self.known.get(&name).map_or(0, |known| known.held);
+        let end = (held + bytes).min(SIZES[name.file]);
+        let body = &content(name.file)[held as usize..end as usize];
+        let pressure = self.pressure(name);
+        if self.known.contains_key(&name) {
+            allowed.gone.extend(pressure.iter().flatten());
+            allowed.grown.insert(name, end);
+        }
+        let head = format!("PATCH /v1/uploads/{} HTTP/1.1\r\nupload-offset: {held}", id(name.file));
+        let answer = self.request(name.owner, &head, body, cut).await?;
+        self.settle(name).await?;
+        let Some(answer) = answer else { return Ok(()) };
+        match answer.status {
+            404 if !self.known.contains_key(&name) => Ok(()),
+            200 => {
+                let now_us = self.clock.now_us();
+                let active_us = self.clock.monotonic_us();
+                let known = self.known.get_mut(&name);
+                let known = known.ok_or_else(|| "an unknown upload is continued".to_owned())?;
+                if end > held {
+                    *known = Known { held: end, written_us: now_us, active_us, ..*known };
+                }
+                known.used_us = now_us;
+                known.is_complete = end == SIZES[name.file];
+                let body = &answer.body;
+                if body["complete"] != json!(known.is_complete) {
+                    let reason = format!("{end} bytes of {name:?} are answered with {body}");
+                    return Err(Failure::Broken(reason));
+                }
+                Ok(self.expect_offset(name, body)?)
+            }
+            507 if pressure.is_some() => Ok(()),
+            _ => Err(Failure::of("a part", &answer)),
+        }
+    }
+
+    /// Waits until the server has ended with an upload that was cut off.
+    async fn settle(&self, name: Name) -> Promise {
+        let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
+        if let Ok(upload) = spool.get(OWNERS[name.owner], &id(name.file)) {
+            upload.write().await.map_err(|fault| fault.to_string())?;
+        }
+        Ok(())
+    }
+
+    async fn wrong_offset(&self, name: Name) -> Outcome {
+        let Some(known) = self.known.get(&name) else { return Ok(()) };
+        let wrong = known.held + 1;
+        let head =
+            format!("PATCH /v1/uploads/{} HTTP/1.1\r\nupload-offset: {wrong}", id(name.file));
+        let Some(answer) = self.request(name.owner, &head, b"x", None).await? else {
+            return Ok(());
+        };
+        match answer.status {
+            409 => Ok(self.expect_offset(name, &answer.body)?),
+            _ => Err(Failure::of("a part for another offset", &answer)),
+        }
+    }
+
+    async fn delete(&mut self, name: Name, allowed: &mut Allowed) -> Outcome {
+        allowed.gone.insert(name);
+        let head = format!("DELETE /v1/uploads/{} HTTP/1.1", id(name.file));
+        let Some(answer) = self.request(name.owner, &head, b"", None).await? else { return Ok(()) };
+        let was_known = self.known.contains_key(&name);
+        match answer.status {
+            204 if was_known => {
+                if !self.disk.is_stopped() {
+                    self.known.remove(&name);
+                }
+                Ok(())
+            }
+            404 if !was_known => Ok(()),
+            _ => Err(Failure::of("a removal", &answer)),
+        }
+    }
+
+    async fn foreign(&self, name: Name) -> Outcome {
+        let other = Name { owner: 1 - name.owner, ..name };
+        if self.known.contains_key(&other) {
+            return Ok(());
+        }
+        let id = id(name.file);
+        for method in ["GET", "DELETE"] {
+            let head = format!("{method} /v1/uploads/{id} HTTP/1.1");
+            match self.request(other.owner, &head, b"", None).await? {
+                Some(Answer { status: 404, .. }) | None => {}
+                Some(answer) => {
+                    return Err(Failure::of(&format!("{method} of another's upload"), &answer));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn expire(&mut self, allowed: &mut Allowed) -> Promise {
+        let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
+        spool.remove_old();
+        let now_us = self.clock.now_us();
+        let age_us = AGE_S * 1_000_000;
+        for (name, known) in &self.known {
+            if now_us - known.written_us >= age_us - SLACK_US {
+                allowed.gone.insert(*name);
+            }
+            let is_over = now_us - known.used_us >= age_us + SLACK_US;
+            if is_over && spool.get(OWNERS[name.owner], &id(name.file)).is_ok() {
+                return Err(format!("{name:?} is kept for ever"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Compares what the server has with what it promised, and takes it over.
+    fn compare(&mut self, allowed: &Allowed) -> Promise {
+        let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
+        let now_us = self.clock.now_us();
+        let active_us = self.clock.monotonic_us();
+        let mut held_bytes = 0;
+        for (owner, token) in OWNERS.into_iter().enumerate() {
+            for file in 0..SIZES.len() {
+                let name = Name { owner, file };
+                let before = self.known.get(&name).copied();
+                let Ok(upload) = spool.get(token, &id(file)) else {
+                    if before.is_some() && !allowed.gone.contains(&name) {
+                        return Err(format!("{name:?} is lost: {before:?}"));
+                    }
+                    self.known.remove(&name);
+                    continue;
+                };
+                let held = upload.offset();
+                held_bytes += held;
+                let least = before.filter(|_| !allowed.gone.contains(&name)).map_or(0, |k| k.held);
+                let most = before.map(|known| known.held).max(allowed.grown.get(&name).copied());
+                if held < least || most.is_none_or(|most| held > most) {
+                    return Err(format!("{name:?} has {held} bytes, not {least} to {most:?}"));
+                }
+                let was_complete = before.is_some_and(|known| known.is_complete);
+                if was_complete && !upload.is_complete() && !allowed.gone.contains(&name) {
+                    return Err(format!("{name:?} is no longer complete"));
+                }
+                let new = Known {
+                    held,
+                    is_complete: upload.is_complete(),
+                    written_us: now_us,
+                    used_us: now_us,
+                    active_us,
+                };
+                let known = self.known.entry(name).or_insert(new);
+                if known.held != held {
+                    *known = new;
+                }
+                known.is_complete = upload.is_complete();
+            }
+        }
+        let usage = spool.usage();
+        if usage.uploads != self.known.len() {
+            return Err(format!("{} uploads count as {}", self.known.len(), usage.uploads));
+        }
+        self.compare_files(held_bytes)
+    }
+
+    /// Compares the bytes that count with those on the disk.
+    fn compare_files(&self, held_bytes: u64) -> Promise {
+        let files = self.disk.files_below("");
+        let kind =
+            |path: &PathBuf| path.extension().and_then(|kind| kind.to_str()).map(str::to_owned);
+        let mut stored_bytes = 0;
+        let mut leftovers = Vec::new();
+        for (path, bytes) in &files {
+            match kind(path).as_deref() {
+                Some("part" | "data") => stored_bytes += bytes,
+                Some("gone") => leftovers.push(path),
+                _ => {}
+            }
+        }
+        if !self.has_leftovers && (stored_bytes != held_bytes || !leftovers.is_empty()) {
+            return Err(format!(
+                "{held_bytes} bytes count, and {stored_bytes} are on the disk: {files:?}"
+            ));
+        }
+        Ok(())
+    }
+
+    /// Starts the next process, as after a kill or a power cut.
+    fn restart(&mut self, step: &Step, allowed: &Allowed) -> Promise {
+        let fault = match (step.operation, step.fault) {
+            (Operation::Stop(fault), _) => fault,
+            (_, Some((_, fault))) => fault,
+            (_, None) => Fault::Kill,
+        };
+        self.disk = self.disk.restarted(&mut Random::new(step.seed));
+        if step.seed.is_multiple_of(4) {
+            // A process that cannot read some of the uploads leaves them to the next one.
+            let bad = [ReadFault::Error, ReadFault::Short][step.seed as usize / 4 % 2];
+            let after = 3 + step.seed / 8 % 6;
+            self.disk.set_bad_reads(Some(BadReads { after, fault: bad, times: 1 }));
+            drop(open(self.machine, &self.disk, &self.clock)?);
+            self.disk.stop(Fault::Kill);
+            self.disk = self.disk.restarted(&mut Random::new(step.seed));
+        }
+        self.server = open(self.machine, &self.disk, &self.clock)?;
+        self.has_leftovers = false;
+        let active_us = self.clock.monotonic_us();
+        let mut gone = allowed.gone.clone();
+        let mut grown = allowed.grown.clone();
+        if fault == Fault::PowerCut {
+            // What was removed may be there again.
+            let names = (0..OWNERS.len() * SIZES.len())
+                .map(|index| Name { owner: index % OWNERS.len(), file: index / OWNERS.len() });
+            grown.extend(names.map(|name| (name, SIZES[name.file])));
+        }
+        for (name, known) in &mut self.known {
+            known.active_us = active_us;
+            known.used_us = known.used_us.max(known.written_us);
+            // An incomplete upload may lose its last bytes in a power cut, or all.
+            if fault == Fault::PowerCut && !known.is_complete {
+                gone.insert(*name);
+            }
+        }
+        self.compare(&Allowed { gone, grown })
+    }
+
+    /// Checks that the spool goes on working, and that nothing is left that counts.
+    async fn finish(mut self) -> Promise {
+        let kill =
+            Step { seed: 1, operation: Operation::Stop(Fault::Kill), fault: None, bad_reads: None };
+        self.run(&kill).await?;
+        for name in self.known.clone().into_keys() {
+            if self.pressure(name).is_none() {
+                self.finish_upload(name).await?;
+            }
+            self.delete(name, &mut Allowed::default()).await?;
+        }
+        self.compare(&Allowed::default())?;
+        let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
+        let left = self.disk.files_below("");
+        if spool.usage() != Default::default() || left.len() != 1 {
+            return Err(format!("{:?} count, and the disk has {left:?}", spool.usage()));
+        }
+        // As much as a token may have finds room.
+        for file in [3, 1] {
+            self.finish_upload(Name { owner: 0, file }).await?;
+        }
+        Ok(())
+    }
+
+    /// Begins an upload, or continues it, and sends the rest.
+    async fn finish_upload(&mut self, name: Name) -> Outcome {
+        let mut allowed = Allowed::default();
+        self.begin(name, &mut allowed).await?;
+        self.append(name, SIZES[name.file], None, &mut allowed).await?;
+        if !self.known.get(&name).is_some_and(|known| known.is_complete) {
+            let known = self.known.get(&name);
+            return Err(Failure::Broken(format!("{name:?} cannot be finished: {known:?}")));
+        }
+        Ok(())
+    }
+}
+
+impl Operation {
+    /// The upload that it changes.
+    fn name(self) -> Option<Name> {
+        match self {
+            Self::Begin(name) | Self::Append { name, .. } => Some(name),
+            _ => None,
+        }
+    }
+}
