@@ -9,6 +9,7 @@
 //! | [`wildcity_client`] | the Rust client of the protocol | protocol |
 //! | [`wildcity_scene`] | what a twin is: geometry, cameras, Gaussians, levels of detail, skies, drives | nothing of ours |
 //! | [`wildcity_render`] | images of a scene: `reference` (f64), `cpu` (SIMD), `gpu` (wgpu) | scene |
+//! | [`wildcity_heap`] | gives free memory back to the operating system | nothing of ours |
 //! | [`wildcity_generate`] | procedural streets and cities, and their maps | scene, sim |
 //! | [`wildcity_sim`] | what moves: ego, traffic, contacts; scenarios, maps and routes | scene |
 //! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
@@ -21,7 +22,7 @@
 //! | [`wildcity_repair`] | repair of images by an ONNX model: manifest, tiles, checks, hashes | nothing of ours |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, scene, session, stress, twin |
 //! | [`wildcity_alpasim`] | AlpaSim's gRPC services | client, render, scene, session, twin |
-//! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, protocol, push, render, repair, scene, session, sim, twin |
+//! | [`wildcity_server`] | WebSocket and HTTP, and the viewer | episode, heap, protocol, push, render, repair, scene, session, sim, twin |
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
@@ -31,7 +32,7 @@
 //!
 //! 1. The wire is known to `protocol`, `client` and `server::convert` only.
 //! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum;
-//!    only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost.
+//!    only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost; only `heap` has `unsafe`.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.
 //! 4. Scene data is checked once, when it enters; poses and cameras are checked once, at the wire.
 //! 5. An image is a function of scene version, render profile, poses, cameras and actors; and, where it says so,

@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -11,6 +11,7 @@ use tokio::time::timeout;
 
 use wildcity_session::Engine;
 
+use crate::limits;
 use crate::listen::listen;
 use crate::state::ServerState;
 use crate::tls::{self, Tls};
@@ -47,6 +48,18 @@ async fn renew_leases(state: &ServerState) {
     }
 }
 
+/// Gives memory that sections and pushes no longer need back to the operating system, until dropped.
+async fn release_memory() {
+    loop {
+        tokio::time::sleep(limits::MEMORY_RELEASE).await;
+        let began = Instant::now();
+        if tokio::task::spawn_blocking(wildcity_heap::release_free_memory).await.is_err() {
+            tracing::error!("free memory was not released: a task crashed");
+        }
+        tracing::debug!(took = ?began.elapsed(), "released free memory");
+    }
+}
+
 impl Running {
     /// Starts the tasks of a server.
     pub(crate) fn new(
@@ -65,6 +78,7 @@ impl Running {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
                 () = renew_leases(&periodic) => {}
+                () = release_memory() => {}
                 () = reloading => {}
                 () = periodic.stopped() => {}
             }

@@ -17,6 +17,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("bincode", &["src/twin/store/chunk_file.rs"]),
     ("fearless_simd", &["src/render/cpu", "src/scene/sky"]),
     ("wgpu", &["src/render/gpu"]),
+    ("libc", &["src/heap"]),
     ("ort", &["src/repair/onnx.rs"]),
     ("object_store", &["src/twin/store/remote", "src/twin/store/catalog.rs"]),
     (
@@ -100,10 +101,18 @@ fn a_planted_violation_is_found() {
             depends_on: Vec::new(),
             files: BTreeMap::from([(file.to_owned(), planted.to_owned())]),
             folder: folder.to_owned(),
+            inherits_lints: true,
         };
         let found = violations(&package);
         assert!(found.iter().any(|text| text.contains(reason)), "{planted:?}: {found:?}");
     }
+}
+
+#[test]
+fn only_heap_may_have_unsafe() {
+    let own = |package: &Package| !package.inherits_lints;
+    let found: Vec<String> = packages().into_iter().filter(own).map(|it| it.name).collect();
+    assert_eq!(found, ["wildcity-heap"]);
 }
 
 /// The rows ``//! | `wildcity-render` | what it is | scene |`` of the documentation.

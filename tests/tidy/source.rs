@@ -21,6 +21,8 @@ pub(crate) struct Package {
     pub(crate) files: BTreeMap<String, String>,
     /// The source folder, from the root of the repository: `src/render`.
     pub(crate) folder: String,
+    /// Whether its lints are those of the workspace.
+    pub(crate) inherits_lints: bool,
 }
 
 #[derive(Deserialize)]
@@ -29,6 +31,7 @@ struct Manifest {
     lib: Option<Library>,
     #[serde(default)]
     dependencies: BTreeMap<String, toml::Value>,
+    lints: BTreeMap<String, toml::Value>,
 }
 
 #[derive(Deserialize)]
@@ -76,6 +79,7 @@ fn package(member: &str) -> Package {
         name: manifest.package.name,
         depends_on,
         files,
+        inherits_lints: manifest.lints.contains_key("workspace"),
         folder: folder.to_str().unwrap().trim_end_matches('/').to_owned(),
     }
 }

@@ -1,0 +1,34 @@
+//! Memory goes back to the operating system: one test, alone in its process, so that the numbers are its own.
+#![cfg(all(target_os = "linux", target_env = "gnu"))]
+
+use std::hint::black_box;
+
+/// Small enough that glibc takes it from the heap, and large enough to contain whole pages.
+const BLOCK_BYTES: usize = 64 << 10;
+const BLOCKS: usize = 2_000;
+
+#[test]
+fn free_pages_between_used_blocks_are_given_back() {
+    let mut short_lived = Vec::new();
+    let mut kept = Vec::new();
+    for _ in 0..BLOCKS {
+        short_lived.push(black_box(vec![1_u8; BLOCK_BYTES]));
+        kept.push(black_box(vec![2_u8; 100]));
+    }
+    let full = resident_bytes();
+    drop(short_lived);
+    let freed = resident_bytes();
+    let short_lived_bytes = (BLOCKS * BLOCK_BYTES) as u64;
+    assert!(full - freed < short_lived_bytes / 10, "glibc gave back {} bytes", full - freed);
+
+    wildcity_heap::release_free_memory();
+    let given_back = full.saturating_sub(resident_bytes());
+    assert!(given_back > short_lived_bytes * 9 / 10, "{given_back} of {short_lived_bytes}");
+    assert!(kept.iter().all(|block| block.iter().all(|&byte| byte == 2)));
+}
+
+fn resident_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+    line.trim().trim_end_matches(" kB").parse::<u64>().unwrap() << 10
+}
