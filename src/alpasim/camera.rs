@@ -4,7 +4,7 @@
 //! AlpaSim counts that of an f-theta camera from the centre of the first pixel, 0.5 less than here. Those of OpenCV's
 //! models are counted from the corner, as here.
 
-use wildcity_render::{RollingShutter, View};
+use wildcity_render::{Readout, RollingShutter, View};
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::camera::{
     FThetaReference, Lens, ShutterDirection, WindshieldReference,
@@ -93,16 +93,17 @@ pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View
     let pair = request.sensor_pose.ok_or(SceneError::Missing { field: "sensor_pose" })?;
     let end = frame.world_from("sensor_pose.end_pose", pair.end_pose.as_ref())?;
     let shutter = request.camera_intrinsics.as_ref().map(wire::CameraSpec::shutter_type);
-    let rolling_shutter = match shutter.and_then(direction) {
-        None => None,
-        Some(direction) => {
-            let first = frame.world_from("sensor_pose.start_pose", pair.start_pose.as_ref())?;
-            // A camera at rest has no motion to render, as in a session.
-            (first != end).then_some(RollingShutter { direction, world_from_camera_first: first })
-        }
+    let Some(direction) = shutter.and_then(direction) else {
+        return Ok(View::new(camera, end));
     };
-    // Only moving actors need the readout of a camera at rest, and none are drawn.
-    Ok(View { camera, world_from_camera: end, rolling_shutter, readout: None })
+    let first = frame.world_from("sensor_pose.start_pose", pair.start_pose.as_ref())?;
+    // A camera at rest has no motion to render, as in a session, but sees objects move.
+    let moves = first != end;
+    let rolling_shutter =
+        moves.then_some(RollingShutter { direction, world_from_camera_first: first });
+    // The poses of a request's objects are those at the start and the end of its own exposure.
+    let readout = Some(Readout { direction, share: 1.0 });
+    Ok(View { camera, world_from_camera: end, rolling_shutter, readout })
 }
 
 /// A camera of a rig, as `get_available_cameras` lists it.

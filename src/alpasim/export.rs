@@ -8,14 +8,16 @@ use std::fmt::Write as _;
 use glam::{DMat4, DVec2, DVec3};
 use serde_json::{Value, json};
 
-use wildcity_scene::Manifest;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::route::{Route, RouteError};
+use wildcity_scene::{ActorBox, ActorClass, Manifest};
+use wildcity_sim::scenario::{FileError, TrackSection, TracksFile};
 
 use crate::camera::logical_id;
 use crate::limits;
-use crate::scene::{SceneError, SceneId};
+use crate::object::{centre_of_actor, id_of_asset, id_of_box};
+use crate::scene::{LocalFrame, SceneError, SceneId};
 
 /// Name of the one sequence of a scene.
 const SEQUENCE: &str = "drive";
@@ -46,6 +48,9 @@ pub enum ExportError {
     /// The drive is damaged.
     #[error(transparent)]
     Route(#[from] RouteError),
+    /// A recorded actor is damaged.
+    #[error(transparent)]
+    Tracks(#[from] FileError),
     /// The scene would have fewer than two poses.
     #[error("{scene} is shorter than {PERIOD_US} us: choose an earlier start")]
     Short {
@@ -54,18 +59,28 @@ pub enum ExportError {
     },
 }
 
-/// The files of a scene, by name. `hash` is that of the version's manifest, and `cameras` are those that the
-/// scene offers.
+/// What a scene has beside its twin.
+#[derive(Clone, Copy, Debug)]
+pub struct SceneContent<'a> {
+    /// The cameras that it offers.
+    pub cameras: &'a [RigCamera],
+    /// Its recorded traffic. A track with an asset has the size of the asset.
+    pub tracks: Option<&'a TracksFile>,
+    /// Length in seconds.
+    pub length_s: f64,
+}
+
+/// The files of a scene, by name. `hash` is that of the version's manifest.
 ///
 /// # Errors
-/// The manifest has no such scene, or it is too short.
+/// The manifest has no such scene, or it is too short, or a track is damaged.
 pub fn files(
     id: &SceneId,
     manifest: &Manifest,
     hash: &str,
-    cameras: &[RigCamera],
-    length_s: f64,
+    content: SceneContent<'_>,
 ) -> Result<Vec<(&'static str, String)>, ExportError> {
+    let SceneContent { cameras, tracks, length_s } = content;
     let drive = id.drive(manifest)?;
     let frame = id.local_frame(manifest)?;
     let route = Route::new(drive)?;
@@ -83,10 +98,16 @@ pub fn files(
     if poses.len() < 2 {
         return Err(ExportError::Short { scene: id.to_string() });
     }
+    let times_us: Vec<i64> = poses.iter().map(|(since_us, _)| *since_us).collect();
+    let sections = tracks.map_or(&[][..], |file| &file.tracks);
+    let mut tracks = Vec::new();
+    for section in sections {
+        tracks.extend(track(section, start_us, &times_us, frame)?);
+    }
     Ok(vec![
         ("metadata.yaml", pretty(&metadata(id, hash, cameras, &poses))),
         ("rig_trajectories.json", pretty(&rig_trajectories(cameras, &poses))),
-        ("sequence_tracks.json", pretty(&sequence_tracks())),
+        ("sequence_tracks.json", pretty(&sequence_tracks(&tracks))),
         ("map.xodr", road(&poses)),
     ])
 }
@@ -149,14 +170,64 @@ fn rig_trajectories(cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
     })
 }
 
-/// One sequence without tracks: twins have no other traffic yet.
-fn sequence_tracks() -> Value {
+/// A recorded actor within a scene.
+struct SceneTrack {
+    id: String,
+    label: &'static str,
+    size_m: [f64; 3],
+    /// Times in microseconds since 1970, and poses of the middle of its box: x, y, z and a quaternion x, y, z, w.
+    poses: Vec<(i64, [f64; 7])>,
+}
+
+/// The part of a recorded actor's track that a scene shows, at the scene's times since `start_us`; `None` if it is
+/// there at fewer than two of them.
+fn track(
+    section: &TrackSection,
+    start_us: i64,
+    times_us: &[i64],
+    frame: LocalFrame,
+) -> Result<Option<SceneTrack>, FileError> {
+    let [length_m, width_m, height_m] = section.size;
+    let size = ActorBox { length_m, width_m, height_m };
+    let track = section.shifted(start_us)?;
+    let pose = |time_us: i64| {
+        let centre = centre_of_actor(&track.at(time_us)?.world_from_actor, &size);
+        let [x, y, z] = (centre.position_m - frame.origin_m).to_array();
+        let [qw, qx, qy, qz] = centre.q_wxyz();
+        Some((limits::EPOCH_US as i64 + time_us, [x, y, z, qx, qy, qz, qw]))
+    };
+    let poses: Vec<_> = times_us.iter().filter_map(|&time_us| pose(time_us)).collect();
+    let id = match &section.asset {
+        Some(hash) => id_of_asset(&section.id, hash),
+        None => id_of_box(&section.id, &size),
+    };
+    let label = match section.class {
+        ActorClass::Vehicle => "automobile",
+        ActorClass::Pedestrian => "person",
+        ActorClass::Bicycle => "bicycle",
+        ActorClass::Object => "other",
+    };
+    // AlpaSim fits a spline to the positions, which one pose has not.
+    let is_shown = poses.len() >= 2;
+    Ok(is_shown.then_some(SceneTrack { id, label, size_m: section.size, poses }))
+}
+
+/// One sequence with the tracks of a scene.
+fn sequence_tracks(tracks: &[SceneTrack]) -> Value {
+    let listed = |of: &dyn Fn(&SceneTrack) -> Value| tracks.iter().map(of).collect::<Vec<_>>();
+    let times = |track: &SceneTrack| -> Vec<i64> { track.poses.iter().map(|at| at.0).collect() };
+    let poses =
+        |track: &SceneTrack| -> Vec<[f64; 7]> { track.poses.iter().map(|at| at.1).collect() };
     json!({ SEQUENCE: {
         "tracks_data": {
-            "tracks_id": [], "tracks_label_class": [], "tracks_flags": [],
-            "tracks_timestamps_us": [], "tracks_poses": [],
+            "tracks_id": listed(&|track| json!(track.id)),
+            "tracks_label_class": listed(&|track| json!(track.label)),
+            // Its motion may be another than the recorded one.
+            "tracks_flags": listed(&|_| json!("CONTROLLABLE")),
+            "tracks_timestamps_us": listed(&|track| json!(times(track))),
+            "tracks_poses": listed(&|track| json!(poses(track))),
         },
-        "cuboidtracks_data": { "cuboids_dims": [] },
+        "cuboidtracks_data": { "cuboids_dims": listed(&|track| json!(track.size_m)) },
     } })
 }
 

@@ -5,7 +5,9 @@
 //! grpc        one gRPC method over HTTP/2
 //! scene       scenes: pieces of recorded drives, and their local frames
 //! camera      cameras, poses and shutters, to and from the wire
+//! object      dynamic objects: what their ids stand for
 //! sensorsim   wildcity as AlpaSim's renderer
+//! physics     wildcity as AlpaSim's physics: boxes on the ground
 //! export      scenes as the files that AlpaSim's runtime reads
 //! egodriver   wildcity driven by AlpaSim's drivers
 //! ```
@@ -22,6 +24,8 @@ pub mod egodriver;
 pub mod export;
 pub mod grpc;
 pub mod limits;
+pub mod object;
+pub mod physics;
 pub mod scene;
 pub mod sensorsim;
 pub mod wire;

@@ -18,6 +18,19 @@ pub const OPEN_SCENES: usize = 16;
 /// Images of one request: a minute of a rig of 16 cameras at 4 Hz would be 3,840.
 pub const BATCH_IMAGES: usize = 256;
 
+/// Dynamic objects whose assets stay in memory between requests.
+pub const OBJECT_ASSETS: usize = 512;
+
+/// Boxes that one request puts on the ground: a rollout of 20 s has 200 poses of the ego. At 1 ms each, for the
+/// longest drives, they take 4 s.
+pub const PHYSICS_BOXES: usize = 4096;
+
+/// A box is moved by physics up to this far, in metres, as by AlpaSim's own service.
+pub const PHYSICS_TRANSLATION_M: f64 = 1.5;
+
+/// A box is turned by physics up to this far, in radians: 10 degrees, as by AlpaSim's own service.
+pub const PHYSICS_ROTATION_RAD: f64 = 0.174_532_925_199_432_95;
+
 /// Distance between two listed starts along a drive, in metres.
 pub const SCENE_SPACING_M: f64 = 100.0;
 

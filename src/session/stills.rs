@@ -9,8 +9,10 @@ use tokio::time::Instant;
 
 use wildcity_render::{Frame, MAX_VIEWS, Target, View};
 use wildcity_scene::RenderProfile;
+use wildcity_scene::actor::{ActorAsset, PlacedChunk};
 use wildcity_scene::appearance::Appearance;
-use wildcity_twin::residency::{Reservation, Resident, RigExtent};
+use wildcity_scene::geometry::Pose;
+use wildcity_twin::residency::{Reservation, Resident, ResidentActor, RigExtent};
 
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
@@ -18,6 +20,7 @@ use crate::engine::render_queue::FrameCost;
 use crate::error::SessionError;
 use crate::observe::encode::{Encoding, encode};
 use crate::pin::pin;
+use crate::scenario::assets::{FrameDetail, Placement};
 use crate::viewpoint::viewpoints;
 
 /// One image to render.
@@ -29,6 +32,36 @@ pub struct Still {
     pub appearance: Appearance,
     /// How the image is encoded.
     pub encoding: Encoding,
+}
+
+/// What moves in the twin, in images of one moment.
+#[derive(Clone, Debug)]
+pub struct StillActor {
+    /// What it is drawn from.
+    pub asset: StillAsset,
+    /// Its pose where the exposures end: its origin is on the ground under its middle, x points forward.
+    pub world_from_actor: Pose,
+    /// Its pose where the longest exposure begins.
+    pub world_from_actor_at_start: Pose,
+}
+
+/// What an actor is drawn from.
+#[derive(Clone, Debug)]
+pub enum StillAsset {
+    /// An asset of the store.
+    Stored(Arc<ResidentActor>),
+    /// One that the caller has made. Its memory is not counted as that of twins.
+    Made(Arc<ActorAsset>),
+}
+
+impl StillAsset {
+    /// The asset.
+    pub fn asset(&self) -> &ActorAsset {
+        match self {
+            Self::Stored(actor) => actor.asset(),
+            Self::Made(asset) => asset,
+        }
+    }
 }
 
 /// A version that images are rendered of, and the memory for its worst frame.
@@ -66,19 +99,26 @@ impl Stills {
     }
 
     /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than [`MAX_VIEWS`] are
-    /// rendered in several frames, each in its turn among the frames of all sessions.
+    /// rendered in several frames, each in its turn among the frames of all sessions. All of them show `actors`, at
+    /// most [`PlacedChunk::MAX_ACTORS`].
     ///
     /// # Errors
     /// Names what was not ready within `patience`, or what the backend refuses.
     pub async fn render(
         &self,
         stills: Vec<Still>,
+        actors: &[StillActor],
         patience: Duration,
     ) -> Result<Vec<Vec<u8>>, SessionError> {
+        let most = PlacedChunk::MAX_ACTORS;
+        if actors.len() > most {
+            let must = format!("{}; at most {most} are accepted", actors.len());
+            return Err(SessionError::OutOfRange { field: "actors", must });
+        }
         let deadline = Instant::now() + patience;
         let mut images = Vec::with_capacity(stills.len());
         for part in stills.chunks(MAX_VIEWS) {
-            images.append(&mut self.render_frame(part.to_vec(), deadline).await?);
+            images.append(&mut self.render_frame(part.to_vec(), actors, deadline).await?);
         }
         Ok(images)
     }
@@ -86,6 +126,7 @@ impl Stills {
     async fn render_frame(
         &self,
         stills: Vec<Still>,
+        actors: &[StillActor],
         deadline: Instant,
     ) -> Result<Vec<Vec<u8>>, SessionError> {
         let views: Vec<View> = stills.iter().map(|still| still.view).collect();
@@ -95,8 +136,12 @@ impl Stills {
 
         // Load before the job is queued, so that no render thread waits for a disk.
         let resident = self.reservation.resident().clone();
-        let scene = pin(resident, self.profile, deadline, viewpoints(&views)).await?;
         let profile = self.profile;
+        let viewpoints = viewpoints(&views);
+        let detail = FrameDetail { viewpoints: &viewpoints, profile: &profile };
+        let placed = detail.placed(placements(actors));
+        let mut scene = pin(resident, profile, deadline, viewpoints).await?;
+        scene.place(placed);
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
             let zeroed = |view: &View| vec![0; 3 * view.camera.pixels()];
             let mut images: Vec<Vec<u8>> = views.iter().map(zeroed).collect();
@@ -122,6 +167,15 @@ impl Stills {
         })
         .await?
     }
+}
+
+fn placements(actors: &[StillActor]) -> impl Iterator<Item = Placement<'_>> {
+    (0..).zip(actors).map(|(index, actor)| Placement {
+        actor: index,
+        asset: actor.asset.asset(),
+        world_from_actor: actor.world_from_actor,
+        world_from_actor_at_start: actor.world_from_actor_at_start,
+    })
 }
 
 fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, SessionError> {

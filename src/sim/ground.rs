@@ -37,10 +37,12 @@ impl<'a> Ground<'a> {
     /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are distinguished.
     /// Between keyframes it is interpolated. Every keyframe is tested: 170,000 take a millisecond.
     pub fn place(&self, world_from_rig: Pose) -> Pose {
-        match self.under(world_from_rig.position_m) {
-            Some(plane) => plane.place(world_from_rig),
-            None => world_from_rig,
-        }
+        self.find(world_from_rig).unwrap_or(world_from_rig)
+    }
+
+    /// As [`Ground::place`]; `None` for a pose that it leaves unchanged because there is no ground, or no heading.
+    pub fn find(&self, world_from_rig: Pose) -> Option<Pose> {
+        self.under(world_from_rig.position_m)?.place(world_from_rig)
     }
 
     fn under(&self, point_m: DVec3) -> Option<Plane> {
@@ -67,22 +69,20 @@ impl<'a> Ground<'a> {
 }
 
 impl Plane {
-    fn place(&self, world_from_rig: Pose) -> Pose {
+    fn place(&self, world_from_rig: Pose) -> Option<Pose> {
         let Self { point_m, up } = *self;
         // A drive that is tilted by more than 45 degrees does not define a ground.
         if up.z < limits::GROUND_UP {
-            return world_from_rig;
+            return None;
         }
         let mut position_m = world_from_rig.position_m;
         let aside_m = position_m - point_m;
         position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
         let forward = world_from_rig.rotation * DVec3::X;
-        // A rig that points along the normal has no heading; it is returned unchanged.
-        let Some(forward) = forward.reject_from_normalized(up).try_normalize() else {
-            return world_from_rig;
-        };
+        // A rig that points along the normal has no heading.
+        let forward = forward.reject_from_normalized(up).try_normalize()?;
         let rotation = DQuat::from_mat3(&DMat3::from_cols(forward, up.cross(forward), up));
-        Pose { position_m, rotation: rotation.normalize() }
+        Some(Pose { position_m, rotation: rotation.normalize() })
     }
 }
 
@@ -142,5 +142,12 @@ mod tests {
         let far = Pose { position_m: DVec3::new(0.0, 500.0, 3.0), ..Pose::IDENTITY };
         assert_eq!(Ground::from_drives(&drives).place(far), far);
         assert_eq!(Ground::from_drives(&[]).place(far), far);
+        assert_eq!(Ground::from_drives(&drives).find(far), None);
+        let upwards = Pose {
+            position_m: DVec3::new(25.0, 0.0, 0.5),
+            rotation: DQuat::from_rotation_y(-std::f64::consts::FRAC_PI_2),
+        };
+        assert_eq!(Ground::from_drives(&drives).find(upwards), None);
+        assert_eq!(Ground::from_drives(&drives).place(upwards), upwards);
     }
 }

@@ -53,6 +53,8 @@ class Door:
     url: str
     stub: Any
     process: subprocess.Popen[str]
+    channel: grpc.Channel
+    folder: Path
 
 
 def hood() -> str:
@@ -76,6 +78,7 @@ def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
     files = ["--trajectory", str(folder / "log.json"), "--rig", str(folder / "rig.json")]
     importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
     subprocess.run([*importing, *twins, *files], check=True, timeout=60)
+    subprocess.run([binary, "actor", "generate", *twins], check=True, timeout=120, stdout=subprocess.DEVNULL)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0", "--alpasim", "127.0.0.1:0"]
     serving += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True) as process:
@@ -84,7 +87,7 @@ def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
             options = [("grpc.max_receive_message_length", 64 << 20), ("grpc.enable_http_proxy", 0)]
             with grpc.insecure_channel(lines["AlpaSim: listening on "], options) as channel:
                 stub = Stub(channel)
-                yield Door(lines["listening on "], stub, process)
+                yield Door(lines["listening on "], stub, process, channel, folder)
         finally:
             process.terminate()
             assert process.wait(timeout=20) == 0, "the server did not stop cleanly"
@@ -156,6 +159,17 @@ def request(**changes: Any) -> Any:
         **changes,
     }
     return sensorsim_pb2.RGBRenderRequest(**fields)
+
+
+def thing(
+    track_id: str,
+    xyz: tuple[float, ...] = (12.0, 0.0, 1.0),
+    q: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0),
+    start: tuple[float, ...] | None = None,
+) -> Any:
+    """A dynamic object, by the pose of the middle of its box."""
+    pair = sensorsim_pb2.PosePair(start_pose=pose(start or xyz, q), end_pose=pose(xyz, q))
+    return sensorsim_pb2.DynamicObject(track_id=track_id, pose_pair=pair)
 
 
 def decoded(image_bytes: bytes) -> Any:
@@ -321,6 +335,12 @@ def test_aggregated_requests_and_loaded_scenes(door: Door) -> None:
         ({"sensor_pose": sensorsim_pb2.PosePair(end_pose=pose((float("nan"), 0, 0)))}, "INVALID_ARGUMENT", "finite"),
         ({"resolution_h": 100_000}, "INVALID_ARGUMENT", "height"),
         ({"image_format": sensorsim_pb2.ImageFormat.AV1}, "INVALID_ARGUMENT", "image_format"),
+        ({"dynamic_objects": [thing("7@nothing")]}, "INVALID_ARGUMENT", "nothing"),
+        ({"dynamic_objects": [thing("7@4x2x0")]}, "INVALID_ARGUMENT", "height_m is 0.0"),
+        ({"dynamic_objects": [thing("7@4x2x1#red")]}, "INVALID_ARGUMENT", "6 hex digits"),
+        ({"dynamic_objects": [sensorsim_pb2.DynamicObject(track_id="7@4x2x1")]}, "INVALID_ARGUMENT", "pose_pair is missing"),
+        ({"dynamic_objects": [thing("7", (float("inf"), 0, 0))]}, "INVALID_ARGUMENT", "finite"),
+        ({"dynamic_objects": [thing("7")] * 257}, "INVALID_ARGUMENT", "257 dynamic_objects; at most 256"),
     ],
 )
 def test_errors_have_the_codes_that_the_runtime_knows(
@@ -341,9 +361,19 @@ def test_lidars_are_not_rendered(door: Door) -> None:
     assert refused.value.code() == grpc.StatusCode.UNIMPLEMENTED
 
 
-def test_dynamic_objects_are_ignored(door: Door) -> None:
-    car = sensorsim_pb2.DynamicObject(track_id="1", pose_pair=sensorsim_pb2.PosePair(end_pose=pose(HERE)))
-    assert door.stub.render_rgb(request(dynamic_objects=[car])) == door.stub.render_rgb(request())
+def test_what_concerns_all_images_fails_the_batch(door: Door) -> None:
+    """The runtime stops, or tries again, by the code of the whole answer."""
+    item = sensorsim_pb2.BatchRGBRenderRequestItem
+    good = item(camera_name="front", request=request())
+    lost = item(camera_name="lost", request=request(scene_id="corridor@9+log+0"))
+    for items, code, text in (
+        ([good, lost], "NOT_FOUND", "9"),
+        ([good, item(camera_name="none")], "INVALID_ARGUMENT", "request is missing"),
+        ([good] * 257, "INVALID_ARGUMENT", "257 images; at most 256"),
+    ):
+        with pytest.raises(grpc.RpcError) as refused:
+            door.stub.batch_render_rgb(sensorsim_pb2.BatchRGBRenderRequest(items=items))
+        assert (refused.value.code().name, text in refused.value.details()) == (code, True), refused.value.details()
 
 
 def test_a_public_address_needs_consent() -> None:
@@ -376,3 +406,19 @@ def test_a_server_that_stops_answers_unavailable(tmp_path: Path) -> None:
             process.terminate()
             assert running.exception(timeout=20).code() == grpc.StatusCode.UNAVAILABLE
         assert process.wait(timeout=20) == 0
+
+
+def test_too_little_memory_is_a_backend_that_was_waited_for(door: Door) -> None:
+    """AlpaSim's runtime tries again after this text."""
+    binary = os.environ["WILDCITY_BIN"]
+    serving = [binary, "serve", "--twins", str(door.folder / "twins"), "--memory-gib", "0.001"]
+    serving += ["--listen", "127.0.0.1:0", "--alpasim", "127.0.0.1:0"]
+    serving += ["--episodes", str(door.folder / "e"), "--uploads", str(door.folder / "u")]
+    with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True) as process:
+        address = listening(process)["AlpaSim: listening on "]
+        with grpc.insecure_channel(address, [("grpc.enable_retries", 0)]) as channel:
+            with pytest.raises(grpc.RpcError) as refused:
+                Stub(channel).render_rgb(request())
+        process.terminate()
+    assert refused.value.code() == grpc.StatusCode.DEADLINE_EXCEEDED
+    assert refused.value.details().startswith("Stopped waiting for backend"), refused.value.details()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -80,6 +81,79 @@ def test_one_sequence_without_tracks(scenes: dict[str, dict[str, bytes]]) -> Non
         (sequence,) = json.loads(files["sequence_tracks.json"]).values()
         lists = [*sequence["tracks_data"].values(), *sequence["cuboidtracks_data"].values()]
         assert len(lists) == 6 and all(values == [] for values in lists)
+
+
+def test_tracks_are_within_the_scene_by_the_middle_of_their_boxes(tmp_path: Path) -> None:
+    binary = os.environ["WILDCITY_BIN"]
+    write_corridor(tmp_path / "corridor.ply")
+    write_log(tmp_path / "log.json")
+    twins = ["--twins", str(tmp_path / "twins")]
+    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
+    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    made = subprocess.run([binary, "actor", "generate", *twins], capture_output=True, text=True, check=True, timeout=120)
+    (sedan,) = (line.split()[1] for before, line in itertools.pairwise(made.stdout.splitlines()) if "actor sedan:" in before)
+
+    def track(name: str, first: int, last: int, **more: Any) -> dict[str, Any]:
+        turn = math.pi / 2
+        keyframes = [
+            {"time_us": 100_000 * k, "pose": {"xyz": [10.0, k, 0.5], "yaw_rad": turn}} for k in range(first, last)
+        ]
+        return {"id": name, "class": "vehicle", "size": [4.0, 2.0, 1.5], "keyframes": keyframes, **more}
+
+    # The scene that starts at 4 m lasts from 0.8 s to 1.8 s.
+    tracks = [
+        track("whole", 0, 21),
+        track("walker", 12, 15, **{"class": "pedestrian"}),
+        track("before", 0, 8),
+        track("once", 18, 21),
+        track("sedan", 0, 21, asset=sedan),
+    ]
+    (tmp_path / "tracks.json").write_text(json.dumps({"format": "wildcity.tracks/1", "tracks": tracks}))
+    exporting = [binary, "alpasim", "export", "corridor", "--out", str(tmp_path / "scenes"), *twins]
+    exporting += ["--every-m", "4", "--length-s", "1", "--tracks", str(tmp_path / "tracks.json")]
+    done = subprocess.run(exporting, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with zipfile.ZipFile(tmp_path / "scenes" / "corridor@1+log+4.usdz") as archive:
+        (sequence,) = json.loads(archive.read("sequence_tracks.json")).values()
+    data, sizes = sequence["tracks_data"], sequence["cuboidtracks_data"]["cuboids_dims"]
+    assert data["tracks_id"] == ["whole@4x2x1.5", "walker@4x2x1.5", f"sedan@{sedan}"]
+    assert data["tracks_label_class"] == ["automobile", "person", "automobile"]
+    # AlpaSim moves what is CONTROLLABLE, and takes the rest as standing.
+    assert data["tracks_flags"] == ["CONTROLLABLE"] * 3
+    assert sizes[0] == [4.0, 2.0, 1.5] and sizes[2] != sizes[0] and all(3.0 < sizes[2][0] < 6.0 for _ in sizes)
+    times = [EPOCH_US + 100_000 * k for k in range(11)]
+    assert data["tracks_timestamps_us"] == [times, times[4:7], times]
+    poses = np.array(data["tracks_poses"][0])
+    # Half the height above the ground, 4 m behind in x; the quaternion is x, y, z, w.
+    assert poses[:, :3] == pytest.approx(np.array([[6.0, 8.0 + k, 1.25] for k in range(11)]), abs=1e-9)
+    assert poses[:, 3:] == pytest.approx(np.array([[0, 0, 0.5**0.5, 0.5**0.5]] * 11), abs=1e-9)
+    assert np.array(data["tracks_poses"][2])[:, 2] == pytest.approx(0.5 + sizes[2][2] / 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "tracks.json"),
+        ('{"format": "wildcity.tracks/2", "tracks": []}', "wildcity.tracks/1"),
+        (
+            '{"format": "wildcity.tracks/1", "tracks": [{"id": "a", "class": "vehicle", "size": [4, 2, 1], "asset": "%s",'
+            ' "keyframes": [{"time_us": 0, "pose": {"xyz": [0, 0, 0]}}]}]}' % ("0" * 64),
+            'track "a"',
+        ),
+    ],
+)
+def test_bad_tracks_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    binary = os.environ["WILDCITY_BIN"]
+    write_corridor(tmp_path / "corridor.ply")
+    write_log(tmp_path / "log.json")
+    twins = ["--twins", str(tmp_path / "twins")]
+    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
+    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    (tmp_path / "tracks.json").write_text(text)
+    exporting = [binary, "alpasim", "export", "corridor", "--out", str(tmp_path / "scenes"), *twins]
+    done = subprocess.run([*exporting, "--tracks", str(tmp_path / "tracks.json")], capture_output=True, text=True)
+    assert done.returncode == 1 and message in done.stderr, done.stderr
+    assert not (tmp_path / "scenes").exists()
 
 
 def test_the_map_is_a_road_along_the_drive_and_beyond(scenes: dict[str, dict[str, bytes]]) -> None:

@@ -164,6 +164,37 @@ def test_episodes_run_beside_each_other(server: Server) -> None:
     assert len({report["frames_hash"] for report in reports}) == 1
 
 
+def test_a_driver_follows_a_scenario_to_its_end(tmp_path: Path) -> None:
+    """The route is the scenario's, 1 m beside the recorded drive, and its rule ends the episode."""
+    binary = os.environ["WILDCITY_BIN"]
+    write_corridor(tmp_path / "corridor.ply")
+    write_log(tmp_path / "log.json")
+    twins = ["--twins", str(tmp_path / "twins")]
+    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
+    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    scenario = {
+        "format": "wildcity.scenario/1",
+        "name": "aside",
+        "twin": {"name": "corridor"},
+        "ego": {"start": {"trajectory": "log", "station_m": 3.0}, "dynamics": {"model": "dynamic", "speed": 5.0}},
+        "route": {"points": [[0, 1, 0], [50, 1, 0]]},
+        "end": {"time_s": 0.4},
+    }
+    (tmp_path / "scenarios").mkdir()
+    (tmp_path / "scenarios" / "aside.json").write_text(json.dumps(scenario))
+    recorder = Recorder()
+    arguments = ["--scenarios", str(tmp_path / "scenarios")]
+    with wildcity.serve(tmp_path / "twins", arguments=arguments) as running, driver(recorder) as address:
+        status, reports, errors = drive(Server(running.url), address, "--scenario", "aside")
+    assert status == 0, errors
+    (report,) = reports
+    # The command line allows 6 steps.
+    assert (report["outcome"], report["steps"]) == ("completed", 4)
+    # At the start the ego is on the recorded drive: the route is 1 m to its left.
+    route = recorder.routes[0]
+    assert route.shape == (20, 3) and route[:, 1] == pytest.approx([1.0] * 20, abs=0.01)
+
+
 def run_suite(folder: Path, agent: str) -> tuple[int, dict[str, Any]]:
     """Runs a scenario of 0.6 s along the corridor, and returns the exit code and result.json."""
     binary = os.environ["WILDCITY_BIN"]

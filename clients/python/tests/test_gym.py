@@ -73,6 +73,110 @@ def test_an_episode_ends_off_the_route_at_its_end_and_at_the_horizon(server: Ser
     assert drive(STRAIGHT, horizon=3)[:3] == (False, True, 3)
 
 
+def scenario(**changes: Any) -> dict[str, Any]:
+    """Along the corridor's drive at 5 m/s, with a car in the way."""
+    actors = [{"name": "car", "class": "vehicle", "size": [4.0, 1.8, 1.5], "stand": {"xyz": [9.0, 0.0, 0.0]}}]
+    return {
+        "format": "wildcity.scenario/1",
+        "name": "straight",
+        "twin": {"name": "corridor"},
+        "ego": {"start": {"trajectory": "log", "station_m": 0.0}, "dynamics": {"model": "dynamic", "speed": 5.0}},
+        "actors": actors,
+        "end": {"time_s": 2.5, "off_route_m": 1.0, "contact": "any"},
+        **changes,
+    }
+
+
+@pytest.fixture
+def drive_in(server: Server) -> Iterator[Any]:
+    """Drives a scenario with one action until it ends: all results of `step`."""
+    made: list[DriveEnv] = []
+
+    def drive(action: np.ndarray[Any, Any], **changes: Any) -> list[Any]:
+        env = DriveEnv(server=server.url, **{**SMALL, "horizon": 100, "scenario": scenario(**changes)})
+        made.append(env)
+        seen, info = env.reset(seed=1)
+        assert env.observation_space.contains(seen) and info["station_m"] == pytest.approx(0.0, abs=1e-6)
+        results = [env.step(action)]
+        while not (results[-1][2] or results[-1][3]):
+            results.append(env.step(action))
+        return results
+
+    yield drive
+    for env in made:
+        env.close()
+
+
+def test_a_scenario_ends_by_its_own_rules(drive_in: Any) -> None:
+    def end(results: list[Any]) -> tuple[bool, bool, str]:
+        _, _, terminated, truncated, info = results[-1]
+        return terminated, truncated, info["end"]
+
+    met = drive_in(STRAIGHT)
+    assert end(met) == (True, False, "contact")
+    rewards = [reward for _, reward, *_ in met]
+    # Half a metre a step, until the contact costs 10.
+    assert rewards[:-1] == pytest.approx([0.5] * (len(met) - 1), abs=0.02)
+    assert rewards[-1] == pytest.approx(-10.0, abs=0.6) and met[-1][4]["contacts"] == 1
+    assert all(result[4]["contacts"] == 0 and result[4]["end"] == "" for result in met[:-1])
+    assert end(drive_in(LEFT)) == (True, False, "off_route")
+    assert end(drive_in(STRAIGHT, actors=[])) == (True, False, "route_done")
+    timed = drive_in(STRAIGHT, end={"time_s": 0.3})
+    assert end(timed) == (False, True, "time") and len(timed) == 3
+
+
+def test_the_route_of_a_scenario_is_the_servers(drive_in: Any) -> None:
+    route = {"points": [[0, 0.5, 0], [30, 0.5, 0]]}
+    (seen, reward, *_), *_ = drive_in(STRAIGHT, actors=[], route=route, end={"time_s": 0.2})
+    # From the place beside the ego on, 80/19 m apart, and straight on after its end.
+    assert seen["route"][:, 1] == pytest.approx([0.5] * 20, abs=0.01)
+    assert seen["route"][:, 0] == pytest.approx([80 / 19 * k for k in range(20)], abs=0.01)
+    # Progress along it, less a tenth of the distance from it.
+    assert reward == pytest.approx(0.5 - 0.05, abs=0.01)
+
+
+def test_a_scenario_passes_gymnasiums_own_check(server: Server) -> None:
+    made = gymnasium.make("wildcity/Drive-v0", server=server.url, scenario=scenario(), **SMALL)
+    check_env(made.unwrapped, skip_render_check=True)
+    made.close()
+
+
+def test_the_vector_environment_is_n_environments_of_a_scenario(server: Server) -> None:
+    arguments = {**SMALL, "server": server.url, "scenario": scenario(end={"time_s": 0.3, "contact": "any"})}
+    ours = DriveVectorEnv(2, **arguments)
+    theirs = gymnasium.vector.SyncVectorEnv([lambda: DriveEnv(**arguments)] * 2)
+    try:
+        compare(ours.reset(seed=5), theirs.reset(seed=5))
+        for _ in range(6):
+            actions = np.zeros((2, 2), np.float32)
+            compare(ours.step(actions), theirs.step(actions))
+    finally:
+        ours.close()
+        theirs.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ego": {"start": {"trajectory": "log", "station_m": 0.0}}}, "no ego.dynamics"),
+        ({"ego": {"start": {"pose": {"xyz": [1, 0, 0]}}, "dynamics": {"model": "dynamic", "speed": 5.0}}}, "no route"),
+    ],
+)
+def test_a_scenario_that_cannot_be_driven_is_refused(server: Server, changes: dict[str, Any], message: str) -> None:
+    env = DriveEnv(server=server.url, **{**SMALL, "scenario": scenario(actors=[], end={"time_s": 1}, **changes)})
+    with pytest.raises(ValueError, match=message):
+        env.reset(seed=1)
+    env.close()
+
+
+def test_a_scenario_says_where_episodes_start(server: Server) -> None:
+    env = DriveEnv(server=server.url, **{**SMALL, "scenario": scenario(actors=[])})
+    assert env.reset(options={"start": Station("log", 3.0)})[1]["station_m"] == pytest.approx(3.0)
+    with pytest.raises(ValueError, match=r"start is 3\.0; a scenario says"):
+        env.reset(options={"start": 3.0})
+    env.close()
+
+
 def test_a_reward_of_the_users_own(server: Server) -> None:
     def speed(before: DriveState, after: DriveState) -> float:
         return after.speed_m_s

@@ -20,8 +20,9 @@ use crate::grpc::{unary, unimplemented};
 use crate::limits;
 use crate::wire::common::Empty;
 
-/// Path of the service's methods.
+/// Paths of the services' methods.
 const SERVICE: &str = "/nre.grpc.protos.sensorsim.SensorsimService/";
+const PHYSICS: &str = "/physics.PhysicsService/";
 
 /// Why the service did not start.
 #[derive(Debug, thiserror::Error)]
@@ -160,6 +161,9 @@ async fn call(
     request: http::Request<hyper::body::Incoming>,
 ) -> http::Response<tonic::body::Body> {
     let path = request.uri().path().to_owned();
+    if let Some(method) = path.strip_prefix(PHYSICS) {
+        return call_physics(&sensorsim, method, &path, request).await;
+    }
     match path.strip_prefix(SERVICE) {
         Some("get_version") => unary(request, |_: Empty| async { sensorsim.get_version() }).await,
         Some("get_available_scenes") => {
@@ -189,5 +193,24 @@ async fn call(
         }
         Some("render_lidar") => unary(request, |_: Empty| async { sensorsim.render_lidar() }).await,
         _ => unimplemented(&path),
+    }
+}
+
+/// Calls a method of AlpaSim's physics. Its scenes and its version are those of the renderer.
+async fn call_physics(
+    sensorsim: &Sensorsim,
+    method: &str,
+    path: &str,
+    request: http::Request<hyper::body::Incoming>,
+) -> http::Response<tonic::body::Body> {
+    match method {
+        "get_version" => unary(request, |_: Empty| async { sensorsim.get_version() }).await,
+        "get_available_scenes" => {
+            unary(request, |_: Empty| async { sensorsim.get_available_scenes().await }).await
+        }
+        "ground_intersection" => {
+            unary(request, |asked| async { sensorsim.ground_intersection(asked).await }).await
+        }
+        _ => unimplemented(path),
     }
 }

@@ -1,37 +1,37 @@
 //! The ten methods.
 
-use std::collections::BTreeSet;
 use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
-use parking_lot::Mutex;
 use tokio::sync::watch;
 use tonic::Status;
 
 use wildcity_scene::rig::RigCamera;
 use wildcity_session::Engine;
 
+use super::objects::ObjectAssets;
 use super::open::OpenVersions;
-use super::render::{OpenScene, images};
+use super::render::{OpenScene, Renderer};
 use super::status::SensorsimError;
 use crate::camera::{available, logical_id};
 use crate::limits;
+use crate::physics::ground_intersection;
 use crate::scene::{SceneId, listed_starts_m, trajectory};
-use crate::wire::{API_VERSION, common, sensorsim as wire};
+use crate::wire::{API_VERSION, common, physics, sensorsim as wire};
 
 /// The state of the service.
 pub(super) struct Sensorsim {
     engine: Arc<Engine>,
     open: OpenVersions,
+    assets: ObjectAssets,
     stopping: watch::Receiver<bool>,
-    /// Scenes whose dynamic objects were ignored, each logged once.
-    warned: Mutex<BTreeSet<String>>,
 }
 
 impl Sensorsim {
     pub(super) fn new(engine: Arc<Engine>, stopping: watch::Receiver<bool>) -> Self {
-        Self { engine, open: OpenVersions::default(), stopping, warned: Mutex::default() }
+        let (open, assets) = (OpenVersions::default(), ObjectAssets::default());
+        Self { engine, open, assets, stopping }
     }
 
     /// Frees the memory of scenes that are not drawn any more, until dropped.
@@ -39,6 +39,7 @@ impl Sensorsim {
         loop {
             tokio::time::sleep(Duration::from_secs(60)).await;
             self.open.forget_idle().await;
+            self.assets.forget_idle().await;
         }
     }
 
@@ -195,6 +196,14 @@ impl Sensorsim {
         Ok(wire::AggregatedRenderReturn { rgb_returns, ..Default::default() })
     }
 
+    /// Boxes on the ground, of the service of AlpaSim's physics.
+    pub(super) async fn ground_intersection(
+        &self,
+        asked: physics::GroundIntersectionRequest,
+    ) -> Result<physics::GroundIntersectionReturn, Status> {
+        self.unless_stopped(ground_intersection(&self.engine, asked)).await?
+    }
+
     /// Not offered.
     pub(super) fn render_lidar(&self) -> Result<wire::LidarRenderReturn, Status> {
         Err(SensorsimError::Unimplemented("wildcity renders no lidar").into())
@@ -209,8 +218,9 @@ impl Sensorsim {
             let text = format!("{} images; at most {most} are accepted", requests.len());
             return Err(Status::invalid_argument(text));
         }
-        self.warn_of_objects(requests);
-        self.unless_stopped(images(&self.engine, &self.open, requests)).await
+        let Self { engine, open, assets, .. } = self;
+        let renderer = Renderer { engine, open, assets };
+        self.unless_stopped(renderer.images(requests)).await
     }
 
     /// The result of `work`, unless the service stops before.
@@ -218,16 +228,6 @@ impl Sensorsim {
         tokio::select! {
             result = work => Ok(result),
             () = stopped(self.stopping.clone()) => Err(SensorsimError::Stopping.into()),
-        }
-    }
-
-    fn warn_of_objects(&self, requests: &[&wire::RgbRenderRequest]) {
-        for request in requests.iter().filter(|request| !request.dynamic_objects.is_empty()) {
-            let mut warned = self.warned.lock();
-            if warned.len() < limits::LISTED_SCENES && warned.insert(request.scene_id.clone()) {
-                let scene = &request.scene_id;
-                tracing::warn!(scene, "dynamic objects are not drawn");
-            }
         }
     }
 }

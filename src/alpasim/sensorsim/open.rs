@@ -1,6 +1,6 @@
 //! Twins with reserved memory.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -22,7 +22,11 @@ struct OpenVersion {
 
 /// The versions that were drawn in the last [`limits::SCENE_IDLE`].
 #[derive(Default)]
-pub(super) struct OpenVersions(Mutex<BTreeMap<(String, u64), OpenVersion>>);
+pub(super) struct OpenVersions {
+    versions: Mutex<BTreeMap<(String, u64), OpenVersion>>,
+    /// Scenes that were asked for with objects of which nothing is known, each logged once.
+    warned: parking_lot::Mutex<BTreeSet<String>>,
+}
 
 impl OpenVersions {
     /// What renders a version, with enough memory for these views.
@@ -39,7 +43,7 @@ impl OpenVersions {
         let version = &resident.version;
         let key = (version.manifest.twin.clone(), version.number);
         // Held while memory is reserved, so that simultaneous requests reserve it once.
-        let mut open = self.0.lock().await;
+        let mut open = self.versions.lock().await;
         if !open.contains_key(&key) && open.len() >= limits::OPEN_SCENES {
             let oldest = open.iter().min_by_key(|(_, version)| version.last_drawn());
             let oldest = oldest.map(|(key, _)| key.clone());
@@ -66,13 +70,21 @@ impl OpenVersions {
 
     /// The scenes that were drawn in the last [`limits::SCENE_IDLE`].
     pub(super) async fn recent(&self) -> Vec<String> {
-        let open = self.0.lock().await;
+        let open = self.versions.lock().await;
         open.values().flat_map(|version| version.scenes.keys().cloned()).collect()
+    }
+
+    /// Logs, once a scene, that objects are drawn as grey boxes.
+    pub(super) fn warn_of_unknown_objects(&self, scene: &str) {
+        let mut warned = self.warned.lock();
+        if warned.len() < limits::LISTED_SCENES && warned.insert(scene.to_owned()) {
+            tracing::warn!(scene, "dynamic objects without an @ in their track_id are grey boxes");
+        }
     }
 
     /// Forgets scenes that were not drawn for [`limits::SCENE_IDLE`], and frees the memory of their versions.
     pub(super) async fn forget_idle(&self) {
-        let mut open = self.0.lock().await;
+        let mut open = self.versions.lock().await;
         open.retain(|_, version| {
             version.scenes.retain(|_, drawn| drawn.elapsed() < limits::SCENE_IDLE);
             !version.scenes.is_empty()

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use wildcity_render::MAX_VIEWS;
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::rig::RigCamera;
@@ -10,6 +11,7 @@ use wildcity_scene::{Manifest, Rig};
 use wildcity_session::{Encoding, Engine, Still};
 use wildcity_twin::residency::Resident;
 
+use super::objects::{Object, ObjectAssets};
 use super::open::OpenVersions;
 use super::status::SensorsimError;
 use crate::camera::{camera_name, jpeg_quality, view, with_preset};
@@ -24,10 +26,10 @@ const RIG: &str = wildcity_session::limits::RIG;
 const OFFERED: &str = "alpamayo2";
 
 /// A scene that was opened.
-pub(super) struct OpenScene {
-    pub(super) id: SceneId,
-    pub(super) resident: Arc<Resident>,
-    pub(super) frame: LocalFrame,
+pub(crate) struct OpenScene {
+    pub(crate) id: SceneId,
+    pub(crate) resident: Arc<Resident>,
+    pub(crate) frame: LocalFrame,
 }
 
 impl OpenScene {
@@ -35,7 +37,7 @@ impl OpenScene {
     ///
     /// # Errors
     /// There is none of this id, or its twin cannot be read.
-    pub(super) async fn open(engine: &Arc<Engine>, id: &str) -> Result<Self, SensorsimError> {
+    pub(crate) async fn open(engine: &Arc<Engine>, id: &str) -> Result<Self, SensorsimError> {
         let id: SceneId = id.parse()?;
         let resident = engine.open_version(id.twin.clone(), Some(id.version)).await?;
         let frame = id.local_frame(&resident.version.manifest)?;
@@ -62,6 +64,17 @@ impl OpenScene {
         };
         let appearance = self.appearance(request, &view.camera)?;
         Ok(Still { view, appearance, encoding })
+    }
+
+    /// The objects that a request's image shows.
+    fn objects(&self, request: &wire::RgbRenderRequest) -> Result<Vec<Object>, SensorsimError> {
+        let objects = &request.dynamic_objects;
+        let most = PlacedChunk::MAX_ACTORS;
+        if objects.len() > most {
+            let text = format!("{} dynamic_objects; at most {most} are accepted", objects.len());
+            return Err(SensorsimError::Invalid(text));
+        }
+        objects.iter().map(|object| Object::read(object, &self.frame)).collect()
     }
 
     /// The exposure of the twin's camera of the same name, and with `insert_ego_mask` its overlay.
@@ -94,86 +107,123 @@ pub fn offered_cameras(manifest: &Manifest) -> Vec<RigCamera> {
     with_preset(&own, Rig::preset(OFFERED).map(|rig| rig.cameras).unwrap_or_default())
 }
 
-/// The images of requests, or why there is none, in their order. Requests of the same scene are rendered
-/// together.
-pub(super) async fn images(
-    engine: &Arc<Engine>,
-    open: &OpenVersions,
-    requests: &[&wire::RgbRenderRequest],
-) -> Vec<Result<wire::RgbRenderReturn, SensorsimError>> {
-    let mut images: Vec<Option<Result<wire::RgbRenderReturn, SensorsimError>>> =
-        requests.iter().map(|_| None).collect();
-    let mut by_scene: Vec<(&str, Vec<usize>)> = Vec::new();
-    for (index, request) in requests.iter().enumerate() {
-        match by_scene.iter_mut().find(|(scene, _)| *scene == request.scene_id) {
-            Some((_, indices)) => indices.push(index),
-            None => by_scene.push((&request.scene_id, vec![index])),
-        }
-    }
-    for (scene, indices) in by_scene {
-        let asked: Vec<_> = indices.iter().map(|&index| requests[index]).collect();
-        let answers = scene_images(engine, open, scene, &asked).await;
-        for (index, answer) in indices.into_iter().zip(answers) {
-            images[index] = Some(answer);
-        }
-    }
-    let none = || Err(SensorsimError::Invalid("no image was made".to_owned()));
-    images.into_iter().map(|image| image.unwrap_or_else(none)).collect()
+/// What images are made with.
+#[derive(Clone, Copy)]
+pub(super) struct Renderer<'a> {
+    pub(super) engine: &'a Arc<Engine>,
+    pub(super) open: &'a OpenVersions,
+    pub(super) assets: &'a ObjectAssets,
 }
 
-async fn scene_images(
-    engine: &Arc<Engine>,
-    open: &OpenVersions,
-    scene: &str,
-    requests: &[&wire::RgbRenderRequest],
-) -> Vec<Result<wire::RgbRenderReturn, SensorsimError>> {
-    let opened = match OpenScene::open(engine, scene).await {
-        Ok(opened) => opened,
-        Err(error) => return repeated(&error, requests.len()),
-    };
-    let stills: Vec<_> = requests.iter().map(|request| opened.still(request)).collect();
-    let good: Vec<Still> = stills.iter().flatten().cloned().collect();
-    let mut rendered = match render(engine, open, &opened, scene, good).await {
-        Ok(images) => images.into_iter(),
-        Err(error) => return repeated(&error, requests.len()),
-    };
-    stills
-        .into_iter()
-        .map(|still| {
-            let still = still?;
-            let image_bytes = rendered.next().unwrap_or_default();
-            let image_bytes = match still.encoding {
-                Encoding::Raw => planar(&image_bytes),
-                Encoding::Jpeg(_) | Encoding::Png => image_bytes,
-            };
-            Ok(wire::RgbRenderReturn { image_bytes })
-        })
-        .collect()
-}
+/// A request's image, or why there is none.
+type Image = Result<wire::RgbRenderReturn, SensorsimError>;
 
-async fn render(
-    engine: &Arc<Engine>,
-    open: &OpenVersions,
-    opened: &OpenScene,
-    scene: &str,
+/// Requests that are rendered together: they are of one scene, and show the same objects.
+struct Group {
+    objects: Vec<Object>,
+    /// Indices of the requests.
+    indices: Vec<usize>,
     stills: Vec<Still>,
-) -> Result<Vec<Vec<u8>>, SensorsimError> {
-    if stills.is_empty() {
-        return Ok(Vec::new());
+}
+
+impl Renderer<'_> {
+    /// The images of requests, or why there is none, in their order. Requests of the same scene and with the same
+    /// objects are rendered together.
+    pub(super) async fn images(self, requests: &[&wire::RgbRenderRequest]) -> Vec<Image> {
+        let mut images: Vec<Option<Image>> = requests.iter().map(|_| None).collect();
+        let mut by_scene: Vec<(&str, Vec<usize>)> = Vec::new();
+        for (index, request) in requests.iter().enumerate() {
+            match by_scene.iter_mut().find(|(scene, _)| *scene == request.scene_id) {
+                Some((_, indices)) => indices.push(index),
+                None => by_scene.push((&request.scene_id, vec![index])),
+            }
+        }
+        for (scene, indices) in by_scene {
+            let asked: Vec<_> = indices.iter().map(|&index| requests[index]).collect();
+            let answers = self.scene_images(scene, &asked).await;
+            for (index, answer) in indices.into_iter().zip(answers) {
+                images[index] = Some(answer);
+            }
+        }
+        images.into_iter().map(|image| image.unwrap_or_else(no_image)).collect()
     }
-    // The memory of the largest frame: requests are rendered in frames of at most MAX_VIEWS.
-    let views: Vec<_> = stills.iter().map(|still| still.view).take(MAX_VIEWS).collect();
-    let renderer = open.stills(engine, opened.resident.clone(), scene, &views).await?;
-    Ok(renderer.render(stills, limits::RENDER_TIMEOUT).await?)
+
+    async fn scene_images(self, scene: &str, requests: &[&wire::RgbRenderRequest]) -> Vec<Image> {
+        let opened = match OpenScene::open(self.engine, scene).await {
+            Ok(opened) => opened,
+            Err(error) => return repeated(&error, requests.len()).collect(),
+        };
+        let mut images: Vec<Option<Image>> = requests.iter().map(|_| None).collect();
+        let mut groups: Vec<Group> = Vec::new();
+        for (index, request) in requests.iter().enumerate() {
+            let read = opened.still(request).and_then(|still| {
+                let objects = opened.objects(request)?;
+                Ok((still, objects))
+            });
+            match read {
+                Err(error) => images[index] = Some(Err(error)),
+                Ok((still, objects)) => {
+                    let group = match groups.iter().position(|group| group.objects == objects) {
+                        Some(group) => group,
+                        None => {
+                            groups.push(Group { objects, indices: Vec::new(), stills: Vec::new() });
+                            groups.len() - 1
+                        }
+                    };
+                    groups[group].indices.push(index);
+                    groups[group].stills.push(still);
+                }
+            }
+        }
+        if groups.iter().any(|group| group.objects.iter().any(Object::is_unknown)) {
+            self.open.warn_of_unknown_objects(scene);
+        }
+        for Group { objects, indices, stills } in groups {
+            let encodings: Vec<Encoding> = stills.iter().map(|still| still.encoding).collect();
+            let answers: Vec<Image> = match self.render(&opened, scene, &objects, stills).await {
+                Ok(files) => files.into_iter().zip(encodings).map(image).collect(),
+                Err(error) => repeated(&error, indices.len()).collect(),
+            };
+            for (index, answer) in indices.into_iter().zip(answers) {
+                images[index] = Some(answer);
+            }
+        }
+        images.into_iter().map(|image| image.unwrap_or_else(no_image)).collect()
+    }
+
+    async fn render(
+        self,
+        opened: &OpenScene,
+        scene: &str,
+        objects: &[Object],
+        stills: Vec<Still>,
+    ) -> Result<Vec<Vec<u8>>, SensorsimError> {
+        // The memory of the largest frame: requests are rendered in frames of at most MAX_VIEWS.
+        let views: Vec<_> = stills.iter().map(|still| still.view).take(MAX_VIEWS).collect();
+        let resident = opened.resident.clone();
+        let renderer = self.open.stills(self.engine, resident, scene, &views).await?;
+        let actors = self.assets.actors(self.engine, objects).await?;
+        Ok(renderer.render(stills, &actors, limits::RENDER_TIMEOUT).await?)
+    }
+}
+
+fn image((file, encoding): (Vec<u8>, Encoding)) -> Image {
+    let image_bytes = match encoding {
+        Encoding::Raw => planar(&file),
+        Encoding::Jpeg(_) | Encoding::Png => file,
+    };
+    Ok(wire::RgbRenderReturn { image_bytes })
+}
+
+fn no_image() -> Image {
+    Err(SensorsimError::Invalid("no image was made".to_owned()))
 }
 
 /// The same error for each of several requests. Errors cannot be cloned, because those of the operating
 /// system cannot; what a client sees of them can.
-fn repeated(
-    error: &SensorsimError,
-    count: usize,
-) -> Vec<Result<wire::RgbRenderReturn, SensorsimError>> {
-    (0..count).map(|_| Err(SensorsimError::Repeated(error.status()))).collect()
+fn repeated(error: &SensorsimError, count: usize) -> impl Iterator<Item = Image> + use<> {
+    let status = error.status();
+    (0..count).map(move |_| Err(SensorsimError::Repeated(status.clone())))
 }
 
 /// [3, height, width] from [height, width, 3].

@@ -9,11 +9,12 @@ use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
 use crate::camera::CameraSpecError;
+use crate::object::ObjectError;
 use crate::scene::SceneError;
 
 /// Why a request was refused.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum SensorsimError {
+pub(crate) enum SensorsimError {
     /// There is no such scene.
     #[error("{0}")]
     UnknownScene(String),
@@ -23,6 +24,9 @@ pub(super) enum SensorsimError {
     /// A camera, a pose or a size is invalid.
     #[error(transparent)]
     Camera(#[from] CameraSpecError),
+    /// The id of a dynamic object stands for nothing.
+    #[error(transparent)]
+    Object(#[from] ObjectError),
     /// The session layer refused.
     #[error(transparent)]
     Session(#[from] SessionError),
@@ -50,11 +54,11 @@ impl From<SceneError> for SensorsimError {
 
 impl SensorsimError {
     /// What the client gets.
-    pub(super) fn status(&self) -> Status {
+    pub(crate) fn status(&self) -> Status {
         let text = self.to_string();
         match self {
             Self::UnknownScene(_) => Status::not_found(text),
-            Self::Invalid(_) | Self::Camera(_) => Status::invalid_argument(text),
+            Self::Invalid(_) | Self::Camera(_) | Self::Object(_) => Status::invalid_argument(text),
             Self::Stopping => Status::unavailable(text),
             Self::Unimplemented(what) => Status::unimplemented(*what),
             Self::Session(error) => of_session(error, text),
@@ -78,10 +82,15 @@ fn of_session(error: &SessionError, text: String) -> Status {
             | StoreError::NoVersion { .. }
             | StoreError::GarbageCollected { .. },
         ) => Status::not_found(text),
+        // A dynamic object names an asset that does not exist.
+        SessionError::Twin(StoreError::NoActor { .. } | StoreError::ActorDamaged { .. }) => {
+            Status::invalid_argument(format!("dynamic_objects: {text}"))
+        }
         SessionError::Busy { .. } => Status::unavailable(text),
         SessionError::DeadlineExceeded
         | SessionError::Residency(
             ResidencyError::NoRoom { .. }
+            | ResidencyError::NoRoomForActor { .. }
             | ResidencyError::TooLarge { .. }
             | ResidencyError::TimedOut { .. },
         ) => late(),
@@ -89,5 +98,66 @@ fn of_session(error: &SessionError, text: String) -> Status {
             Status::invalid_argument(text)
         }
         _ => Status::internal(text),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use tonic::Code;
+
+    /// Every row of the table in docs/alpasim.md that a request alone cannot provoke.
+    #[test]
+    fn each_error_has_its_status() {
+        let session = |error: SessionError| SensorsimError::from(error);
+        let residency = |error: ResidencyError| session(error.into());
+        let (twin, text) = (String::from("demo"), String::from("sedan"));
+        let no_room = ResidencyError::NoRoom {
+            twin: twin.clone(),
+            needed_bytes: 2,
+            held_bytes: 0,
+            limit_bytes: 1,
+        };
+        let no_room_for_actor = ResidencyError::NoRoomForActor {
+            actor: text.clone(),
+            needed_bytes: 2,
+            held_bytes: 0,
+            limit_bytes: 1,
+        };
+        let too_large =
+            ResidencyError::TooLarge { twin: twin.clone(), needed_bytes: 2, limit_bytes: 1 };
+        let timed_out = ResidencyError::TimedOut {
+            twin: twin.clone(),
+            missing: 1,
+            needed: 2,
+            waited: Duration::from_secs(300),
+        };
+        let no_actor = StoreError::NoActor { text, found: 0, known: Vec::new() };
+        let id = "x".parse::<crate::scene::SceneId>().unwrap_err();
+        let object = crate::object::ObjectLook::of_track("7@").unwrap_err();
+        let late = "Stopped waiting for backend: ";
+        for (error, code, start) in [
+            (SensorsimError::from(id), Code::NotFound, "\"x\" is no scene"),
+            (SensorsimError::Stopping, Code::Unavailable, "the server is shutting down"),
+            (session(SessionError::Busy { what: "frames queued" }), Code::Unavailable, ""),
+            (session(SessionError::DeadlineExceeded), Code::DeadlineExceeded, late),
+            (residency(no_room), Code::DeadlineExceeded, late),
+            (residency(no_room_for_actor), Code::DeadlineExceeded, late),
+            (residency(too_large), Code::DeadlineExceeded, late),
+            (residency(timed_out), Code::DeadlineExceeded, late),
+            (session(no_actor.into()), Code::InvalidArgument, "dynamic_objects: "),
+            (object.into(), Code::InvalidArgument, "dynamic_objects: track_id"),
+            (session(SessionError::Crashed), Code::Internal, ""),
+            (SensorsimError::Unimplemented("no lidar"), Code::Unimplemented, "no lidar"),
+        ] {
+            let status = error.status();
+            assert_eq!(status.code(), code, "{status}");
+            assert!(status.message().starts_with(start), "{status}");
+            // What several requests of one scene get is the same.
+            let repeated = SensorsimError::Repeated(error.status()).status();
+            assert_eq!((repeated.code(), repeated.message()), (code, status.message()));
+        }
     }
 }

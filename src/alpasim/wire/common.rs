@@ -28,6 +28,17 @@ pub struct Vec3 {
     pub z: f32,
 }
 
+/// Size of a box, in metres.
+#[derive(Clone, Copy, PartialEq, prost::Message)]
+pub struct Aabb {
+    #[prost(float, tag = "1")]
+    pub size_x: f32,
+    #[prost(float, tag = "2")]
+    pub size_y: f32,
+    #[prost(float, tag = "3")]
+    pub size_z: f32,
+}
+
 /// A rigid transform: p_a = R(quat) p_b + vec.
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 pub struct Pose {

@@ -2,6 +2,7 @@
 
 pub mod common;
 pub mod egodriver;
+pub mod physics;
 pub mod sensorsim;
 
 /// Version of the API.

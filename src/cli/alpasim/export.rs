@@ -1,16 +1,20 @@
 //! `wildcity alpasim export`.
 
 use std::io::{self, Cursor, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use anyhow::Context as _;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use crate::cli::directories::Twins;
 use crate::cli::output;
-use wildcity_alpasim::export::files;
+use wildcity_alpasim::export::{ExportError, SceneContent, files};
 use wildcity_alpasim::scene::SceneId;
 use wildcity_alpasim::sensorsim::offered_cameras;
+use wildcity_scene::ActorBox;
+use wildcity_sim::scenario::TracksFile;
+use wildcity_twin::store::Catalog;
 
 /// Write scenes of a twin as the files that AlpaSim's runtime reads: rig, cameras, tracks and map.
 ///
@@ -37,21 +41,30 @@ pub(super) struct Export {
     #[arg(long, value_name = "S", default_value_t = 20.0, value_parser = positive)]
     length_s: f64,
 
+    /// Recorded traffic, a file of format wildcity.tracks/1 on the clock of the drive. A track without an asset becomes a
+    /// grey box of its size.
+    #[arg(long, value_name = "FILE")]
+    tracks: Option<PathBuf>,
+
     #[command(flatten)]
     twins: Twins,
 }
 
 impl Export {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let version = self.twins.catalog()?.version(&self.twin, None)?;
+        let catalog = self.twins.catalog()?;
+        let version = catalog.version(&self.twin, None)?;
         let manifest = &version.manifest;
         anyhow::ensure!(
             !manifest.trajectories.is_empty(),
             "twin {:?} has no recorded drive: import one with --trajectory",
             self.twin
         );
+        let tracks = self.tracks.as_deref().map(|path| tracks(path, &catalog)).transpose()?;
         output::create_dir(&self.out)?;
         let cameras = offered_cameras(manifest);
+        let content =
+            SceneContent { cameras: &cameras, tracks: tracks.as_ref(), length_s: self.length_s };
         let mut out = io::stdout().lock();
         for drive in &manifest.trajectories {
             let starts = (drive.length_m() / self.every_m).floor() as u32;
@@ -62,9 +75,9 @@ impl Export {
                     trajectory: drive.name.clone(),
                     start_m: f64::from(start) * self.every_m,
                 };
-                let scene = match files(&id, manifest, &version.hash, &cameras, self.length_s) {
+                let scene = match files(&id, manifest, &version.hash, content) {
                     // A drive may end less than two poses after the last start.
-                    Err(_) if start > 0 && start == starts => continue,
+                    Err(ExportError::Short { .. }) if start > 0 && start == starts => continue,
                     other => other?,
                 };
                 let path = self.out.join(format!("{id}.usdz"));
@@ -79,6 +92,21 @@ impl Export {
         )?;
         Ok(())
     }
+}
+
+/// Reads recorded traffic. A track with an asset gets the asset's size, as it is drawn.
+fn tracks(path: &Path, catalog: &Catalog) -> anyhow::Result<TracksFile> {
+    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+    let mut file = TracksFile::parse(&bytes).with_context(|| path.display().to_string())?;
+    for track in &mut file.tracks {
+        if let Some(hash) = &track.asset {
+            let found =
+                catalog.find_actor(hash).with_context(|| format!("track {:?}", track.id))?;
+            let ActorBox { length_m, width_m, height_m } = found.description.box_;
+            track.size = [length_m, width_m, height_m];
+        }
+    }
+    Ok(file)
 }
 
 /// A zip archive without compression, as USDZ is.

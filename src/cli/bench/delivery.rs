@@ -163,7 +163,7 @@ impl Ways {
                 let views =
                     View::of_rig(&self.rig.cameras, pose).into_iter().zip(&self.rig.cameras);
                 let limit = wildcity_protocol::limits::STEP_TIMEOUT;
-                self.stills.render(views.map(still).collect(), limit).await?;
+                self.stills.render(views.map(still).collect(), &[], limit).await?;
             }
             1 => drop(self.session.step(pose, false).await?),
             2 => drop(self.socket.step(there).await?),

@@ -19,7 +19,8 @@ use wildcity_render::{Backend, RenderError};
 use wildcity_repair::Models;
 use wildcity_scene::{Rays, RenderProfile};
 use wildcity_twin::residency::{
-    Cache, Prefetcher, Reservation, ResidencyError, Resident, RigExtent, Stats, Urgency, Viewpoint,
+    Cache, Prefetcher, Reservation, ResidencyError, Resident, ResidentActor, RigExtent, Stats,
+    Urgency, Viewpoint,
 };
 use wildcity_twin::store::Catalog;
 
@@ -251,6 +252,22 @@ impl Engine {
             let resident = engine.cache.open(&twin, version)?;
             engine.leases.take(&resident);
             Ok::<_, ResidencyError>(resident)
+        });
+        Ok(opened.await??)
+    }
+
+    /// An asset by its name, its hash or the first digits of its hash, in memory until its last copy is dropped.
+    ///
+    /// # Errors
+    /// There is none, or more than one, or it is damaged, or there is no room for it.
+    pub async fn open_actor(
+        self: &Arc<Self>,
+        name: String,
+    ) -> Result<Arc<ResidentActor>, SessionError> {
+        let engine = self.clone();
+        let opened = run_blocking(move || {
+            let hash = engine.cache.catalog().find_actor(&name)?.hash;
+            engine.cache.actor(&hash)
         });
         Ok(opened.await??)
     }

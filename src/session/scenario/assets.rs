@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use wildcity_scene::RenderProfile;
-use wildcity_scene::actor::{ActorViewpoint, ContactShadow, PlacedChunk};
+use wildcity_scene::actor::{ActorAsset, ActorViewpoint, ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::scenario::AssetInfo;
 use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
@@ -59,26 +59,56 @@ impl ActorAssets {
         poses_at_start: &[Option<Pose>],
         frame: FrameDetail<'_>,
     ) -> Vec<PlacedChunk> {
+        let actors = self.0.iter().zip(poses).enumerate();
+        let placements = actors.filter_map(|(index, (actor, pose))| {
+            let world_from_actor = (*pose)?;
+            let at_start = poses_at_start.get(index).copied().flatten();
+            Some(Placement {
+                actor: index as u16,
+                asset: actor.as_ref()?.asset(),
+                world_from_actor,
+                world_from_actor_at_start: at_start.unwrap_or(world_from_actor),
+            })
+        });
+        frame.placed(placements)
+    }
+}
+
+/// An actor in a frame.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Placement<'a> {
+    /// Its index among the actors.
+    pub(crate) actor: u16,
+    pub(crate) asset: &'a ActorAsset,
+    /// Its pose at the frame's time.
+    pub(crate) world_from_actor: Pose,
+    /// Its pose at the start of the longest exposure.
+    pub(crate) world_from_actor_at_start: Pose,
+}
+
+impl FrameDetail<'_> {
+    /// What a frame draws of some actors: each in the level of detail that the frame needs, with its shadow.
+    pub(crate) fn placed<'a>(
+        &self,
+        actors: impl Iterator<Item = Placement<'a>>,
+    ) -> Vec<PlacedChunk> {
         let viewpoint = |seen: &Viewpoint| ActorViewpoint {
             position_m: seen.position_m,
             focal_px: seen.focal_px,
         };
-        let viewpoints: Vec<ActorViewpoint> = frame.viewpoints.iter().map(viewpoint).collect();
-        let RenderProfile { tau_px, reach_m, .. } = *frame.profile;
-        let actors = self.0.iter().zip(poses).enumerate();
-        let placed = actors.filter_map(|(index, (actor, pose))| {
-            let asset = actor.as_ref()?.asset();
-            let world_from_actor = (*pose)?;
+        let viewpoints: Vec<ActorViewpoint> = self.viewpoints.iter().map(viewpoint).collect();
+        let RenderProfile { tau_px, reach_m, .. } = *self.profile;
+        let placed = actors.filter_map(|placement| {
+            let Placement { actor, asset, world_from_actor, world_from_actor_at_start } = placement;
             let chunk = asset.level(&world_from_actor, &viewpoints, tau_px, reach_m)?;
             let box_ = asset.description.box_;
-            let at_start = poses_at_start.get(index).copied().flatten();
             Some(PlacedChunk {
-                world_from_actor_at_start: at_start.unwrap_or(world_from_actor),
+                world_from_actor_at_start,
                 shadow: Some(ContactShadow {
                     length_m: box_.length_m as f32,
                     width_m: box_.width_m as f32,
                 }),
-                ..PlacedChunk::at_rest(chunk.clone(), world_from_actor, index as u16)
+                ..PlacedChunk::at_rest(chunk.clone(), world_from_actor, actor)
             })
         });
         placed.collect()

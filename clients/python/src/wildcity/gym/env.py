@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sync import Client, Session, connect
-from .task import DriveConfig, DriveTask, Seen, drive_of
+from .task import DriveConfig, Seen, Task, task_of
 
 
 class DriveEnv(gymnasium.Env[Any, Any]):
-    """Follow a recorded drive. The arguments are those of `DriveConfig`, and `render_mode`.
+    """Follow a recorded drive, or drive in a scenario. The arguments are those of `DriveConfig`, and `render_mode`.
 
     The session is opened by the first `reset`, whose options are `start`, a distance along the drive in metres (or a
     `Station`), and `version`, the version of the twin to show from then on. `render` returns the images side by side.
@@ -29,7 +29,7 @@ class DriveEnv(gymnasium.Env[Any, Any]):
         self.action_space = self.config.action_space()
         self._client: Client | None = None
         self._session: Session | None = None
-        self._task: DriveTask | None = None
+        self._task: Task | None = None
         self._version: int | None = None
         self._seen: Seen | None = None
 
@@ -71,11 +71,11 @@ class DriveEnv(gymnasium.Env[Any, Any]):
             with client, session or contextlib.nullcontext():
                 pass
 
-    def _opened(self) -> tuple[Session, DriveTask]:
+    def _opened(self) -> tuple[Session, Task]:
         if self._session is None or self._task is None:
             config = self.config
             self._client = connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token)
             self._session = self._client.open(**config.open_options(self._client.welcome))
             self._version = self._session.opened.version
-            self._task = DriveTask(config, drive_of(self._session.opened))
+            self._task = task_of(config, self._session.opened)
         return self._session, self._task

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -33,16 +34,20 @@ CURVATURE_1_M = 0.2
 WAYPOINTS = 20
 HISTORY_POSES = 16
 SPEED_M_S = 60.0
+CONTACT_M = 10.0
+"""What a contact costs, in metres of progress."""
 HISTORY_M = 200.0
 """16 poses at 0.1 s and 60 m/s are 90 m."""
 ROUTE_M = 1000.0
+ROUTE_SPACING_M = 80 / 19
+"""Distance between two points of a scenario's route."""
 
 Seen = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class DriveState:
-    """Where the ego is on the recorded drive: what a reward may depend on."""
+    """Where the ego is on the recorded drive, or on the scenario's route: what a reward may depend on."""
 
     station_m: float
     """Distance along the drive of the point that is nearest to the ego."""
@@ -51,10 +56,15 @@ class DriveState:
     speed_m_s: float
     observation: Observation
 
+    @property
+    def contacts(self) -> int:
+        """Contacts that began in the last step, with actors of the scenario or with the twin."""
+        return sum(event.kind == "contact" for event in self.observation.metadata.events)
+
 
 def default_reward(before: DriveState, after: DriveState) -> float:
-    """Progress along the drive in metres, minus a tenth of the distance from it."""
-    return after.station_m - before.station_m - 0.1 * after.distance_m
+    """Progress along the drive in metres, minus a tenth of the distance from it, minus 10 for each contact."""
+    return after.station_m - before.station_m - 0.1 * after.distance_m - CONTACT_M * after.contacts
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,8 @@ class DriveConfig:
 
     server, token, timeout: as `wildcity.connect`.
     twin, version, trajectory: the twin and the recorded drive to follow; the latest version and the first drive if None.
+    scenario: a scenario to drive in, as of `Client.open`. Route, start, dynamics and end are then those of the scenario,
+        and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m are not used.
     rig, cameras, size: the rig (the twin's own if None), the cameras to see, and the (width, height) of each image.
     dynamics, speed, dt_us: the motion model, the speed at the start in m/s, the time of a step.
     horizon: steps after which an episode is truncated.
@@ -76,6 +88,7 @@ class DriveConfig:
     twin: str = "demo"
     version: int | None = None
     trajectory: str | None = None
+    scenario: str | Mapping[str, Any] | None = None
     rig: str | Rig | None = None
     cameras: tuple[str, ...] = ("front",)
     size: tuple[int, int] = (96, 60)
@@ -102,14 +115,19 @@ class DriveConfig:
     def open_options(self, welcome: Welcome) -> dict[str, Any]:
         """Arguments of `Client.open`. Raises `ValueError` if the twin has no drive to follow."""
         images = {camera: ImagePart(size=self.size) for camera in self.cameras}
-        return {
+        options = {
             "twin": self.twin,
             "version": self.version,
             "rig": self.rig,
             # Raw, because small images cost more time to decode than to transfer.
             "outputs": Outputs(cameras=self.cameras, encoding="raw", images=images),
-            "dynamics": Dynamics(self.dynamics, speed=self.speed),
             "dt_us": self.dt_us,
+        }
+        if self.scenario is not None:
+            return {**options, "scenario": self.scenario}
+        return {
+            **options,
+            "dynamics": Dynamics(self.dynamics, speed=self.speed),
             "trajectory": DriveSection(self._drive_name(welcome)),
         }
 
@@ -146,24 +164,24 @@ def image_key(camera: str) -> str:
     return f"image_{camera.replace('.', '_')}"
 
 
-def drive_of(opened: Opened) -> Drive:
-    """The drive that `open_options` asks for."""
+def task_of(config: DriveConfig, opened: Opened) -> Task:
+    """The task of a session that was opened with `open_options`."""
+    if config.scenario is not None:
+        return ScenarioTask(config, opened)
     assert opened.trajectory is not None, "the server left out the drive that was asked for"
-    return opened.trajectory
+    return DriveTask(config, opened.trajectory)
 
 
-class DriveTask:
-    """Episodes along one recorded drive."""
+class Task(ABC):
+    """Episodes of one session."""
 
-    def __init__(self, config: DriveConfig, drive: Drive) -> None:
+    def __init__(self, config: DriveConfig) -> None:
         self.config = config
-        self.trajectory = drive.name
-        self.route = Route(drive)
         self._state: DriveState | None = None
         self._steps = 0
 
-    def start(self, numbers: np.random.Generator, options: Mapping[str, Any] | None) -> Station:
-        """Where the next episode starts: the option `start`, in metres along the drive, or a random station.
+    def start(self, numbers: np.random.Generator, options: Mapping[str, Any] | None) -> Station | None:
+        """Where the next episode starts: at the option `start`, or where the task says.
 
         Raises `ValueError` if an option is unknown.
         """
@@ -172,11 +190,7 @@ class DriveTask:
         given.pop("version", None)
         if given:
             raise ValueError(f"options {sorted(given)} are unknown; known are start and version")
-        if start is None:
-            length_m = self.route.length_m
-            first_m, last_m = self.config.start_m or (0.0, max(length_m - 20.0, length_m / 2))
-            start = numbers.uniform(first_m, last_m)
-        return start if isinstance(start, Station) else Station(self.trajectory, float(start))
+        return self._start(numbers, start)
 
     def begin(self, seen: Observation) -> tuple[Seen, dict[str, Any]]:
         """The first observation of an episode, and its info."""
@@ -197,18 +211,29 @@ class DriveTask:
         self._state = after
         self._steps += 1
         reward = (self.config.reward or default_reward)(before, after)
-        terminated = after.distance_m > self.config.off_route_m
-        at_end = after.station_m >= self.route.length_m - 0.5
-        truncated = not terminated and (at_end or self._steps >= self.config.horizon)
+        terminated, ended = self._ended(after)
+        truncated = not terminated and (ended or self._steps >= self.config.horizon)
         return self._arrays(after), float(reward), terminated, truncated, self._info(after)
 
+    @abstractmethod
+    def _start(self, numbers: np.random.Generator, start: Any) -> Station | None:
+        """Where the next episode starts; `start` is the option of this name."""
+
+    @abstractmethod
     def _state_of(self, seen: Observation, near_m: float | None) -> DriveState:
-        station_m, distance_m = self.route.locate(seen.ego.pose, near_m)
-        return DriveState(station_m, distance_m, float(np.linalg.norm(seen.ego.velocity)), seen)
+        """Where the ego is; `near_m` is the station before."""
+
+    @abstractmethod
+    def _ended(self, state: DriveState) -> tuple[bool, bool]:
+        """Whether the episode terminates, and whether it is truncated."""
+
+    @abstractmethod
+    def _ahead(self, state: DriveState) -> NDArray[np.float64]:
+        """[20, 2]: points of the route ahead, in the rig frame."""
 
     def _arrays(self, state: DriveState) -> Seen:
         seen = state.observation
-        ahead = self.route.ahead(seen.ego.pose, state.station_m, WAYPOINTS, self.config.waypoint_m)
+        ahead = self._ahead(state)
         # Copies: arrays of an observation are views of the received message, and read-only.
         images = {image_key(camera): seen.images[camera].copy() for camera in self.config.cameras}
         return {
@@ -227,3 +252,87 @@ class DriveTask:
             "version": metadata.version,
             "frame_hash": metadata.frame_hash,
         }
+
+
+class DriveTask(Task):
+    """Episodes along one recorded drive."""
+
+    def __init__(self, config: DriveConfig, drive: Drive) -> None:
+        super().__init__(config)
+        self.trajectory = drive.name
+        self.route = Route(drive)
+
+    def _start(self, numbers: np.random.Generator, start: Any) -> Station:
+        if start is None:
+            length_m = self.route.length_m
+            first_m, last_m = self.config.start_m or (0.0, max(length_m - 20.0, length_m / 2))
+            start = numbers.uniform(first_m, last_m)
+        return start if isinstance(start, Station) else Station(self.trajectory, float(start))
+
+    def _state_of(self, seen: Observation, near_m: float | None) -> DriveState:
+        station_m, distance_m = self.route.locate(seen.ego.pose, near_m)
+        return DriveState(station_m, distance_m, float(np.linalg.norm(seen.ego.velocity)), seen)
+
+    def _ended(self, state: DriveState) -> tuple[bool, bool]:
+        return state.distance_m > self.config.off_route_m, state.station_m >= self.route.length_m - 0.5
+
+    def _ahead(self, state: DriveState) -> NDArray[np.float64]:
+        pose = state.observation.ego.pose
+        return self.route.ahead(pose, state.station_m, WAYPOINTS, self.config.waypoint_m)
+
+
+class ScenarioTask(Task):
+    """Episodes of a scenario. Progress and ends are what the server says."""
+
+    def __init__(self, config: DriveConfig, opened: Opened) -> None:
+        super().__init__(config)
+        if opened.dynamics.model == "teleport":
+            raise ValueError("the scenario has no ego.dynamics: actions need the model kinematic or dynamic")
+
+    def _start(self, numbers: np.random.Generator, start: Any) -> Station | None:
+        if start is None or isinstance(start, Station):
+            return start
+        raise ValueError(f"start is {start!r}; a scenario says where episodes start: give a Station or nothing")
+
+    def _state_of(self, seen: Observation, near_m: float | None) -> DriveState:
+        route = seen.metadata.route
+        if route is None:
+            raise ValueError("the scenario has no route: give it one, or a start along a trajectory")
+        return DriveState(route.station_m, abs(route.off_m), float(np.linalg.norm(seen.ego.velocity)), seen)
+
+    def _ended(self, state: DriveState) -> tuple[bool, bool]:
+        reason = end_of(state.observation)
+        return reason is not None and reason != "time", reason == "time"
+
+    def _ahead(self, state: DriveState) -> NDArray[np.float64]:
+        route = state.observation.metadata.route
+        assert route is not None, "`_state_of` has refused it"
+        points = np.array([point[:2] for point in route.points], np.float64).reshape(-1, 2)
+        return straight_on(points[:WAYPOINTS])
+
+    def _info(self, state: DriveState) -> dict[str, Any]:
+        metadata = state.observation.metadata
+        return {
+            **super()._info(state),
+            "command": metadata.route.command if metadata.route is not None else "straight",
+            "contacts": state.contacts,
+            "end": end_of(state.observation) or "",
+        }
+
+
+def end_of(seen: Observation) -> str | None:
+    """Which of its rules has ended the scenario with this observation, if one has."""
+    return next((event.name for event in seen.metadata.events if event.kind == "end"), None)
+
+
+def straight_on(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[20, 2]: the points of a route in the rig frame; straight on after its end."""
+    missing = WAYPOINTS - len(points)
+    if missing == 0:
+        return points
+    last = points[-1] if len(points) else np.zeros(2)
+    step = points[-1] - points[-2] if len(points) > 1 else np.array([ROUTE_SPACING_M, 0.0])
+    length_m = float(np.linalg.norm(step))
+    step = step * (ROUTE_SPACING_M / length_m) if length_m > 1e-6 else np.array([ROUTE_SPACING_M, 0.0])
+    more: NDArray[np.float64] = np.concatenate([points, last + step * np.arange(1, missing + 1)[:, None]])
+    return more

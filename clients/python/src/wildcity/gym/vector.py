@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ..aio import Client, Session, connect
-from .task import DriveConfig, DriveTask, Seen, drive_of
+from .task import DriveConfig, Seen, Task, task_of
 
 T = TypeVar("T")
 
@@ -126,7 +126,7 @@ class DriveVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 class _Lane:
     """One session and its task."""
 
-    def __init__(self, client: Client, session: Session, task: DriveTask) -> None:
+    def __init__(self, client: Client, session: Session, task: Task) -> None:
         self._client = client
         self._session = session
         self._task = task
@@ -160,7 +160,7 @@ async def _open_all(config: DriveConfig, count: int) -> list[_Lane]:
     options = config.open_options(clients[0].welcome)
     sessions = await asyncio.gather(*(client.open(**options) for client in clients))
     return [
-        _Lane(client, session, DriveTask(config, drive_of(session.opened)))
+        _Lane(client, session, task_of(config, session.opened))
         for client, session in zip(clients, sessions, strict=True)
     ]
 

@@ -1,0 +1,269 @@
+//! Dynamic objects: what moves in a scene beside the ego.
+//!
+//! A request for an image names an object by its track's id alone, with poses of the middle of its box. So the id says
+//! what is drawn, as the id of a scene does, and the server keeps no table:
+//!
+//! | id | what is drawn |
+//! |---|---|
+//! | `NAME@ASSET` | an asset of the store, by its hash or its name |
+//! | `NAME@LxWxH`, `NAME@LxWxH#RRGGBB` | a box of this length, width and height in metres, grey or in this colour |
+//! | `NAME` | a grey box of the size of a car |
+//!
+//! `wildcity alpasim export --tracks` writes such ids; AlpaSim's runtime repeats those that a scene's file has.
+
+use std::str::FromStr;
+
+use glam::DVec3;
+
+use wildcity_scene::actor::{ActorAsset, AssetDescription, AssetError};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::rig::is_name;
+use wildcity_scene::{ActorBox, ActorClass, Gaussians, sh};
+
+/// The box of an object of which nothing is known.
+const CAR: ActorBox = ActorBox { length_m: 4.6, width_m: 1.9, height_m: 1.6 };
+
+/// Red, green and blue of a box without a colour.
+const GREY: [u8; 3] = [128, 128, 128];
+
+/// Edge of a box's cells, in metres, and the most cells along an edge.
+const CELL_M: f64 = 0.1;
+const MOST_CELLS: f64 = 64.0;
+
+/// Standard deviation of a cell's Gaussian, as a fraction of the cell's edge, and across the face, in metres.
+const OVERLAP: f64 = 0.66;
+const THICKNESS_M: f64 = 0.004;
+
+/// The logit of an opacity of 0.99.
+const LOGIT_OPACITY: f32 = 4.595;
+
+/// Share of its colour that a face has, so that the edges of a box are seen: front and rear, left and right, top.
+const SHADES: [f64; 3] = [0.7, 0.85, 1.0];
+
+/// What an object is drawn from.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ObjectLook {
+    /// An asset, by its hash or its name.
+    Asset(String),
+    /// A box.
+    Box {
+        /// Its size.
+        size: ActorBox,
+        /// Its red, green and blue.
+        rgb8: [u8; 3],
+    },
+    /// Nothing is known: a grey box of the size of a car.
+    Unknown,
+}
+
+/// Why an id stands for nothing.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error(
+    "dynamic_objects: track_id {id:?}: {reason}; expected NAME@ASSET, NAME@LxWxH or NAME@LxWxH#RRGGBB with metres, \
+     or a NAME without @"
+)]
+pub struct ObjectError {
+    /// The refused id.
+    pub id: String,
+    /// What is wrong with it.
+    pub reason: String,
+}
+
+impl ObjectLook {
+    /// What a track's id stands for.
+    ///
+    /// # Errors
+    /// What follows its `@` is no name, and no size that an actor may have.
+    pub fn of_track(id: &str) -> Result<Self, ObjectError> {
+        let Some((_, look)) = id.rsplit_once('@') else { return Ok(Self::Unknown) };
+        look.parse().map_err(|reason| ObjectError { id: id.to_owned(), reason })
+    }
+
+    /// The box, unless it is that of an asset.
+    pub fn size(&self) -> Option<ActorBox> {
+        match self {
+            Self::Asset(_) => None,
+            Self::Box { size, .. } => Some(*size),
+            Self::Unknown => Some(CAR),
+        }
+    }
+
+    /// The asset of a box; `None` for one of the store.
+    ///
+    /// # Errors
+    /// It has too many Gaussians, which a checked box never has.
+    pub fn made(&self) -> Result<Option<ActorAsset>, AssetError> {
+        let (size, rgb8) = match self {
+            Self::Asset(_) => return Ok(None),
+            Self::Box { size, rgb8 } => (*size, *rgb8),
+            Self::Unknown => (CAR, GREY),
+        };
+        let description = AssetDescription {
+            name: "box".to_owned(),
+            class: ActorClass::Object,
+            box_: size,
+            provenance: Provenance::of("box".to_owned()),
+        };
+        ActorAsset::new(&gaussians(size, rgb8), description).map(Some)
+    }
+}
+
+/// What follows the `@` of an id.
+impl FromStr for ObjectLook {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (size, colour) = match text.split_once('#') {
+            Some((size, colour)) => (size, Some(colour)),
+            None => (text, None),
+        };
+        let extents: Vec<f64> = size.split('x').map_while(|part| part.parse().ok()).collect();
+        let [length_m, width_m, height_m] = match extents[..] {
+            [length_m, width_m, height_m] if size.split('x').count() == 3 => {
+                [length_m, width_m, height_m]
+            }
+            _ if colour.is_none() && is_name(text) => return Ok(Self::Asset(text.to_owned())),
+            _ => return Err(format!("{text:?} is no asset and no size")),
+        };
+        let size = ActorBox { length_m, width_m, height_m };
+        size.check().map_err(|error| error.to_string())?;
+        let rgb8 = match colour {
+            None => GREY,
+            Some(hex) => {
+                rgb8(hex).ok_or_else(|| format!("{hex:?} is no colour of 6 hex digits"))?
+            }
+        };
+        Ok(Self::Box { size, rgb8 })
+    }
+}
+
+/// The id of a track that is drawn as an asset.
+pub fn id_of_asset(name: &str, hash: &str) -> String {
+    format!("{name}@{hash}")
+}
+
+/// The id of a track that is drawn as a box.
+pub fn id_of_box(name: &str, size: &ActorBox) -> String {
+    format!("{name}@{}x{}x{}", size.length_m, size.width_m, size.height_m)
+}
+
+/// The pose of an actor, whose origin is on the ground, from that of the middle of its box.
+pub fn actor_of_centre(centre: &Pose, size: &ActorBox) -> Pose {
+    raised(centre, -0.5 * size.height_m)
+}
+
+/// The pose of the middle of an actor's box.
+pub fn centre_of_actor(actor: &Pose, size: &ActorBox) -> Pose {
+    raised(actor, 0.5 * size.height_m)
+}
+
+/// A pose moved along its own z axis.
+pub(crate) fn raised(pose: &Pose, by_m: f64) -> Pose {
+    Pose { position_m: pose.position_m + pose.rotation * DVec3::new(0.0, 0.0, by_m), ..*pose }
+}
+
+fn rgb8(hex: &str) -> Option<[u8; 3]> {
+    let is_hex = hex.len() == 6 && hex.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let number = is_hex.then(|| u32::from_str_radix(hex, 16).ok())??;
+    let [_, red, green, blue] = number.to_be_bytes();
+    Some([red, green, blue])
+}
+
+/// Five faces of a box, all but the one on the ground, of flat Gaussians.
+fn gaussians(size: ActorBox, rgb8: [u8; 3]) -> Gaussians {
+    let extents_m = DVec3::new(size.length_m, size.width_m, size.height_m);
+    let cells = (extents_m / CELL_M).ceil().min(DVec3::splat(MOST_CELLS)).max(DVec3::ONE);
+    let cell_m = extents_m / cells;
+    let mut gaussians = Gaussians::default();
+    let faces = [(0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0), (2, 1.0)];
+    for (axis, side) in faces {
+        let mut sigmas_m = OVERLAP * cell_m;
+        sigmas_m[axis] = THICKNESS_M;
+        let rgb = rgb8.map(|value| SHADES[axis] * f64::from(value) / 255.0);
+        let dc = rgb.map(|value| ((value - 0.5) / sh::C0) as f32);
+        let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+        for i in 0..cells[u] as usize {
+            for j in 0..cells[v] as usize {
+                // From the middle of the box.
+                let mut at_m = DVec3::ZERO;
+                at_m[axis] = 0.5 * side * extents_m[axis];
+                at_m[u] = (i as f64 + 0.5) * cell_m[u] - 0.5 * extents_m[u];
+                at_m[v] = (j as f64 + 0.5) * cell_m[v] - 0.5 * extents_m[v];
+                at_m.z += 0.5 * extents_m.z;
+                gaussians.means_m.push(at_m.to_array());
+                gaussians.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+                gaussians.ln_scales.push(sigmas_m.to_array().map(|sigma_m| sigma_m.ln() as f32));
+                gaussians.logit_opacities.push(LOGIT_OPACITY);
+                gaussians.sh.extend(dc);
+            }
+        }
+    }
+    gaussians
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_says_what_is_drawn() {
+        let size = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
+        let red = [0xc0, 0x10, 0x20];
+        let look = |id: &str| ObjectLook::of_track(id).unwrap();
+        assert_eq!(look("7@sedan"), ObjectLook::Asset("sedan".to_owned()));
+        assert_eq!(look("7@4.5x1.8x1.5"), ObjectLook::Box { size, rgb8: GREY });
+        assert_eq!(look("a@b@4.5x1.8x1.5#C01020"), ObjectLook::Box { size, rgb8: red });
+        assert_eq!(look("17"), ObjectLook::Unknown);
+        // Two extents are no size, but may be a name.
+        assert_eq!(look("7@4.5x1.8"), ObjectLook::Asset("4.5x1.8".to_owned()));
+        assert_eq!(look(&id_of_box("7", &size)).size(), Some(size));
+        assert_eq!(look(&id_of_asset("7", "ab12")), ObjectLook::Asset("ab12".to_owned()));
+        for (id, reason) in [
+            ("7@", "no asset and no size"),
+            ("7@Sedan", "no asset and no size"),
+            ("7@4.5x1.8x0", "height_m is 0.0"),
+            ("7@4.5xnanx1.5", "width_m is NaN"),
+            ("7@4.5x1.8x1.5#12345", "6 hex digits"),
+            ("7@sedan#123456", "no asset and no size"),
+        ] {
+            let text = ObjectLook::of_track(id).unwrap_err().to_string();
+            assert!(text.contains(reason) && text.contains(id), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_box_has_its_size_and_colour() {
+        let size = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
+        let asset = ObjectLook::Box { size, rgb8: [255, 0, 51] }.made().unwrap().unwrap();
+        let all = gaussians(size, [255, 0, 51]);
+        assert_eq!(asset.levels[0].chunk.len(), all.len());
+        let bounds = ActorAsset::bounds(&all);
+        // Every face but the lower one has Gaussians, on the face.
+        assert!((bounds.min_m - DVec3::new(-2.25, -0.9, 0.05)).length() < 1e-9, "{bounds:?}");
+        assert!((bounds.max_m - DVec3::new(2.25, 0.9, 1.5)).length() < 1e-9, "{bounds:?}");
+        let top = (0..all.len()).find(|&index| all.means_m[index][2] == 1.5).unwrap();
+        let rgb = all.sh_of(top).iter().map(|&dc| 0.5 + sh::C0 * f64::from(dc));
+        for (value, wanted) in rgb.zip([1.0, 0.0, 0.2]) {
+            assert!((value - wanted).abs() < 1e-6, "{value} {wanted}");
+        }
+        // The largest box that may be is no more than five faces of the most cells.
+        let large = ActorBox { length_m: 100.0, width_m: 100.0, height_m: 100.0 };
+        assert_eq!(gaussians(large, GREY).len(), 5 * 64 * 64);
+        assert!(gaussians(ActorBox { height_m: 0.01, ..large }, GREY).len() <= 64 * 64 + 4 * 64);
+        assert!(ObjectLook::Unknown.made().unwrap().is_some());
+        assert!(ObjectLook::Asset("sedan".to_owned()).made().unwrap().is_none());
+    }
+
+    #[test]
+    fn the_middle_of_a_box_is_half_its_height_above_the_ground() {
+        let size = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
+        let rotation = glam::DQuat::from_rotation_x(0.1);
+        let centre = Pose { position_m: DVec3::new(1.0, 2.0, 3.0), rotation };
+        let actor = actor_of_centre(&centre, &size);
+        assert!(((actor.position_m - centre.position_m).length() - 0.75).abs() < 1e-12);
+        assert!(actor.position_m.z < 2.26);
+        let again = centre_of_actor(&actor, &size);
+        assert!((again.position_m - centre.position_m).length() < 1e-12);
+    }
+}

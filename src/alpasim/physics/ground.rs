@@ -1,0 +1,115 @@
+//! A box on the ground of recorded drives.
+
+use glam::DVec3;
+
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::Ground;
+
+use crate::limits;
+use crate::object::raised;
+use crate::wire::physics::Status;
+
+/// Puts a box on the ground: moves it vertically and tilts it, so that it stands on the ground's plane, and keeps its
+/// heading and the x and y of its middle. `world_from_box` is the pose of its middle.
+///
+/// The pose is returned as it was, with the reason, where there is no ground, or if it would move by more than
+/// [`limits::PHYSICS_TRANSLATION_M`] or turn by more than [`limits::PHYSICS_ROTATION_RAD`]: AlpaSim's own service
+/// does the same.
+pub fn on_ground(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> (Pose, Status) {
+    match placed(ground, world_from_box, height_m) {
+        None => (*world_from_box, Status::InsufficientPointsFitplane),
+        Some(there) => match refused(world_from_box, &there) {
+            Some(status) => (*world_from_box, status),
+            None => (there, Status::SuccessfulUpdate),
+        },
+    }
+}
+
+fn placed(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> Option<Pose> {
+    let bottom = raised(world_from_box, -0.5 * height_m);
+    let tilted = ground.find(bottom)?;
+    // Tilting moves the middle of the lower face aside; the ground's height is that under its new place.
+    let half = tilted.rotation * DVec3::new(0.0, 0.0, 0.5 * height_m);
+    let aside = (world_from_box.position_m - half).with_z(tilted.position_m.z);
+    let under = ground.find(Pose { position_m: aside, ..tilted })?;
+    let z_m = under.position_m.z + half.z;
+    Some(Pose { position_m: world_from_box.position_m.with_z(z_m), rotation: tilted.rotation })
+}
+
+fn refused(from: &Pose, to: &Pose) -> Option<Status> {
+    if (to.position_m.z - from.position_m.z).abs() > limits::PHYSICS_TRANSLATION_M {
+        return Some(Status::HighTranslation);
+    }
+    let [up_from, up_to] = [from, to].map(|pose| pose.rotation * DVec3::Z);
+    let is_turned = up_from.angle_between(up_to) > limits::PHYSICS_ROTATION_RAD;
+    is_turned.then_some(Status::HighRotation)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+    use wildcity_scene::Trajectory;
+    use wildcity_scene::trajectory::Keyframe;
+
+    const HEIGHT_M: f64 = 1.5;
+
+    /// A drive uphill along x with a slope of 0.1.
+    fn uphill() -> Vec<Trajectory> {
+        let keyframe = |i: i64| {
+            let x_m = 5.0 * i as f64;
+            let rotation = DQuat::from_rotation_y(-(0.1f64.atan()));
+            let world_from_rig = Pose { position_m: DVec3::new(x_m, 0.0, 0.1 * x_m), rotation };
+            Keyframe { time_us: i, world_from_rig }
+        };
+        vec![Trajectory { name: "log".into(), keyframes: (0..=10).map(keyframe).collect() }]
+    }
+
+    fn at(x_m: f64, y_m: f64, z_m: f64, rotation: DQuat) -> Pose {
+        Pose { position_m: DVec3::new(x_m, y_m, z_m), rotation }
+    }
+
+    #[test]
+    fn a_box_stands_on_the_slope_with_its_heading_and_place() {
+        let drives = uphill();
+        let ground = Ground::from_drives(&drives);
+        for (yaw_rad, above_m) in [(0.0, 0.0), (0.3, 0.9), (2.5, -0.4)] {
+            let level =
+                at(20.0, 2.0, 2.0 + 0.5 * HEIGHT_M + above_m, DQuat::from_rotation_z(yaw_rad));
+            let (there, status) = on_ground(&ground, &level, HEIGHT_M);
+            assert_eq!(status, Status::SuccessfulUpdate);
+            assert_eq!(there.position_m.truncate(), level.position_m.truncate());
+            // The middle of the lower face is on the plane z = 0.1 x, and the box is along its normal.
+            let bottom = raised(&there, -0.5 * HEIGHT_M).position_m;
+            assert!((bottom.z - 0.1 * bottom.x).abs() < 1e-9, "{bottom}");
+            let up = there.rotation * DVec3::Z;
+            assert!((up - DVec3::new(-0.1, 0.0, 1.0).normalize()).length() < 1e-9, "{up}");
+            let forward = there.rotation * DVec3::X;
+            let turned = forward.truncate().angle_to(glam::DVec2::from_angle(yaw_rad));
+            assert!(turned.abs() < 0.01, "{forward}");
+            let (again, _) = on_ground(&ground, &there, HEIGHT_M);
+            assert!((again.position_m - there.position_m).length() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_pose_that_cannot_be_meant_is_returned_with_the_reason() {
+        let drives = uphill();
+        let ground = Ground::from_drives(&drives);
+        let flat = DQuat::IDENTITY;
+        let high = at(20.0, 0.0, 2.0 + 0.5 * HEIGHT_M + 1.6, flat);
+        let low = at(20.0, 0.0, 2.0 + 0.5 * HEIGHT_M - 1.6, flat);
+        let tilted = at(20.0, 0.0, 2.0 + 0.5 * HEIGHT_M, DQuat::from_rotation_x(0.2));
+        let far = at(20.0, 80.0, 2.0, flat);
+        for (pose, reason) in [
+            (high, Status::HighTranslation),
+            (low, Status::HighTranslation),
+            (tilted, Status::HighRotation),
+            (far, Status::InsufficientPointsFitplane),
+        ] {
+            assert_eq!(on_ground(&ground, &pose, HEIGHT_M), (pose, reason));
+        }
+        let bare = Ground::from_drives(&[]);
+        assert_eq!(on_ground(&bare, &high, HEIGHT_M).1, Status::InsufficientPointsFitplane);
+    }
+}
