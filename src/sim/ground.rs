@@ -150,4 +150,22 @@ mod tests {
         assert_eq!(Ground::from_drives(&drives).find(upwards), None);
         assert_eq!(Ground::from_drives(&drives).place(upwards), upwards);
     }
+
+    /// The distance includes the difference in height.
+    #[test]
+    fn a_pose_high_above_a_drive_is_far_from_it() {
+        let drives = drives();
+        // Beside the begin of the street.
+        let height_m = |above_m: f64| {
+            let position_m = DVec3::new(45.0, -25.0, above_m);
+            Ground::from_drives(&drives).place(Pose { position_m, ..Pose::IDENTITY }).position_m.z
+        };
+        // 20 m aside: within 25 m up to a height of 15 m.
+        for above_m in [-14.9, 0.0, 14.9] {
+            assert!(height_m(above_m).abs() < 1e-12, "{above_m}");
+        }
+        for above_m in [-15.1, 15.1, 24.0] {
+            assert_eq!(height_m(above_m), above_m);
+        }
+    }
 }

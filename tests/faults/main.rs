@@ -16,6 +16,7 @@
 //! cargo test -p wildcity-twin --test faults one_history` runs one on both, and `HISTORIES=n ... many_histories` any
 //! number.
 
+mod assets;
 mod bucket;
 #[allow(dead_code, reason = "the simulation of uploads uses another part of it")]
 mod disk;

@@ -41,6 +41,11 @@ fn instances_are_those_of_the_reference() {
     placed::check_instances(&gpu(), &Reference);
 }
 
+#[test]
+fn instances_are_those_of_the_vectors() {
+    placed::check_instance_vectors(&gpu());
+}
+
 /// The cpu runs the first stages, the gpu the rest.
 #[test]
 fn instances_of_stages_that_ran_on_the_cpu() {

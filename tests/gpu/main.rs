@@ -20,6 +20,8 @@ mod skies;
 mod streets;
 #[path = "../support/truths.rs"]
 mod truths;
+#[path = "../support/vectors.rs"]
+mod vectors;
 
 mod actors;
 mod cameras;

@@ -74,6 +74,40 @@ fn splat_comes_back() {
     assert_alike(&read(&splat(&g)).unwrap(), &g, within, ".splat");
 }
 
+/// A file without a magic number begins with numbers, which may have the bytes that other formats begin with.
+#[test]
+fn a_splat_may_begin_as_other_formats_do() {
+    let within = Within { quat: 0.02, opacity: 0.002, dc: 0.007, ..EXACT };
+    // Of JSON, with and without white space; of gzip; of safetensors, in the third number.
+    let starts = [*b"{a", *b"{\"", *b"{}", *b"{\n", *b" {", *b"\t{", *b"{{", [0x1f, 0x8b]];
+    let any = (0..=u8::MAX).map(|byte| [byte, 0x80]);
+    for start in starts.into_iter().chain(any) {
+        for axis in [0, 2] {
+            let mut g = gaussians(50, 0, 20.0, 1);
+            let bits = (g.means_m[0][axis] as f32).to_bits() & 0xFFFF_0000;
+            let bits = bits | u32::from(u16::from_le_bytes(start));
+            g.means_m[0][axis] = f32::from_bits(bits).into();
+            let file = splat(&g);
+            assert_eq!(file[4 * axis..][..2], start);
+            let read = read(&file).unwrap_or_else(|error| panic!("{start:?}, {axis}: {error}"));
+            assert_alike(&read, &g, within, ".splat");
+        }
+    }
+}
+
+/// What is read of a file's start does not depend on white space, nor on how long a header is.
+#[test]
+fn json_is_found_by_what_it_is() {
+    for text in ["{}", " \n{ }", "{\"asset\": {\"version\": \"1.0\"}}", "{", "{\"\u{e9}\": 1}"] {
+        let refused = refusal(text.as_bytes()).to_string();
+        assert!(refused.starts_with("SOG") || refused.starts_with("glTF"), "{text:?}: {refused}");
+    }
+    for text in ["{\u{1}\"a\": 1}", "{a: 1}", "{[1]}"] {
+        let refused = refusal(text.as_bytes()).to_string();
+        assert!(refused.contains("none of the formats"), "{text:?}: {refused}");
+    }
+}
+
 #[test]
 fn spz_comes_back() {
     for sh_degree in 0..=3 {

@@ -27,6 +27,8 @@ fn schemas_are_up_to_date() {
     check::<http::Ticket>("ticket");
     check::<http::EpisodeInfo>("episode");
     check::<http::ActorAsset>("actor");
+    check::<http::ActorList>("actors");
+    check::<http::TwinList>("twins");
     check::<http::Refusal>("refusal");
 }
 

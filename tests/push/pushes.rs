@@ -50,6 +50,48 @@ async fn a_push_replaces_the_cells_that_it_touches() {
         .refused(404, "unknown_version");
 }
 
+/// Axes and scale are those of each file; what is stored and reported is in the twin's.
+#[tokio::test]
+async fn each_file_has_its_axes_and_its_scale() {
+    let server = TestServer::start().await;
+    let dir = tempfile::tempdir().unwrap();
+    let mut one = Gaussians::default();
+    one.means_m.push([1.0, 2.0, 3.0]);
+    one.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+    one.ln_scales.push([0.1_f32, 0.2, 0.3].map(f32::ln));
+    one.logit_opacities.push(0.0);
+    one.sh.extend([0.0; 3]);
+    let client = client(&server);
+    let mut uploads = Vec::new();
+    for logit in [0.0, 1.0] {
+        one.logit_opacities[0] = logit;
+        let path = write(dir.path(), "one.ply", &one);
+        uploads.push(client.upload(&path, &mut |_, _| {}).await.unwrap().id);
+    }
+    let mut asked = push_of(&[&uploads[0], &uploads[1]]);
+    asked.record = Some("f32".to_owned());
+    // x right, y down, z forward, in half metres; and a quarter turn.
+    (asked.files[0].axes, asked.files[0].scale) = ("y-down-z-forward".to_owned(), 0.5);
+    asked.files[1].axes = "0 -1 0 1 0 0 0 0 1".to_owned();
+    let begun = client.push("turned", &asked).await.unwrap();
+    let pushed = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
+    let ranges = pushed.report.unwrap().ranges.unwrap();
+    assert_eq!(ranges.mean_m, [[-2.0, 1.0, -1.0], [0.5, 1.5, 3.0]]);
+    let near = |a: f64, b: f64| (a - b).abs() < 1e-6;
+    assert!(near(ranges.scale_m[0], 0.05) && near(ranges.scale_m[1], 0.3), "{ranges:?}");
+
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    let version = catalog.version("turned", None).unwrap();
+    let entry = &version.manifest.chunks[0];
+    let mut centres_m = Vec::new();
+    for section in entry.sections.iter().filter(|section| section.level == 0) {
+        let chunk = catalog.section(&version, entry, section).unwrap();
+        centres_m.extend(chunk.to_gaussians().means_m);
+    }
+    centres_m.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    assert_eq!(centres_m, [[-2.0, 1.0, 3.0], [0.5, 1.5, -1.0]]);
+}
+
 #[tokio::test]
 async fn a_push_makes_a_new_twin() {
     let server = TestServer::start().await;

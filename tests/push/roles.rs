@@ -1,9 +1,12 @@
 //! What each role may do.
 
+use std::sync::Arc;
+
 use serde_json::json;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
 use wildcity_client::{Client, ConnectOptions, HttpClient};
-use wildcity_server::{SpoolLimits, Tokens};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_server::{Config, Tokens};
 
 use crate::http::{Reply, push_of, send};
 use crate::support::TestServer;
@@ -19,10 +22,10 @@ fn with_token(token: &str) -> ConnectOptions {
 }
 
 async fn guarded() -> TestServer {
-    guarded_with(SpoolLimits::default()).await
+    guarded_with(|_| {}).await
 }
 
-async fn guarded_with(spool: SpoolLimits) -> TestServer {
+async fn guarded_with(change: impl FnOnce(&mut Config)) -> TestServer {
     let hash = blake3::hash(PUSHER.as_bytes());
     let text = json!({ "tokens": [
         { "name": "driver", "role": "drive", "token": DRIVER },
@@ -35,8 +38,8 @@ async fn guarded_with(spool: SpoolLimits) -> TestServer {
     // A public address: with tokens it is allowed.
     TestServer::configured(|config| {
         config.tokens = Some(tokens);
-        config.limits.spool = spool;
         config.listen = "0.0.0.0:0".parse().unwrap();
+        change(config);
     })
     .await
 }
@@ -174,6 +177,30 @@ async fn the_client_sends_its_token() {
     assert_eq!(driver.reset(0, None).await.unwrap().metadata().version, 2);
 }
 
+/// What a push did to the images is for all that may push to the twin, and for nobody else.
+#[tokio::test]
+async fn the_report_of_a_push_is_for_those_that_may_push() {
+    let cpu = Arc::new(Cpu::new(1, Simd::Best).unwrap());
+    let server = guarded_with(|config| config.backend = cpu).await;
+    let url = format!("http://127.0.0.1:{}", server.address().port());
+    let dir = tempfile::tempdir().unwrap();
+    let path = crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 40, 1));
+    let pusher = HttpClient::new(&url, &with_token(PUSHER)).unwrap();
+    let upload = pusher.upload(&path, &mut |_, _| {}).await.unwrap();
+    let begun = pusher.push("test", &push_of(&[&upload.id])).await.unwrap();
+    let request = format!("GET /v1/twins/test/pushes/{}", begun.id);
+    pusher.wait_for_push(begun, &mut |_| {}).await.unwrap();
+    for token in [PUSHER, RIVAL, ADMIN] {
+        let shown = ask(&server, &request, Some(token), "").await;
+        let previews = shown.body["report"]["golden"].as_array().unwrap();
+        assert_eq!((shown.status, previews.len()), (200, 4), "{shown:?}");
+        assert!(previews.iter().any(|preview| preview["psnr_db"].is_f64()), "{shown:?}");
+    }
+    for token in [DRIVER, ELSEWHERE] {
+        ask(&server, &request, Some(token), "").await.refused(403, "forbidden");
+    }
+}
+
 #[tokio::test]
 async fn web_pages_from_elsewhere_may_not_push() {
     let server = TestServer::start().await;
@@ -276,7 +303,7 @@ async fn an_upload_is_that_of_its_token() {
 
 #[tokio::test]
 async fn a_token_has_a_quota() {
-    let server = guarded_with(SpoolLimits { bytes: 1000, ..SpoolLimits::default() }).await;
+    let server = guarded_with(|config| config.limits.spool.bytes = 1000).await;
     let begin = async |token: &'static str, byte: u8, size: u64| {
         ask(&server, "POST /v1/uploads", Some(token), &announcement(&[byte], size)).await
     };

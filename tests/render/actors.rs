@@ -61,6 +61,12 @@ fn instances_are_those_of_the_reference() {
     placed::check_instances(&cpu(), &Reference);
 }
 
+#[test]
+fn instances_are_those_of_the_vectors() {
+    placed::check_instance_vectors(&cpu());
+    placed::check_instance_vectors(&Reference);
+}
+
 /// Every instruction set, and any number of threads.
 #[test]
 fn actors_do_not_depend_on_threads_and_agree_on_instruction_sets() {

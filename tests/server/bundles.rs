@@ -96,6 +96,36 @@ async fn the_last_frames_of_each_camera_newest_first() {
     assert_eq!(bundle(&agent.step(2.0).await, "front"), driven(0, &[2, 1, 0]));
 }
 
+/// Camera by camera, in the order of the agent's own choice, each from its newest frame on.
+#[tokio::test]
+async fn earlier_frames_are_listed_camera_by_camera() {
+    let server = TestServer::start().await;
+    for cameras in [["front", "rear"], ["rear", "front"]] {
+        let outputs = json!({ "encoding": "raw", "frames": 3, "cameras": cameras });
+        let mut agent = server.agent().await;
+        let opened = agent.open(json!({ "outputs": outputs })).await;
+        assert_eq!([0, 1].map(|k| opened["cameras"][k]["name"].clone()), cameras);
+        agent.look(json!({ "type": "reset" })).await;
+        agent.step(1.0).await;
+        let seen = agent.step(2.0).await;
+        let listed: Vec<_> = seen.meta["history"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|past| (&past["camera"], &past["index"], &past["back"]))
+            .collect();
+        let [first, second] = cameras.map(|camera| json!(camera));
+        let [zero, one, two] = [0, 1, 2].map(|number| json!(number));
+        let wanted = [
+            (&first, &zero, &one),
+            (&first, &zero, &two),
+            (&second, &one, &one),
+            (&second, &one, &two),
+        ];
+        assert_eq!(listed, wanted);
+    }
+}
+
 #[tokio::test]
 async fn files_of_earlier_frames_are_the_files_of_then() {
     let server = TestServer::start().await;

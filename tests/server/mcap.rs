@@ -1,9 +1,13 @@
 //! MCAP files of episodes that end: written beside the records, delivered, and refused with the reason.
 
+use std::io::Write as _;
 use std::path::Path;
 use std::process::Command;
-use std::time::{Duration, SystemTime};
+use std::sync::mpsc::{Receiver, channel};
+use std::thread::sleep;
+use std::time::{Duration, Instant, SystemTime};
 
+use rustix::fs::{Mode, OFlags};
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -119,6 +123,26 @@ async fn what_was_cut_has_no_mcap_file_until_it_is_exported_by_hand() {
     assert_eq!((cut, cut), (exported.messages, whole));
 }
 
+/// Ends the reading of a pipe: gives a line to the first reader, as soon as it is told to, or after [`TEST_TIMEOUT`], or
+/// when it can be told no more. Then gives its name to a file. Returns whether it was told to.
+///
+/// What waits for the pipe goes on in any case, so that a test that fails also ends.
+fn release(pipe: &Path, file: &Path, told: &Receiver<()>) -> bool {
+    let is_told = told.recv_timeout(TEST_TIMEOUT).is_ok();
+    let begun = Instant::now();
+    let flags = OFlags::WRONLY | OFlags::NONBLOCK;
+    let write = loop {
+        // A pipe without a reader cannot be opened so.
+        match rustix::fs::open(pipe, flags, Mode::empty()) {
+            Ok(pipe) => break std::fs::File::from(pipe).write_all(b"no record\n"),
+            Err(_) if begun.elapsed() < TEST_TIMEOUT => sleep(Duration::from_millis(5)),
+            Err(error) => break Err(error.into()),
+        }
+    };
+    std::fs::rename(file, pipe).unwrap();
+    is_told && write.is_ok()
+}
+
 /// The export of `a-1` blocks, since a pipe that nothing writes to has the name of its record; the session goes on
 /// writing the record itself.
 #[tokio::test]
@@ -139,19 +163,20 @@ async fn no_request_waits_for_an_export() {
         agent.step(1.0).await;
         agent.ask(json!({ "type": "close" })).await;
     };
+    let (tell, told) = channel();
+    let pipe_of_thread = pipe.clone();
+    let releasing = std::thread::spawn(move || release(&pipe_of_thread, &record, &told));
     timeout(TEST_TIMEOUT / 2, driven).await.expect("requests are answered");
+    assert!(!releasing.is_finished(), "the requests waited until the pipe was read");
     assert_eq!(names(server.episodes.path()), ["a-1.jsonl", "b-1.jsonl", "b-2.jsonl"]);
     let text = std::fs::read_to_string(server.episodes.path().join("b-2.jsonl")).unwrap();
     assert!(text.lines().last().unwrap().contains("\"outcome\":\"completed\""), "{text}");
 
     // What comes out of the pipe is no record: this export fails, and the others follow.
-    let writer = std::thread::spawn(move || {
-        std::fs::write(&pipe, "no record\n").unwrap();
-        std::fs::rename(&record, &pipe).unwrap();
-    });
+    tell.send(()).unwrap();
     let (status, _, _) = get(&server, "/v1/episodes/b-2/mcap").await;
     assert_eq!(status, 200);
-    writer.join().unwrap();
+    assert!(releasing.join().unwrap(), "nothing read the pipe");
     assert!(refused(&server, "/v1/episodes/a-1/mcap").await.contains("no header"));
     let entry = listed(&server, "a-1").await;
     assert_eq!((&entry["outcome"], &entry["steps"]), (&"completed".into(), &2.into()), "{entry}");

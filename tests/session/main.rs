@@ -2,6 +2,8 @@
 
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/scene_files.rs"]
+mod scene_files;
 #[path = "../support/source.rs"]
 mod source;
 #[path = "../support/streaming.rs"]
@@ -9,6 +11,7 @@ mod streaming;
 
 mod actor_records;
 mod actors;
+mod before_actors;
 mod driving;
 mod fairness;
 mod long;

@@ -12,4 +12,5 @@ mod driving;
 mod integrators;
 mod solids;
 mod study;
+mod surface;
 mod traffic;

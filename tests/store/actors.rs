@@ -235,6 +235,59 @@ fn a_link_a_pipe_and_a_directory_are_damaged_assets() {
     }
 }
 
+/// A folder of objects that is none, as a link to itself or a file in its place.
+#[test]
+fn a_damaged_folder_hides_no_other() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let van = add(&catalog, "van", 1).unwrap().actor;
+    let put = |seed| catalog.put_actor(&asset("car", seed), RecordFormat::Q32).unwrap();
+    let car = (2..).map(put);
+    // Assets of another folder than the first.
+    let car = { car }.find(|car| car.hash[..2] != van.hash[..2]).unwrap();
+    let folder = dir.path().join(".actors/objects").join(&car.hash[..2]);
+    let whole = dir.path().join("elsewhere");
+    std::fs::rename(&folder, &whole).unwrap();
+    let links = |to: &std::path::Path| std::os::unix::fs::symlink(to, &folder).unwrap();
+    let loops = || links(&folder);
+    let dangles = || links(&dir.path().join("nowhere"));
+    let file = || std::fs::write(&folder, "no folder").unwrap();
+    let cases: [&dyn Fn(); 3] = [&loops, &dangles, &file];
+    for replace in cases {
+        replace();
+        let ActorList { actors, damaged } = catalog.actors().unwrap();
+        assert_eq!((actors, damaged.len()), (vec![van.clone()], 1));
+        assert_eq!((&*damaged[0].hash, &damaged[0].name), (&car.hash[..2], &None));
+        assert!(damaged[0].reason.contains("it is not a directory"), "{damaged:?}");
+        for text in ["van", &van.hash, &van.hash[..6]] {
+            assert_eq!(catalog.find_actor(text).unwrap(), van);
+        }
+        catalog.actor(&van.hash).unwrap();
+        for error in [
+            catalog.find_actor(&car.hash).unwrap_err(),
+            catalog.find_actor(&car.hash[..6]).unwrap_err(),
+            catalog.actor(&car.hash).unwrap_err(),
+            catalog.remove_actor(&car.hash, true).unwrap_err(),
+            catalog.remove_actor(&car.hash, false).unwrap_err(),
+        ] {
+            assert!(matches!(error, StoreError::ActorDamaged { .. }), "{error}");
+            assert!(error.to_string().contains("mend it in the store"), "{error}");
+            assert!(!error.to_string().contains(&*dir.path().to_string_lossy()), "{error}");
+        }
+        let error = catalog.find_actor("bus").unwrap_err();
+        assert!(matches!(error, StoreError::NoActor { found: 0, .. }), "{error}");
+        let other = (20..).map(|seed| asset("bus", seed));
+        let bus = { other }
+            .find_map(|bus| catalog.add_actor(&bus, RecordFormat::Q32, SameName::Refused).ok());
+        assert_eq!(catalog.remove_actor("bus", false).unwrap(), bus.unwrap().actor.hash);
+        std::fs::remove_file(&folder).unwrap();
+    }
+    // A link to a folder is one.
+    links(&whole);
+    assert_eq!(catalog.find_actor(&car.hash).unwrap(), car);
+    assert_eq!(catalog.actors().unwrap().damaged, []);
+}
+
 #[test]
 fn an_asset_is_removed_alone() {
     everywhere(|place| {

@@ -5,7 +5,10 @@
 use std::sync::Arc;
 
 use glam::{DQuat, DVec3};
-use wildcity_render::{Backend, Frame, Readout, RollingShutter, Target, View};
+use wildcity_render::compare::gaussians::{GaussianSpec, forward_view, gaussians_of, scene_of};
+use wildcity_render::{
+    Backend, FIRST_ACTOR_INSTANCE, Frame, Readout, RollingShutter, TWIN_INSTANCE, Target, View,
+};
 use wildcity_scene::actor::{ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole, ShutterDirection};
 use wildcity_scene::geometry::{Camera, Pose};
@@ -15,6 +18,7 @@ use crate::images::{Image, agree, max_difference, psnr, render, render_one};
 use crate::lenses::{lenses, rolling_view};
 use crate::scene_files::Random;
 use crate::streets::street;
+use crate::vectors::{cases, number};
 
 /// Size of the actor's box, in metres.
 const BOX_M: [f64; 3] = [4.4, 1.8, 1.5];
@@ -275,4 +279,45 @@ pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
     for (ids, view) in all.iter().zip(&views) {
         assert_eq!(*ids, instances(backend, &scene, *view).0);
     }
+}
+
+/// Asserts that layers, seen one behind the other, give the instance ids of the vectors.
+pub(crate) fn check_instance_vectors(backend: &dyn Backend) {
+    let Some(cases) = cases("own", "instance") else { return };
+    for case in cases {
+        let layers: Vec<[f64; 2]> = serde_json::from_value(case.input["layers"].clone()).unwrap();
+        // After each layer: whose Gaussian decides, and how much of the light from behind is left.
+        let after: Vec<(u16, f64)> =
+            (1..=layers.len()).map(|count| through(backend, &layers[..count])).collect();
+        let decides = after.iter().position(|(id, _)| *id != 0);
+        let (id, left) = after[decides.unwrap_or(layers.len() - 1)];
+        assert_eq!(f64::from(id), number(&case.expected["instance"]), "{}", case.name);
+        let wanted = number(&case.expected["transmittance"]);
+        assert!((left - wanted).abs() < 1e-6, "{}: {left}, not {wanted}", case.name);
+        // What is behind changes nothing.
+        let behind = decides.map_or(&[][..], |decides| &after[decides..]);
+        assert!(behind.iter().all(|later| later.0 == id), "{}: {after:?}", case.name);
+    }
+}
+
+/// The instance id, and the share of the light that is left, behind wide Gaussians: each whose, and its opacity.
+fn through(backend: &dyn Backend, layers: &[[f64; 2]]) -> (u16, f64) {
+    let mut twin = Vec::new();
+    let mut placed = Vec::new();
+    for (index, &[id, opacity]) in layers.iter().enumerate() {
+        let wide = GaussianSpec { sigma_m: DVec3::ONE, opacity, ..GaussianSpec::default() };
+        let at_m = DVec3::Z * (10.0 + index as f64);
+        if id == f64::from(TWIN_INSTANCE) {
+            twin.push(GaussianSpec { mean_m: at_m, ..wide });
+            continue;
+        }
+        let chunk = chunk_of(&gaussians_of(&[GaussianSpec { mean_m: DVec3::ZERO, ..wide }]));
+        let pose = Pose { position_m: at_m, ..Pose::IDENTITY };
+        placed.push(PlacedChunk::at_rest(chunk, pose, id as u16 - FIRST_ACTOR_INSTANCE));
+    }
+    let scene = Scene { placed, ..scene_of(&twin) };
+    // The centre of the middle pixel is where all of them are.
+    let (ids, opacity) = instances(backend, &scene, forward_view([33, 33], 60.0));
+    let middle = 33 * 33 / 2;
+    (ids[middle], 1.0 - f64::from(opacity[middle]))
 }

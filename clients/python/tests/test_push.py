@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import wildcity
 from wildcity import Camera, Pose, PushFailed, PushProgress, Refused, Rig
+from wildcity.http_client import HttpClient
 
 RIG = Rig("one", (Camera("front", 96, 64, 60.0, 60.0, 48.0, 32.0, Pose((-15, 0, 1.5), (0.5, -0.5, 0.5, -0.5))),))
 TOKEN = "pusher-pusher-pusher"
@@ -174,8 +175,23 @@ class CuttingProxy:
                         return
 
 
+def test_damaged_assets_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    damaged = [
+        {"hash": "9f", "reason": "the folder of all assets whose hashes begin so: it is not a directory"},
+        {"hash": "a" * 64, "name": "van", "reason": "its bytes hash to b"},
+    ]
+    answer: dict[str, Any] = {"actors": [], "damaged": damaged}
+    monkeypatch.setattr(HttpClient, "json", lambda *_: answer)
+    listed = wildcity.actors()
+    assert listed.damaged == tuple(wildcity.DamagedActor(**one) for one in damaged)
+    assert [one.name for one in listed.damaged] == [None, "van"]
+    del damaged[1]["reason"]
+    with pytest.raises(wildcity.ProtocolError, match=r"damaged\[1\].reason is missing"):
+        wildcity.actors()
+
+
 def test_an_asset_of_an_actor(server: str, tmp_path: Path) -> None:
-    assert wildcity.actors(server=server) == ()
+    assert wildcity.actors(server=server) == wildcity.ActorList(())
     path = write_ply(tmp_path / "thing.ply", 0.0, 6, count=500)
     seen: list[PushProgress] = []
     thing = wildcity.push_actor(path, name="thing", kind="object", record="f32", server=server, progress=seen.append)
@@ -186,7 +202,7 @@ def test_an_asset_of_an_actor(server: str, tmp_path: Path) -> None:
     assert thing.provenance.options == ("axes=identity", "scale=1", "gaussians=200000")
     assert [seen[0].state, seen[-1].state] == ["uploading", "ready"]
     assert wildcity.push_actor(path, name="thing", kind="object", record="f32", server=server) == thing
-    assert wildcity.actors(server=server) == (thing,)
+    assert wildcity.actors(server=server) == wildcity.ActorList((thing,))
     assert wildcity.actor("thing", server=server) == wildcity.actor(thing.hash[:8], server=server) == thing
 
     for change, code, field in [

@@ -1,9 +1,8 @@
 //! Assets of actors: what other vehicles and pedestrians are drawn from.
 
 use reqwest::Method;
-use serde::Deserialize;
 
-use wildcity_protocol::http::{ActorAsset, NewActor};
+use wildcity_protocol::http::{ActorAsset, ActorList, NewActor};
 
 use crate::http::{HttpClient, HttpError};
 use crate::limits;
@@ -19,17 +18,12 @@ impl HttpClient {
         self.request_json_within(Method::POST, &path, Some(actor), limits::ACTOR_TIMEOUT).await
     }
 
-    /// All assets of the server, in order of name and hash.
+    /// All assets of the server, and those that are damaged.
     ///
     /// # Errors
     /// The server refuses, or does not answer.
-    pub async fn actors(&self) -> Result<Vec<ActorAsset>, HttpError> {
-        #[derive(Deserialize)]
-        struct Listed {
-            actors: Vec<ActorAsset>,
-        }
-        let listed: Listed = self.request_json(Method::GET, &["v1", "actors"], None::<&()>).await?;
-        Ok(listed.actors)
+    pub async fn actors(&self) -> Result<ActorList, HttpError> {
+        self.request_json(Method::GET, &["v1", "actors"], None::<&()>).await
     }
 
     /// The asset of a name, of a hash, or of a hash that begins with at least 4 digits.

@@ -50,9 +50,9 @@ pub use observation::{ImageView, Observation};
 pub use options::ConnectOptions;
 pub use wildcity_protocol as protocol;
 pub use wildcity_protocol::http::{
-    ActorAsset, ActorBox, ActorClass, ActorLevel, ActorProvenance, AllCells, CellReport,
-    CellSelection, NewActor, NewPush, PreviewRequest, Push, PushFile, PushReport, PushState,
-    Upload,
+    ActorAsset, ActorBox, ActorClass, ActorLevel, ActorList, ActorProvenance, AllCells, CellReport,
+    CellSelection, DamagedActor, NewActor, NewPush, PreviewRequest, Push, PushFile, PushReport,
+    PushState, Upload,
 };
 pub use wildcity_protocol::message::{
     Action, BranchPoint, Drive, DrivePose, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,

@@ -54,6 +54,31 @@ impl ActorClass {
     }
 }
 
+/// The assets of a server: the answer to `GET /v1/actors`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct ActorList {
+    /// Those that can be read, in order of name and hash.
+    pub actors: Vec<ActorAsset>,
+    /// The others, in order of hash.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub damaged: Vec<DamagedActor>,
+}
+
+/// An asset that differs from what was stored, or cannot be read; or a folder of assets that cannot be listed.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct DamagedActor {
+    /// Its hash, 64 hex digits; of a folder, the two digits that the hashes of its assets begin with.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = "^[0-9a-f]{2}([0-9a-f]{62})?$")))]
+    pub hash: String,
+    /// The name that it states, if that can be read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+    /// What is wrong, for people.
+    pub reason: String,
+}
+
 /// An asset of an actor: the answer to `POST /v1/actors` and `GET /v1/actors/{actor}`, and an entry of
 /// `GET /v1/actors`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

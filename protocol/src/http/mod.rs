@@ -7,9 +7,12 @@ mod actor;
 use serde::{Deserialize, Serialize};
 
 use crate::error::Code;
-use crate::message::Pose;
+use crate::message::{Pose, TwinInfo};
 
-pub use actor::{ActorAsset, ActorBox, ActorClass, ActorLevel, ActorProvenance, NewActor};
+pub use actor::{
+    ActorAsset, ActorBox, ActorClass, ActorLevel, ActorList, ActorProvenance, DamagedActor,
+    NewActor,
+};
 
 /// `POST /v1/uploads`: announces a file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -302,6 +305,27 @@ pub struct PsnrPreview {
     /// PSNR over all images of the pose, in dB. Absent if the images are equal.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub psnr_db: Option<f64>,
+}
+
+/// The twins of a server that a token may use: the answer to `GET /v1/twins`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct TwinList {
+    /// Those that can be opened, in order of name.
+    pub twins: Vec<TwinInfo>,
+    /// The others, in order of name.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub damaged: Vec<DamagedTwin>,
+}
+
+/// A twin whose latest version cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct DamagedTwin {
+    /// Its name.
+    pub name: String,
+    /// What is wrong, for people.
+    pub reason: String,
 }
 
 /// A version of a twin: an entry of `GET /v1/twins/{twin}/versions`.

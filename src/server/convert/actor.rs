@@ -1,7 +1,5 @@
 //! Assets of actors.
 
-use serde_json::{Value, json};
-
 use crate::fault::Fault;
 use wildcity_protocol::http;
 use wildcity_push::{AssetRequest, AssetSettings, limits};
@@ -37,21 +35,19 @@ pub(crate) fn new_actor(body: &[u8]) -> Result<AssetRequest, Fault> {
 }
 
 /// The body of `GET /v1/actors`.
-pub(crate) fn actors(list: &ActorList, with_provenance: bool) -> Value {
-    let actors: Vec<Value> = list.actors.iter().map(|one| actor(one, with_provenance)).collect();
-    if list.damaged.is_empty() {
-        return json!({ "actors": actors });
-    }
-    let damaged = |DamagedActor { hash, name, reason }: &DamagedActor| match name {
-        Some(name) => json!({ "hash": hash, "name": name, "reason": reason }),
-        None => json!({ "hash": hash, "reason": reason }),
+pub(crate) fn actors(list: &ActorList, with_provenance: bool) -> http::ActorList {
+    let damaged = |damaged: &DamagedActor| {
+        let DamagedActor { hash, name, reason } = damaged.clone();
+        http::DamagedActor { hash, name, reason }
     };
-    let damaged: Vec<Value> = list.damaged.iter().map(damaged).collect();
-    json!({ "actors": actors, "damaged": damaged })
+    http::ActorList {
+        actors: list.actors.iter().map(|one| actor(one, with_provenance)).collect(),
+        damaged: list.damaged.iter().map(damaged).collect(),
+    }
 }
 
 /// An asset. Its provenance may name a twin.
-pub(crate) fn actor(actor: &StoredActor, with_provenance: bool) -> Value {
+pub(crate) fn actor(actor: &StoredActor, with_provenance: bool) -> http::ActorAsset {
     let description = &actor.description;
     let ActorBox { length_m, width_m, height_m } = description.box_;
     let Provenance { source, builder, options } = description.provenance.clone();
@@ -61,7 +57,7 @@ pub(crate) fn actor(actor: &StoredActor, with_provenance: bool) -> Value {
         error_m: level.error_m,
         bytes: level.bytes.into(),
     };
-    json!(http::ActorAsset {
+    http::ActorAsset {
         hash: actor.hash.clone(),
         name: description.name.clone(),
         class: match description.class {
@@ -77,5 +73,5 @@ pub(crate) fn actor(actor: &StoredActor, with_provenance: bool) -> Value {
         record: actor.record.to_string(),
         bytes: actor.bytes,
         levels: actor.levels.iter().map(level).collect(),
-    })
+    }
 }

@@ -9,6 +9,7 @@ use crate::config::Limits as ServerLimits;
 use crate::fault::Fault;
 use crate::memory::{MemoryPlace, SharedMemory};
 use crate::sessions::ClosedSession;
+use wildcity_protocol::http;
 use wildcity_protocol::limits::MEMORY_SLOTS;
 use wildcity_protocol::message::{
     self, Answer, Limits, Opened, RigCamera, ServerInfo, TrajectoryInfo, TwinInfo,
@@ -248,14 +249,15 @@ pub(crate) fn closed(
 }
 
 /// The body of `GET /v1/twins`.
-pub(crate) fn twins(list: &TwinSummaries) -> serde_json::Value {
-    let twins: Vec<_> = list.twins.iter().map(|twin| twin_info(twin)).collect();
-    if list.damaged.is_empty() {
-        return serde_json::json!({ "twins": twins });
+pub(crate) fn twins(list: &TwinSummaries) -> http::TwinList {
+    let damaged = |damaged: &DamagedSummary| {
+        let DamagedSummary { name, reason } = damaged.clone();
+        http::DamagedTwin { name, reason }
+    };
+    http::TwinList {
+        twins: list.twins.iter().map(|twin| twin_info(twin)).collect(),
+        damaged: list.damaged.iter().map(damaged).collect(),
     }
-    let damaged = |DamagedSummary { name, reason }: &DamagedSummary| serde_json::json!({ "name": name, "reason": reason });
-    let damaged: Vec<_> = list.damaged.iter().map(damaged).collect();
-    serde_json::json!({ "twins": twins, "damaged": damaged })
 }
 
 /// The body of `GET /v1/twins/{twin}`: one twin.

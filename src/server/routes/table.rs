@@ -227,8 +227,8 @@ pub(super) fn guarded() -> Vec<Row> {
         op(Get, "/v1/episodes/{episode}/mcap", ADMIN, "An episode that ended as MCAP.")
             .answers(200, Other("application/vnd.mcap"))
             .does(episodes::mcap),
-        op(Get, "/v1/twins", ANY, "The latest version of every twin.")
-            .answers(200, List("twins", "answer#TwinInfo"))
+        op(Get, "/v1/twins", ANY, "The latest version of every twin, and the damaged twins.")
+            .answers(200, Json("twins"))
             .does(twins::list),
         op(Get, "/v1/twins/{twin}", ANY, "The latest version of a twin.")
             .answers(200, Json("answer#TwinInfo"))
@@ -291,8 +291,8 @@ pub(super) fn guarded() -> Vec<Row> {
         op(Delete, "/v1/uploads/{id}", PUSH, "Removes an upload.")
             .answers(204, Content::None)
             .does(uploads::delete),
-        op(Get, "/v1/actors", ANY, "All assets of actors, in order of name and hash.")
-            .answers(200, List("actors", "actor"))
+        op(Get, "/v1/actors", ANY, "All assets of actors, and the damaged ones.")
+            .answers(200, Json("actors"))
             .does(actors::list),
         op(
             Get,
@@ -300,7 +300,7 @@ pub(super) fn guarded() -> Vec<Row> {
             ANY,
             "The asset of an actor of this name, or of a hash that begins so.",
         )
-        .answers(200, Json("actor"))
+        .answers(200, Json("actors#ActorAsset"))
         .does(actors::show),
         op(
             Post,
@@ -309,7 +309,7 @@ pub(super) fn guarded() -> Vec<Row> {
             "Makes an asset of an actor from uploads; 200 instead if it is there already.",
         )
         .takes(Json("new_actor"))
-        .answers(201, Json("actor"))
+        .answers(201, Json("actors#ActorAsset"))
         .does(actors::push),
         op(Get, "/metrics", ADMIN, "Metrics for Prometheus.")
             .answers(200, Other("application/openmetrics-text"))

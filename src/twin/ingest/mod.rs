@@ -201,19 +201,14 @@ impl Format {
         Ok(match start {
             [b'p', b'l', b'y', b'\n' | b'\r', ..] => Self::Ply,
             [b'N', b'G', b'S', b'P', ..] => Self::Spz,
-            [0x1f, 0x8b, ..] => Self::Gzip,
+            // The magic number, and the one method of compression.
+            [0x1f, 0x8b, 8, ..] => Self::Gzip,
             [b'P', b'K', 3, 4, ..] => Self::Zip,
             [b'g', b'l', b'T', b'F', ..] => Self::Glb,
             // Version 0.1, and two unused bytes.
             [0, 1, 0, 0, ..] => Self::Ksplat,
-            // A safetensors file starts with a length of eight bytes, at most three of which are
-            // not zero. So JSON has no zero among its first eight bytes, and safetensors has.
-            _ if start.trim_ascii_start().starts_with(b"{")
-                && !start.iter().take(8).any(|&b| b == 0) =>
-            {
-                Self::Json
-            }
-            _ if start.get(8) == Some(&b'{') => Self::Safetensors,
+            _ if is_json(start) => Self::Json,
+            _ if is_safetensors(start) => Self::Safetensors,
             // Last, because it has no magic number.
             _ if splat::is_likely(start) => Self::Splat,
             _ => {
@@ -222,6 +217,32 @@ impl Format {
             }
         })
     }
+}
+
+/// Whether a file that starts like this is an object of JSON: text that begins with a brace, and a name or another brace.
+/// A number of a `.splat` file may begin with the same bytes, but 64 bytes of numbers, colours and rotations are no
+/// text.
+fn is_json(start: &[u8]) -> bool {
+    let object = start.trim_ascii_start().strip_prefix(b"{").map(<[u8]>::trim_ascii_start);
+    object.is_some_and(|object| matches!(object, [] | [b'"' | b'}', ..]))
+        && is_text(&start[..start.len().min(64)])
+}
+
+/// Whether bytes are UTF-8 without control characters but white space. The last character may be cut.
+fn is_text(bytes: &[u8]) -> bool {
+    let is_utf8 = match std::str::from_utf8(bytes) {
+        Ok(_) => true,
+        Err(error) => error.error_len().is_none(),
+    };
+    is_utf8 && bytes.iter().all(|byte| !byte.is_ascii_control() || byte.is_ascii_whitespace())
+}
+
+/// Whether a file that starts like this is a safetensors file: a length of eight bytes, and so many bytes of JSON.
+fn is_safetensors(start: &[u8]) -> bool {
+    start.split_first_chunk().is_some_and(|(length, rest)| {
+        let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX);
+        is_json(&rest[..rest.len().min(length)])
+    })
 }
 
 /// Size of the read buffer, in bytes.

@@ -94,8 +94,11 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// The record does not exist, or the backend cannot rename.
     fn set_record_aside(&self, name: &str, number: u64) -> Result<PathBuf, StoreError>;
 
-    /// All objects of a twin, in order of their hashes, and whatever else has the name of an object.
-    fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError>;
+    /// All objects of a twin, and whatever else has the name of an object.
+    ///
+    /// # Errors
+    /// Nothing can be listed. Parts that cannot be listed are in the result.
+    fn list_objects(&self, name: &str) -> Result<ObjectListing, StoreError>;
 
     /// Removes the objects that `which` returns. Where the backend has locks, publishing is locked
     /// from before `which` is called.
@@ -187,6 +190,38 @@ pub(super) struct HashedStart {
     pub(super) start: Vec<u8>,
     /// BLAKE3 of the whole object, 64 lower-case hex digits.
     pub(super) hash: String,
+}
+
+/// The objects of a twin.
+#[derive(Debug, Default)]
+pub(super) struct ObjectListing {
+    /// Those that were found, in order of their hashes.
+    pub(super) objects: Vec<ListedObject>,
+    /// The others.
+    pub(super) unlisted: Vec<UnlistedObjects>,
+}
+
+impl ObjectListing {
+    /// The objects. What is no folder has none.
+    ///
+    /// # Errors
+    /// The disk fails to list some.
+    pub(super) fn whole(self) -> Result<Vec<ListedObject>, StoreError> {
+        let is_failure = |one: &UnlistedObjects| matches!(one.error, StoreError::Io { .. });
+        match self.unlisted.into_iter().find(is_failure) {
+            None => Ok(self.objects),
+            Some(UnlistedObjects { error, .. }) => Err(error),
+        }
+    }
+}
+
+/// Objects that cannot be listed: one, or all of a folder.
+#[derive(Debug)]
+pub(super) struct UnlistedObjects {
+    /// The hash of the object, or the two digits that the hashes of a folder begin with.
+    pub(super) digits: String,
+    /// [`StoreError::Io`] if the disk fails, [`StoreError::Damaged`] if the folder is none.
+    pub(super) error: StoreError,
 }
 
 /// An object in a listing.

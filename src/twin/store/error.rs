@@ -107,14 +107,9 @@ pub enum StoreError {
         known: Vec<String>,
     },
     /// An asset differs from what was stored, or cannot be read.
-    #[error(
-        "the actor {}{} is damaged: {reason}; store it again, or remove it with `wildcity actor remove {}`",
-        hash.get(..12).unwrap_or(hash),
-        name.as_ref().map(|name| format!(" ({name:?})")).unwrap_or_default(),
-        hash.get(..12).unwrap_or(hash)
-    )]
+    #[error("{}", damaged_actor(hash, name.as_deref(), reason))]
     ActorDamaged {
-        /// Its hash, 64 lower-case hex digits.
+        /// Its hash, 64 lower-case hex digits; or only two, if the folder of all hashes that begin with them is none.
         hash: String,
         /// The name that it states, if that can be read. It may be damaged, too.
         name: Option<String>,
@@ -316,6 +311,19 @@ impl StoreError {
         let path = path.to_owned();
         move |cause| Self::Io { action, path, cause }
     }
+}
+
+fn damaged_actor(hash: &str, name: Option<&str>, reason: &str) -> String {
+    let Some(digits) = hash.get(..12) else {
+        return format!(
+            "no actor whose hash begins with {hash} can be read: {reason}; mend it in the store"
+        );
+    };
+    let name = name.map(|name| format!(" ({name:?})")).unwrap_or_default();
+    format!(
+        "the actor {digits}{name} is damaged: {reason}; store it again, or remove it with \
+         `wildcity actor remove {digits}`"
+    )
 }
 
 fn known_twins(known: &[String]) -> String {

@@ -79,7 +79,7 @@ impl Catalog {
     ) -> Result<FsckReport, StoreError> {
         check_name(name)?;
         // Listed first, so that objects committed meanwhile are not reported as left over.
-        let listed = self.objects.list_objects(name)?;
+        let listed = self.objects.list_objects(name)?.whole()?;
         let numbers = self.numbers(name)?;
         let present: BTreeSet<u64> = numbers.iter().copied().collect();
         let last = numbers[numbers.len() - 1];

@@ -166,7 +166,7 @@ impl Catalog {
         let grace_us = i64::try_from(keep.grace.as_micros()).unwrap_or(i64::MAX);
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
         let mut plan = CollectionPlan::default();
-        for object in self.objects.list_objects(name)? {
+        for object in self.objects.list_objects(name)?.whole()? {
             if !object.is_file || named.contains(&object.hash) {
                 continue;
             }

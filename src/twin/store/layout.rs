@@ -41,6 +41,11 @@ pub(super) fn is_hash(text: &str) -> bool {
     text.len() == 64 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }
 
+/// Whether a text is two lower-case hex digits, the name of a folder of objects.
+pub(super) fn is_prefix(text: &str) -> bool {
+    text.len() == 2 && text.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
+}
+
 /// Checks that a side file is small enough to be read again.
 ///
 /// # Errors

@@ -69,6 +69,9 @@ async fn the_others_are_listed_pushed_and_driven_among() {
         assert_eq!((damaged.len(), &damaged[0]["hash"]), (1, &json!(bad)), "{listed:?}");
         assert!(damaged[0]["reason"].as_str().unwrap().contains(why), "{listed:?}");
         assert_eq!(damaged[0].get("name"), is_name_known.then_some(&json!("bad")));
+        let seen_by_client = client.actors().await.unwrap();
+        assert_eq!(json!(seen_by_client.damaged), listed.body["damaged"]);
+        assert_eq!(seen_by_client.actors.len(), names.len());
         assert_eq!(get(&server, "/v1/actors/good").await.body["hash"], good);
 
         // By its hash, its digits, and its name where that can be read.
@@ -91,6 +94,22 @@ async fn the_others_are_listed_pushed_and_driven_among() {
             drives(&mut agent, asset).await;
         }
     }
+    // A folder of assets that is none, and the digits of what was in it.
+    let folder = path.parent().unwrap();
+    std::fs::remove_dir_all(folder).unwrap();
+    std::os::unix::fs::symlink(folder, folder).unwrap();
+    let listed = client.actors().await.unwrap();
+    assert!(listed.actors.iter().any(|actor| actor.hash == good));
+    assert_eq!((listed.damaged.len(), &*listed.damaged[0].hash), (1, &bad[..2]), "{listed:?}");
+    assert!(listed.damaged[0].reason.contains("it is not a directory"), "{listed:?}");
+    assert!(!listed.damaged[0].reason.contains('/'), "{listed:?}");
+    get(&server, &format!("/v1/actors/{bad}")).await.refused(500, "twin_damaged");
+    for asset in ["good", &good] {
+        drives(&mut server.agent().await, asset).await;
+    }
+    std::fs::remove_file(folder).unwrap();
+    std::fs::create_dir(folder).unwrap();
+    std::fs::write(&path, "damaged").unwrap();
     // A name that a damaged asset states is free; the same push again repairs it.
     assert_eq!(pushed(&client, "bad", 2).await, bad);
     assert_eq!(std::fs::read(&path).unwrap(), whole);

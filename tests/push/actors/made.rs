@@ -54,7 +54,7 @@ async fn a_pushed_asset_is_that_of_an_import() {
     let small = post(&server, "/v1/actors", &asked).await;
     assert_eq!(small.status, 201, "{small:?}");
 
-    let listed = client.actors().await.unwrap();
+    let listed = client.actors().await.unwrap().actors;
     let names: Vec<&str> = listed.iter().map(|actor| &*actor.name).collect();
     assert_eq!(names, ["small", "thing"]);
     for text in ["thing", &wanted.hash, &wanted.hash[..8]] {

@@ -45,7 +45,7 @@ async fn a_client_that_goes_away_leaves_nothing() {
     assert!(text.lines().last().unwrap().contains("the push was cancelled"), "{text}");
     // Sent again, it is made; by then the threads of the first are done, and have stored nothing.
     let made = client.push_actor(&actor_of("large", &[&id])).await.unwrap();
-    let listed = client.actors().await.unwrap();
+    let listed = client.actors().await.unwrap().actors;
     assert_eq!((listed.len(), &listed[0].hash), (1, &made.hash));
 }
 

@@ -6,7 +6,17 @@ in SI units, or have their unit in their name. Frames and conventions are in `pr
 
 from importlib.metadata import version as _version
 
-from .assets import ActorAsset, ActorBox, ActorLevel, ActorProvenance, actor, actors, push_actor
+from .assets import (
+    ActorAsset,
+    ActorBox,
+    ActorLevel,
+    ActorList,
+    ActorProvenance,
+    DamagedActor,
+    actor,
+    actors,
+    push_actor,
+)
 from .errors import (
     BadFrame,
     Code,
@@ -80,6 +90,7 @@ __all__ = [
     "ActorAsset",
     "ActorBox",
     "ActorLevel",
+    "ActorList",
     "ActorProvenance",
     "AxisNoise",
     "BadFrame",
@@ -88,6 +99,7 @@ __all__ = [
     "Client",
     "Code",
     "ConnectFailed",
+    "DamagedActor",
     "Disconnected",
     "Drive",
     "DrivePose",

@@ -65,6 +65,27 @@ class ActorAsset:
     provenance: ActorProvenance | None = None
 
 
+@dataclass(frozen=True)
+class DamagedActor:
+    """An asset that differs from what was stored or cannot be read, or a folder of assets that cannot be listed.
+
+    hash: of a folder, the two digits that the hashes of its assets begin with.
+    name: the name that it states, if that can be read.
+    """
+
+    hash: str
+    reason: str
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class ActorList:
+    """The assets of a server in order of name and hash, and those that are damaged."""
+
+    actors: tuple[ActorAsset, ...]
+    damaged: tuple[DamagedActor, ...] = ()
+
+
 def push_actor(
     files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
@@ -115,14 +136,17 @@ def push_actor(
 
 def actors(
     *, server: str = "http://127.0.0.1:8080", token: str | None = None, timeout: float = 60.0
-) -> tuple[ActorAsset, ...]:
-    """All assets of a server, in order of name and hash.
+) -> ActorList:
+    """All assets of a server, and those that are damaged.
 
     Raises `Refused` if the server refuses, and `ConnectFailed` if it does not answer.
     """
-    answer = HttpClient(server, token, timeout).json("GET", "/v1/actors", None)
-    listed = decode(dict, answer, "actors").get("actors")
-    return tuple(_actor(actor, f"actors[{index}]") for index, actor in enumerate(decode(list, listed, "actors")))
+    answer = decode(dict, HttpClient(server, token, timeout).json("GET", "/v1/actors", None), "the list of actors")
+    listed = decode(list, answer.get("actors"), "actors")
+    return ActorList(
+        tuple(_actor(actor, f"actors[{index}]") for index, actor in enumerate(listed)),
+        decode(tuple[DamagedActor, ...], answer.get("damaged", []), "damaged"),
+    )
 
 
 def actor(

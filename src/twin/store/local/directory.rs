@@ -53,6 +53,28 @@ impl Local {
         Ok(OpenObject { path, file, bytes })
     }
 
+    /// Names in a folder of objects, sorted; none if it was removed.
+    ///
+    /// # Errors
+    /// The disk fails to list it; [`StoreError::Damaged`] if it is no folder.
+    pub(super) fn names_in_folder(&self, dir: &Path) -> Result<Vec<String>, StoreError> {
+        let cause = match self.disk.list(dir) {
+            Ok(mut names) => {
+                names.sort_unstable();
+                return Ok(names);
+            }
+            Err(cause) => cause,
+        };
+        match self.disk.info(dir) {
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+            Ok(found) if !found.is_dir => {
+                let reason = "it is not a directory".to_owned();
+                Err(StoreError::Damaged { path: dir.to_owned(), reason })
+            }
+            _ => Err(StoreError::io("list", dir)(cause)),
+        }
+    }
+
     /// Removes the objects of a twin that `named` does not contain.
     pub(super) fn remove_unnamed(
         &self,

@@ -15,9 +15,13 @@ use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::backend::{HashedStart, ListedObject, ObjectBackend, Staging};
+use super::backend::{
+    HashedStart, ListedObject, ObjectBackend, ObjectListing, Staging, UnlistedObjects,
+};
 use super::disk::{FileInfo, Lock, Wait};
-use super::layout::{ACTORS, LOCK_ENDING, check_hash, check_side_file, is_hash, log_numbers};
+use super::layout::{
+    ACTORS, LOCK_ENDING, check_hash, check_side_file, is_hash, is_prefix, log_numbers,
+};
 
 pub(super) use directory::Local;
 pub(super) use disk_cache::DiskCache;
@@ -183,24 +187,35 @@ impl ObjectBackend for Local {
         Ok(aside)
     }
 
-    fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
+    fn list_objects(&self, name: &str) -> Result<ObjectListing, StoreError> {
         let objects = self.root.join(name).join("objects");
-        let mut listed = Vec::new();
-        for prefix in entries(&*self.disk, &objects)? {
-            for hash in entries(&*self.disk, &objects.join(&prefix))? {
-                let path = objects.join(&prefix).join(&hash);
-                let found = match self.disk.info(&path) {
+        let mut listing = ObjectListing::default();
+        // No object lies in a folder of another name.
+        for prefix in entries(&*self.disk, &objects)?.into_iter().filter(|name| is_prefix(name)) {
+            let dir = objects.join(&prefix);
+            let hashes = match self.names_in_folder(&dir) {
+                Ok(hashes) => hashes,
+                Err(error) => {
+                    listing.unlisted.push(UnlistedObjects { digits: prefix, error });
+                    continue;
+                }
+            };
+            for hash in hashes.into_iter().filter(|name| is_hash(name)) {
+                let path = dir.join(&hash);
+                match self.disk.info(&path) {
+                    Ok(FileInfo { bytes, modified_us: written_us, is_file, .. }) => {
+                        listing.objects.push(ListedObject { hash, bytes, is_file, written_us });
+                    }
                     // It was removed in between.
-                    Err(error) if error.kind() == ErrorKind::NotFound => continue,
-                    found => found.map_err(StoreError::io("find", &path))?,
-                };
-                if is_hash(&hash) {
-                    let FileInfo { bytes, modified_us: written_us, is_file, .. } = found;
-                    listed.push(ListedObject { hash, bytes, is_file, written_us });
+                    Err(error) if error.kind() == ErrorKind::NotFound => {}
+                    Err(cause) => {
+                        let error = StoreError::io("find", &path)(cause);
+                        listing.unlisted.push(UnlistedObjects { digits: hash, error });
+                    }
                 }
             }
         }
-        Ok(listed)
+        Ok(listing)
     }
 
     fn remove_objects(

@@ -22,7 +22,7 @@ use crate::limits;
 use wildcity_scene::rig::is_name;
 
 use super::StoreError;
-use super::backend::{HashedStart, ListedObject, ObjectBackend, Staging};
+use super::backend::{HashedStart, ListedObject, ObjectBackend, ObjectListing, Staging};
 use super::disk::Lock;
 use super::layout::{check_side_file, is_hash, log_numbers, object_key, record_key};
 
@@ -185,7 +185,7 @@ impl ObjectBackend for Remote {
         Ok(())
     }
 
-    fn list_objects(&self, name: &str) -> Result<Vec<ListedObject>, StoreError> {
+    fn list_objects(&self, name: &str) -> Result<ObjectListing, StoreError> {
         let key = format!("{name}/objects");
         let store = self.store.clone();
         let at = self.key(&key);
@@ -199,9 +199,9 @@ impl ObjectBackend for Remote {
             let written_us = found.last_modified.timestamp_micros();
             Some(ListedObject { hash, bytes: found.size, is_file: true, written_us })
         });
-        let mut listed: Vec<ListedObject> = listed.collect();
-        listed.sort_unstable_by(|a, b| a.hash.cmp(&b.hash));
-        Ok(listed)
+        let mut objects: Vec<ListedObject> = listed.collect();
+        objects.sort_unstable_by(|a, b| a.hash.cmp(&b.hash));
+        Ok(ObjectListing { objects, unlisted: Vec::new() })
     }
 
     fn remove_objects(
