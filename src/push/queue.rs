@@ -90,6 +90,12 @@ impl PushQueue {
         self.entries.lock().open_count()
     }
 
+    /// A value that is another one when a push has begun or ended since.
+    pub fn changes(&self) -> (u64, usize) {
+        let entries = self.entries.lock();
+        (entries.begun, entries.open_count())
+    }
+
     /// The push of an id: a known one, or a new one with the files that `files` returns. A known push that
     /// failed is begun again. `files` is only called for a new push, because the uploads of a known one may
     /// have been removed.

@@ -113,6 +113,8 @@ pub struct Limits {
     /// Bytes of memory that all twins in use may take; three quarters of the machine's memory if there
     /// is no value.
     pub resident_bytes: Option<u64>,
+    /// Time between two returns of free memory to the operating system, while sections are evicted or pushes run.
+    pub memory_release: Duration,
     /// Limits of uploads.
     pub spool: SpoolLimits,
 }
@@ -160,6 +162,7 @@ impl Default for Limits {
             push_memory_bytes: None,
             push: wildcity_push::limits::CHECK_TIMEOUT,
             resident_bytes: None,
+            memory_release: limits::MEMORY_RELEASE,
             spool: SpoolLimits::default(),
         }
     }

@@ -48,15 +48,22 @@ async fn renew_leases(state: &ServerState) {
     }
 }
 
-/// Gives memory that sections and pushes no longer need back to the operating system, until dropped.
-async fn release_memory() {
+/// Gives memory that evicted sections and pushes no longer need back to the operating system, until dropped.
+async fn release_memory(state: &ServerState) {
+    let changes = || (state.engine.residency().evictions, state.pushes.changes());
+    let mut before = changes();
     loop {
-        tokio::time::sleep(limits::MEMORY_RELEASE).await;
-        let began = Instant::now();
-        if tokio::task::spawn_blocking(wildcity_heap::release_free_memory).await.is_err() {
-            tracing::error!("free memory was not released: a task crashed");
+        tokio::time::sleep(state.limits.memory_release).await;
+        let now = changes();
+        if now == before && state.pushes.open_count() == 0 {
+            continue;
         }
-        tracing::debug!(took = ?began.elapsed(), "released free memory");
+        before = now;
+        let began = Instant::now();
+        match tokio::task::spawn_blocking(wildcity_heap::release_free_memory).await {
+            Ok(()) => tracing::debug!(took = ?began.elapsed(), "released free memory"),
+            Err(_) => tracing::error!("free memory was not released: a task crashed"),
+        }
     }
 }
 
@@ -78,7 +85,7 @@ impl Running {
                 () = periodic.sessions.end_expired() => {}
                 () = remove_old_uploads(&periodic) => {}
                 () = renew_leases(&periodic) => {}
-                () = release_memory() => {}
+                () = release_memory(&periodic) => {}
                 () = reloading => {}
                 () = periodic.stopped() => {}
             }

@@ -1,9 +1,12 @@
 //! `wildcity push`, as users run it.
 
+use std::fs::{self, File};
 use std::process::Command;
+use std::time::{Duration, Instant};
 
 use crate::http::{get, in_cell, write};
-use crate::support::TestServer;
+use crate::served::Served;
+use crate::support::{self, TestServer};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_file_is_pushed_and_reported() {
@@ -39,6 +42,33 @@ async fn a_file_is_pushed_and_reported() {
     let done = tokio::task::block_in_place(|| run(&["--cells", "x"]));
     assert!(!done.status.success());
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 3);
+}
+
+#[test]
+fn a_push_is_followed_by_a_release_of_memory() {
+    let dir = tempfile::tempdir().unwrap();
+    let log = dir.path().join("log");
+    let twins = support::twins();
+    let at = twins.path().as_os_str().to_owned();
+    let filter = "warn,wildcity_server::shutdown=debug";
+    let server = Served::logging(filter, &at, twins, |command| {
+        command.args(["--memory-release-s", "0.05"]).stderr(File::create(&log).unwrap())
+    });
+    let releases = || fs::read_to_string(&log).unwrap().matches("released free memory").count();
+    std::thread::sleep(Duration::from_millis(500));
+    assert_eq!(releases(), 0, "nothing was evicted or pushed");
+
+    let block = write(dir.path(), "block.ply", &in_cell([0, 0], 40, 1));
+    let url = format!("http://{}", server.address);
+    let mut push = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+    push.arg("push").arg(block).args(["--twin", "test", "--cells", "0,0", "--server", &url]);
+    let pushed = push.output().unwrap();
+    assert!(pushed.status.success(), "{pushed:?}");
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while releases() == 0 {
+        assert!(Instant::now() < deadline, "no memory was released");
+        std::thread::sleep(Duration::from_millis(20));
+    }
 }
 
 /// Runs `wildcity actor` with some arguments. Returns whether it succeeded, and what it said.

@@ -36,9 +36,19 @@ impl Served {
         dir: tempfile::TempDir,
         change: impl FnOnce(&mut Command) -> &mut Command,
     ) -> Self {
+        Self::logging("warn", twins, dir, change)
+    }
+
+    /// As [`Served::at`], with a filter of its log.
+    pub(crate) fn logging(
+        filter: &str,
+        twins: &OsStr,
+        dir: tempfile::TempDir,
+        change: impl FnOnce(&mut Command) -> &mut Command,
+    ) -> Self {
         let episodes = tempfile::tempdir().unwrap();
         let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
-        command.args(["serve", "--listen", "127.0.0.1:0", "--log", "warn", "--threads", "1"]);
+        command.args(["serve", "--listen", "127.0.0.1:0", "--threads", "1", "--log", filter]);
         let mut child = change(&mut command)
             .arg("--twins")
             .arg(twins)

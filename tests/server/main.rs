@@ -22,7 +22,6 @@ mod bundles;
 mod damaged_twin;
 mod drives;
 mod ego;
-mod heap;
 mod http;
 mod leases;
 mod many;

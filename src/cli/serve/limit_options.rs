@@ -72,6 +72,10 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().drain.as_secs_f64(), value_parser = seconds)]
     drain_timeout_s: f64,
 
+    /// Seconds between two returns of free memory to the system, while Gaussians are evicted or pushes run.
+    #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().memory_release.as_secs_f64(), value_parser = seconds)]
+    memory_release_s: f64,
+
     /// Uploads that are kept at once, finished or not.
     #[arg(long, value_name = "N", default_value_t = SpoolLimits::default().uploads, value_parser = count())]
     max_uploads: usize,
@@ -110,6 +114,7 @@ impl LimitOptions {
             push_memory_bytes: self.push_memory_gib.map(bytes_of_gib),
             push: seconds(self.push_timeout_s),
             resident_bytes,
+            memory_release: seconds(self.memory_release_s),
             spool: SpoolLimits {
                 uploads: self.max_uploads,
                 upload_bytes: bytes_of_gib(self.upload_gib),
