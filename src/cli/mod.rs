@@ -22,6 +22,7 @@ mod directories;
 mod doctor;
 mod drive;
 mod episode;
+mod eval;
 mod exit;
 mod import;
 mod input_files;
@@ -30,6 +31,7 @@ mod limits;
 mod lod;
 mod map;
 mod output;
+mod placement;
 mod profile_options;
 mod progress;
 mod push;
@@ -80,6 +82,7 @@ enum Command {
     Twin(twin::Twin),
     Actor(actor::Actor),
     Render(render::Render),
+    Eval(Box<eval::Eval>),
     Repair(repair::Repair),
     Drive(drive::Drive),
     Alpasim(alpasim::Alpasim),
@@ -113,6 +116,7 @@ pub fn main() -> ExitCode {
         Command::Twin(command) => command.run(),
         Command::Actor(command) => command.run(),
         Command::Render(command) => command.run(),
+        Command::Eval(command) => command.run(),
         Command::Repair(command) => command.run(),
         Command::Drive(command) => command.run(),
         Command::Alpasim(command) => command.run(),
@@ -193,8 +197,8 @@ mod tests {
                 assert_eq!(names, expected.1, "{path} --{}", argument.get_long().unwrap());
             }
         }
-        // serve, import, render, bench step, bisect; and push instead of serve.
-        assert_eq!(counts, [5, 5]);
+        // serve, import, render, eval, bench step, bisect; and push instead of serve.
+        assert_eq!(counts, [6, 6]);
     }
 
     #[test]

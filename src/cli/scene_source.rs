@@ -12,6 +12,7 @@ use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::ingest;
 use wildcity_twin::ingest::cameras::{self, ListedCamera};
 use wildcity_twin::residency::{Cache, PinnedScene, Resident};
+use wildcity_twin::store::Version;
 
 use super::directories::{TwinVersion, Twins};
 use super::profile_options::{LoadedProfile, ProfileOptions};
@@ -25,7 +26,7 @@ pub(super) struct SceneSource {
     #[arg(value_name = "SCENE")]
     scene: String,
 
-    /// JSON list of cameras, in the scene's own axes and metres: name, width, height, fx, fy, cx, cy
+    /// JSON list of cameras, or one a line, in the scene's own axes and metres: name, width, height, fx, fy, cx, cy
     /// (pixels), position (or position_ply), R_world_to_cam (rotation matrix by rows), and optionally
     /// near (metres).
     #[arg(long, value_name = "FILE")]
@@ -52,7 +53,7 @@ pub(super) struct Shot {
 }
 
 /// Where scenes come from.
-enum Source {
+pub(super) enum Source {
     /// A file: always drawn at full detail.
     File(Scene),
     /// A twin: drawn with as much detail as the cameras need.
@@ -79,14 +80,48 @@ impl Deref for FrameScene<'_> {
 }
 
 impl Source {
-    fn scene(&self, shots: &[Shot]) -> anyhow::Result<FrameScene<'_>> {
-        let views: Vec<View> = shots.iter().map(|shot| shot.view).collect();
-        Ok(match (self, shots) {
-            (Self::Twin(resident), [first, ..]) => FrameScene::Needed(
-                resident.scene(&wildcity_session::viewpoints(&views), &first.profile)?,
-            ),
-            (Self::Twin(_), []) => FrameScene::Whole(Cow::default()),
-            (Self::File(scene), _) => FrameScene::Whole(Cow::Borrowed(scene)),
+    /// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file the default.
+    pub(super) fn open(scene: &str, twins: &Twins) -> anyhow::Result<(Self, RenderProfile)> {
+        let path = Path::new(scene);
+        // Pipes and devices count as files, so that the reader refuses them by name. A directory does
+        // not: it may have the same name as a twin.
+        if path.exists() && !path.is_dir() {
+            let bar = progress::bytes("reading");
+            let gaussians = ingest::read(path, &mut progress::show(&bar))
+                .with_context(|| format!("{}", path.display()))?;
+            bar.finish_and_clear();
+            let scene = Scene::from_gaussians(&gaussians);
+            return Ok((Self::File(scene), RenderProfile::default()));
+        }
+        let named: TwinVersion = scene.parse().map_err(anyhow::Error::msg)?;
+        let cache = Cache::new(twins.catalog()?);
+        let resident = cache.open(&named.name, named.number).with_context(|| {
+            format!("SCENE {scene:?} is not a file, and cannot be opened as a twin")
+        })?;
+        let profile = resident.version.manifest.profile;
+        Ok((Self::Twin(resident), profile))
+    }
+
+    /// The version of the twin; `None` for a file.
+    pub(super) fn version(&self) -> Option<&Version> {
+        match self {
+            Self::Twin(resident) => Some(&resident.version),
+            Self::File(_) => None,
+        }
+    }
+
+    /// What a frame of these views draws.
+    pub(super) fn scene(
+        &self,
+        views: &[View],
+        profile: &RenderProfile,
+    ) -> anyhow::Result<FrameScene<'_>> {
+        Ok(match self {
+            Self::Twin(_) if views.is_empty() => FrameScene::Whole(Cow::default()),
+            Self::Twin(resident) => {
+                FrameScene::Needed(resident.scene(&wildcity_session::viewpoints(views), profile)?)
+            }
+            Self::File(scene) => FrameScene::Whole(Cow::Borrowed(scene)),
         })
     }
 }
@@ -94,12 +129,14 @@ impl Source {
 impl LoadedScene {
     /// The scene of a frame that has one shot.
     pub(super) fn scene_of(&self, shot: &Shot) -> anyhow::Result<FrameScene<'_>> {
-        self.source.scene(std::slice::from_ref(shot))
+        self.source.scene(&[shot.view], &shot.profile)
     }
 
     /// The scene of a frame that has all shots.
     pub(super) fn scene(&self) -> anyhow::Result<FrameScene<'_>> {
-        self.source.scene(&self.shots)
+        let views: Vec<View> = self.shots.iter().map(|shot| shot.view).collect();
+        let profile = self.shots.first().map_or(RenderProfile::DEFAULT, |shot| shot.profile);
+        self.source.scene(&views, &profile)
     }
 }
 
@@ -109,32 +146,10 @@ impl SceneSource {
         let listed =
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
         let changes = self.profile.load()?;
-        let (source, profile) = self.source()?;
+        let (source, profile) = Source::open(&self.scene, &self.twins)?;
         let shots = listed.into_iter().map(|camera| shot(camera, profile, &changes));
         let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
         Ok(LoadedScene { source, shots })
-    }
-
-    /// Reads the scene, with the profile that belongs to it: the twin's, or for a file the default.
-    fn source(&self) -> anyhow::Result<(Source, RenderProfile)> {
-        let path = Path::new(&self.scene);
-        // Pipes and devices count as files, so that the reader refuses them by name. A directory does
-        // not: it may have the same name as a twin.
-        if path.exists() && !path.is_dir() {
-            let bar = progress::bytes("reading");
-            let gaussians = ingest::read(path, &mut progress::show(&bar))
-                .with_context(|| format!("{}", path.display()))?;
-            bar.finish_and_clear();
-            let scene = Scene::from_gaussians(&gaussians);
-            return Ok((Source::File(scene), RenderProfile::default()));
-        }
-        let named: TwinVersion = self.scene.parse().map_err(anyhow::Error::msg)?;
-        let cache = Cache::new(self.twins.catalog()?);
-        let resident = cache.open(&named.name, named.number).with_context(|| {
-            format!("SCENE {:?} is not a file, and cannot be opened as a twin", self.scene)
-        })?;
-        let profile = resident.version.manifest.profile;
-        Ok((Source::Twin(resident), profile))
     }
 }
 
@@ -145,7 +160,7 @@ fn shot(
     mut profile: RenderProfile,
     changes: &LoadedProfile,
 ) -> anyhow::Result<Shot> {
-    let ListedCamera { name, camera, world_from_camera, near } = camera;
+    let ListedCamera { name, camera, world_from_camera, near, .. } = camera;
     profile.near = near.unwrap_or(profile.near);
     let profile = changes.apply(profile).with_context(|| format!("camera {name:?}"))?;
     Ok(Shot { name, view: View::new(camera, world_from_camera), profile })

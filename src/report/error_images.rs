@@ -2,6 +2,7 @@
 
 use super::error::ReportError;
 use wildcity_render::compare::errors::Image;
+use wildcity_render::compare::heat::{HEAT_RGB, heat_rgb};
 
 /// The window in which a setting has its largest error.
 #[derive(Clone, Debug, Default)]
@@ -17,10 +18,6 @@ pub struct ErrorImages {
 /// Errors that have the colours of [`HEAT_RGB`], in colour values from 0 to 1: below the first it is black,
 /// from the last on white. Steps of a factor of four, from a quarter of a step of 8 bits.
 pub(super) const HEAT_STEPS: [f32; 6] = [1e-3, 4e-3, 1.6e-2, 6.4e-2, 0.256, 1.0];
-
-/// Colours from dark to light, so that the map also reads without colour vision.
-pub(super) const HEAT_RGB: [[u8; 3]; 6] =
-    [[0, 0, 0], [52, 15, 92], [140, 32, 110], [215, 76, 60], [250, 160, 40], [252, 253, 191]];
 
 impl ErrorImages {
     /// Encodes an image and its reference, which has the same size, with the map of their error.
@@ -56,10 +53,5 @@ fn heat(error: f32) -> [u8; 3] {
     let Some(low) = HEAT_STEPS.iter().rposition(|step| error >= *step) else { return HEAT_RGB[0] };
     let Some(next_step) = HEAT_STEPS.get(low + 1) else { return HEAT_RGB[low] };
     let share = (error / HEAT_STEPS[low]).ln() / (next_step / HEAT_STEPS[low]).ln();
-    let mix = |channel: usize| {
-        let from = f32::from(HEAT_RGB[low][channel]);
-        let to = f32::from(HEAT_RGB[low + 1][channel]);
-        (from + share * (to - from)).round() as u8
-    };
-    [0, 1, 2].map(mix)
+    heat_rgb(low as f32 + share)
 }

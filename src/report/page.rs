@@ -4,13 +4,14 @@ use data_encoding::BASE64;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::error::ReportError;
-use super::error_images::{ErrorImages, HEAT_RGB, HEAT_STEPS};
+use super::error_images::{ErrorImages, HEAT_STEPS};
 use super::measurement::Measurement;
 use super::recommend::{Goal, Recommendation, pareto_front};
 use super::report::Report;
 use super::sample_points::OFFSETS_M;
 use super::setting::Family;
 use super::{feature_costs, plots};
+use wildcity_render::compare::heat::HEAT_RGB;
 use wildcity_stress::Verdict;
 
 const STYLE: &str = "\
@@ -135,7 +136,8 @@ fn error_against_time_caption() -> Markup {
              setting beats in both error and time. Settings that another one beats are grey. Values \
              are compared before they are rounded to 8 bits, which alone leaves 59 dB; settings that \
              change the encoding are compared after decoding. In the table, least PSNR is that of \
-             one camera's window at one sample point, where it is least."
+             one camera's window at one sample point, where it is least. SSIM is that of RGB, over \
+             windows within the image (scikit-image with Gaussian weights)."
         }
     }
 }

@@ -48,6 +48,7 @@ mod crash;
 mod demo;
 mod devices;
 mod episode;
+mod eval;
 mod garbage;
 mod generate;
 mod import;

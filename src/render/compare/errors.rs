@@ -5,6 +5,7 @@ use serde::Serialize;
 
 use super::json_numbers::serialize_number;
 use crate::compare::psnr::psnr_db;
+use crate::compare::ssim::Ssim;
 
 /// Errors of a set of images. Values are those of colour, clamped to [0, 1] as displayed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -12,7 +13,7 @@ pub struct ImageErrors {
     /// Peak signal-to-noise ratio of all values together, in dB; infinite if none differs.
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
-    /// Mean structural similarity (SSIM) of the images' luma; 1 if nothing differs.
+    /// Mean structural similarity of the images ([`Ssim::within`]); 1 if nothing differs.
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
     /// Largest error of a value.
@@ -150,71 +151,12 @@ impl ErrorAccumulator {
     }
 }
 
-/// Edge of SSIM's window, in pixels (Wang et al. 2004).
-const WINDOW: usize = 11;
-/// Standard deviation of SSIM's window.
-const SIGMA_PX: f64 = 1.5;
-/// Wang et al. 2004: C1 is `(0.01 L)²` and C2 `(0.03 L)²`, for values from 0 to L = 1.
-const C1: f64 = 1e-4;
-const C2: f64 = 9e-4;
-
-/// Mean structural similarity (Wang et al. 2004) of luma over all windows within the image. An image smaller
-/// than a window is one window.
-pub fn ssim(image: &Image, truth: &Image) -> f64 {
-    let [width, height] = image.size_px.map(|px| px as usize);
-    let a = luma(&image.rgb);
-    let b = luma(&truth.rgb);
-    let products = |x: &[f64], y: &[f64]| x.iter().zip(y).map(|(x, y)| x * y).collect::<Vec<_>>();
-    let mean = |values: &[f64]| smooth(values, width, height);
-    let mean_a = mean(&a);
-    let mean_b = mean(&b);
-    let square_a = mean(&products(&a, &a));
-    let square_b = mean(&products(&b, &b));
-    let mixed = mean(&products(&a, &b));
-    let at = |i: usize| {
-        let ma = mean_a[i];
-        let mb = mean_b[i];
-        let va = square_a[i] - ma * ma;
-        let vb = square_b[i] - mb * mb;
-        let covariance = mixed[i] - ma * mb;
-        (2.0 * ma * mb + C1) * (2.0 * covariance + C2) / ((ma * ma + mb * mb + C1) * (va + vb + C2))
-    };
-    (0..mean_a.len()).map(at).sum::<f64>() / mean_a.len() as f64
-}
-
-/// Luma by the weights of ITU-R BT.601.
-fn luma(rgb: &[f32]) -> Vec<f64> {
-    let weights = [0.299, 0.587, 0.114];
-    let pixel = |rgb: &[f32]| rgb.iter().zip(weights).map(|(&v, w)| w * f64::from(v)).sum();
-    rgb.chunks_exact(3).map(pixel).collect()
-}
-
-/// Weighted means over all windows within the image: along rows first, then along columns.
-fn smooth(values: &[f64], width: usize, height: usize) -> Vec<f64> {
-    let across = weights(WINDOW.min(width));
-    let down = weights(WINDOW.min(height));
-    let columns = width + 1 - across.len();
-    let rows = height + 1 - down.len();
-    let sum = |weights: &[f64], at: &dyn Fn(usize) -> f64| {
-        weights.iter().enumerate().map(|(k, weight)| weight * at(k)).sum::<f64>()
-    };
-    let mut within_rows = Vec::with_capacity(columns * height);
-    for row in values.chunks_exact(width) {
-        within_rows.extend((0..columns).map(|x| sum(&across, &|k| row[x + k])));
-    }
-    let cell = |i: usize| sum(&down, &|k| within_rows[i + k * columns]);
-    (0..columns * rows).map(cell).collect()
-}
-
-/// Weights of a 1D Gaussian window of `count` pixels, with sum 1.
-fn weights(count: usize) -> Vec<f64> {
-    let at = |k: usize| {
-        let off = k as f64 - 0.5 * (count - 1) as f64;
-        (-0.5 * (off / SIGMA_PX).powi(2)).exp()
-    };
-    let weights: Vec<f64> = (0..count).map(at).collect();
-    let sum: f64 = weights.iter().sum();
-    weights.into_iter().map(|weight| weight / sum).collect()
+/// [`Ssim::within`] of two images. An image smaller than a window has none, and is compared with mirrored edges.
+fn ssim(image: &Image, truth: &Image) -> f64 {
+    let [a, b] =
+        [image, truth].map(|image| image.rgb.iter().map(|&v| v.into()).collect::<Vec<f64>>());
+    let ssim = Ssim::of(&a, &b, image.size_px, None);
+    if ssim.within.is_nan() { ssim.mirrored } else { ssim.within }
 }
 
 #[cfg(test)]
@@ -274,30 +216,5 @@ mod tests {
         let two = ramp.averaged([2, 1]);
         assert!((two.rgb[3] - 0.7).abs() < 1e-6, "{}", two.rgb[3]);
         assert_eq!(ramp.averaged([3, 1]).rgb, ramp.rgb);
-    }
-
-    #[test]
-    fn ssim_depends_on_structure_more_than_on_brightness() {
-        let truth = striped(4, 0.0);
-        let mut brighter = truth.clone();
-        brighter.rgb.iter_mut().for_each(|value| *value += 0.05);
-        let [brighter, noisy, other] =
-            [brighter, striped(4, 0.05), striped(5, 0.0)].map(|image| ssim(&image, &truth));
-        assert!(brighter > 0.97 && brighter < 1.0, "{brighter}");
-        assert!(noisy < brighter && noisy > 0.5 && other < 0.6, "{noisy}, {other}");
-    }
-
-    /// One window of two values each, by hand: means 0.5 and 0.25, variances 0.25 and 0.0625, covariance
-    /// 0.125, so (0.25 + C1)(0.25 + C2) / ((0.3125 + C1)(0.3125 + C2)).
-    #[test]
-    fn ssim_of_a_single_window() {
-        let image = |high: f32| Image {
-            size_px: [2, 1],
-            rgb: vec![0.0, 0.0, 0.0, high, high, high],
-            depth_m: vec![1.0; 2],
-            opacity: vec![1.0; 2],
-        };
-        let wanted = (0.25 + C1) * (0.25 + C2) / ((0.3125 + C1) * (0.3125 + C2));
-        assert!((ssim(&image(1.0), &image(0.5)) - wanted).abs() < 1e-7);
     }
 }

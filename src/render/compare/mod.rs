@@ -4,14 +4,18 @@
 //! |---|---|
 //! | [`gaussians`] | small scenes, written as lists of [`GaussianSpec`](gaussians::GaussianSpec) |
 //! | [`images`] | all images of a view by a backend, parts of images, and [`agree`](images::agree): whether two backends drew the same |
-//! | [`psnr`] | peak signal-to-noise ratio |
+//! | [`psnr`], [`ssim`], [`flip`] | measures of one pair of images, as other packages compute them |
 //! | [`errors`] | PSNR, SSIM, largest errors and depth errors over many images |
+//! | [`heat`] | colours of error maps |
 //! | [`reprojection`] | how far known points are from their pixels |
 //! | [`json_numbers`] | numbers that JSON lacks (infinity, NaN) |
 
 pub mod errors;
+pub mod flip;
 pub mod gaussians;
+pub mod heat;
 pub mod images;
 pub mod json_numbers;
 pub mod psnr;
 pub mod reprojection;
+pub mod ssim;

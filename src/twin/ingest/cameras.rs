@@ -1,4 +1,4 @@
-//! Camera lists: JSON files of views in the scene's own axes.
+//! Camera lists: JSON files of views in the scene's own axes, and perhaps of their images.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -25,6 +25,10 @@ pub struct ListedCamera {
     pub world_from_camera: Pose,
     /// The smallest z that it draws, if the list says one, in units of the scene.
     pub near: Option<f64>,
+    /// File of the image that it took, if the list says one, relative to the list.
+    pub image: Option<String>,
+    /// File of the image's mask, likewise.
+    pub mask: Option<String>,
 }
 
 /// Why a camera list was refused.
@@ -35,7 +39,7 @@ pub enum CamerasError {
     File(#[from] FileError),
     /// The JSON is not a camera list.
     #[error(
-        "not a camera list: {0}; it is one object, or a list of objects, with name, width, height, \
+        "not a camera list: {0}; it is one object, one a line, or a list of objects, with name, width, height, \
          fx, fy, cx, cy, R_world_to_cam (3 rows), and position or position_ply"
     )]
     Json(serde_json::Error),
@@ -124,13 +128,15 @@ struct Entry {
     exposure: Option<IgnoredAny>,
     overlay: Option<IgnoredAny>,
     near: Option<f64>,
+    image: Option<String>,
+    mask: Option<String>,
     position: Option<[f64; 3]>,
     position_ply: Option<[f64; 3]>,
     #[serde(rename = "R_world_to_cam")]
     rotation: [[f64; 3]; 3],
 }
 
-/// Reads a camera list.
+/// Reads a camera list: one object, one object a line (JSON Lines), or a list of objects.
 ///
 /// A camera's axes are x right, y down, z forward: `p_camera = R_world_to_cam (p - position)`.
 ///
@@ -139,7 +145,7 @@ struct Entry {
 pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     let text = file::read_whole(path, limits::CAMERA_LIST_BYTES)?;
     let one_or_many = match text.trim_ascii_start().first() {
-        Some(b'{') => serde_json::from_slice(&text).map(|entry| vec![entry]),
+        Some(b'{') => serde_json::Deserializer::from_slice(&text).into_iter().collect(),
         _ => serde_json::from_slice(&text),
     };
     let entries: Vec<Entry> = one_or_many.map_err(CamerasError::Json)?;
@@ -164,7 +170,8 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
 }
 
 fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
-    let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, .. } = entry;
+    let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, image, mask, .. } =
+        entry;
     let of_rigs = [
         ("shutter", entry.shutter.is_some()),
         ("exposure", entry.exposure.is_some()),
@@ -206,5 +213,5 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     };
     let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
-    Ok(ListedCamera { name, camera, world_from_camera, near })
+    Ok(ListedCamera { name, camera, world_from_camera, near, image, mask })
 }

@@ -29,6 +29,7 @@ struct Transforms {
 struct Frame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
+    mask_path: Option<String>,
     #[serde(flatten)]
     intrinsics: Intrinsics,
 }
@@ -43,6 +44,15 @@ struct Intrinsics(BTreeMap<String, Value>);
 /// # Errors
 /// The error names the file, the line or the field, and what to do.
 pub fn read(path: &Path) -> Result<Vec<PosedImage>, CaptureError> {
+    let masked = read_masked(path)?;
+    Ok(masked.into_iter().map(|(image, _)| image).collect())
+}
+
+/// The same with the mask of each image (`mask_path`), if it has one.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_masked(path: &Path) -> Result<Vec<(PosedImage, Option<String>)>, CaptureError> {
     let inside = path.join("transforms.json");
     let path = if path.is_dir() { inside.as_path() } else { path };
     let text = read_whole(path, limits::CAPTURE_BYTES)
@@ -58,7 +68,11 @@ pub fn read(path: &Path) -> Result<Vec<PosedImage>, CaptureError> {
         return Err(CaptureError::at(path, place, "there is no frame: give a file with frames"));
     }
     let frames = file.frames.into_iter().enumerate();
-    frames.map(|(index, frame)| posed(path, index, frame, &file.intrinsics)).collect()
+    let masked = |(index, mut frame): (usize, Frame)| {
+        let mask = frame.mask_path.take();
+        Ok((posed(path, index, frame, &file.intrinsics)?, mask))
+    };
+    frames.map(masked).collect()
 }
 
 fn posed(

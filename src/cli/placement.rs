@@ -40,15 +40,21 @@ impl Placement {
             Some(twin) => {
                 let catalog = self.twins.catalog()?;
                 let version = catalog.version(&twin.name, twin.number)?;
-                let about = || format!("twin {} version {}", twin.name, version.number);
-                check_lineage(&catalog, &version).with_context(about)?;
-                of_provenance(&version.manifest.provenance).with_context(about)
+                of_version(&catalog, &version)
             }
         }
     }
 }
 
-fn imported(axes: &str, scale: f64) -> anyhow::Result<Alignment> {
+/// The change of a version's axes and unit since its files were imported.
+pub(super) fn of_version(catalog: &Catalog, version: &Version) -> anyhow::Result<Alignment> {
+    let about = || format!("twin {} version {}", version.manifest.twin, version.number);
+    check_lineage(catalog, version).with_context(about)?;
+    of_provenance(&version.manifest.provenance).with_context(about)
+}
+
+/// The change of axes and unit of `--axes` and `--scale`.
+pub(super) fn imported(axes: &str, scale: f64) -> anyhow::Result<Alignment> {
     let parsed: Axes = axes.parse()?;
     let alignment = parsed.scaled(scale)?.alignment();
     alignment.with_context(|| {
@@ -66,13 +72,15 @@ fn check_lineage(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
     let mut number = version.number;
     while let Some(parent) = parent_of(number).filter(|parent| *parent < number) {
         let before = catalog.version(twin, Some(parent)).with_context(|| {
-            format!("it was made from version {parent}, which cannot be read: give --axes and --scale in place of --twin")
+            format!(
+                "it was made from version {parent}, which cannot be read: give --axes and --scale"
+            )
         })?;
         let before = before.manifest.provenance.options;
         anyhow::ensure!(
             options.starts_with(&before),
             "version {number} was pushed, and does not say how version {parent} was imported and aligned: name an older \
-             version, or give --axes and --scale in place of --twin"
+             version, or give --axes and --scale"
         );
         options = before;
         number = parent;
@@ -92,7 +100,7 @@ fn of_provenance(provenance: &Provenance) -> anyhow::Result<Alignment> {
             [] => Ok(default.to_owned()),
             [value] => Ok(value.to_owned()),
             _ => anyhow::bail!(
-                "its files were imported with different {key}: give --axes and --scale in place of --twin"
+                "its files were imported with different {key}: give --axes and --scale"
             ),
         }
     };

@@ -1,7 +1,5 @@
 //! `wildcity route from-colmap` and `wildcity route from-nerfstudio`.
 
-mod placement;
-
 use std::io::{self, Write};
 use std::path::PathBuf;
 
@@ -12,7 +10,7 @@ use wildcity_twin::ingest::capture;
 
 use super::files::to_json;
 use crate::cli::output;
-use placement::Placement;
+use crate::cli::placement::Placement;
 
 /// Make a drive and a rig of the camera poses of a COLMAP model.
 ///

@@ -1,0 +1,151 @@
+//! The held-out images: their files, masks and cameras.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+
+use wildcity_scene::align::PosedImage;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_twin::ingest::{self, cameras, capture};
+
+/// A real image and its camera.
+pub(super) struct HeldOutImage {
+    /// Its name in the list.
+    pub(super) name: String,
+    pub(super) file: PathBuf,
+    pub(super) mask: Option<PathBuf>,
+    pub(super) camera: Camera,
+    /// In the axes and unit of the list.
+    pub(super) world_from_camera: Pose,
+    /// The smallest z that it draws, if the list says one, in units of the scene.
+    pub(super) near: Option<f64>,
+}
+
+/// Real images, in the order of their names.
+pub(super) struct ImageList {
+    images: Vec<HeldOutImage>,
+    /// Whether the poses are in the axes of the scene; else they are in those of a capture.
+    pub(super) is_in_scene_axes: bool,
+}
+
+/// An image of a list.
+struct ListedImage {
+    posed: PosedImage,
+    mask: Option<String>,
+    near: Option<f64>,
+}
+
+/// A list before its files are looked for.
+struct Listed {
+    images: Vec<ListedImage>,
+    /// The folder that names are in, unless another one is given.
+    folder: PathBuf,
+    /// As [`ImageList::is_in_scene_axes`].
+    is_in_scene_axes: bool,
+}
+
+impl ImageList {
+    /// Reads the list and finds the files.
+    ///
+    /// # Errors
+    /// The list cannot be read, or an image or a mask is missing.
+    pub(super) fn read(
+        source: &Path,
+        image_dir: Option<&Path>,
+        masks: Option<&Path>,
+    ) -> anyhow::Result<Self> {
+        let Listed { images, folder, is_in_scene_axes } =
+            read(source).with_context(|| format!("--images {}", source.display()))?;
+        let folder = image_dir.unwrap_or(&folder);
+        let mut found = Vec::with_capacity(images.len());
+        for ListedImage { posed, mask, near } in images {
+            let PosedImage { name, camera, world_from_camera } = posed;
+            let file = image_file(folder, &name)?;
+            let mask = match (masks, mask) {
+                (Some(masks), _) => Some(mask_file(masks, &name)?),
+                (None, Some(mask)) => Some(folder.join(mask)),
+                (None, None) => None,
+            };
+            found.push(HeldOutImage { name, file, mask, camera, world_from_camera, near });
+        }
+        found.sort_by(|a, b| a.name.cmp(&b.name));
+        Ok(Self { images: found, is_in_scene_axes })
+    }
+
+    /// Every `step`-th image, beginning with the first.
+    pub(super) fn every(&self, step: usize) -> Vec<&HeldOutImage> {
+        self.images.iter().step_by(step).collect()
+    }
+}
+
+fn read(source: &Path) -> anyhow::Result<Listed> {
+    let beside = source.parent().unwrap_or(Path::new("")).to_owned();
+    let is_dir = source.is_dir();
+    if is_dir && !source.join("transforms.json").is_file() {
+        let images = capture::read_colmap(source)?;
+        let listed = |posed| ListedImage { posed, mask: None, near: None };
+        let images = images.into_iter().map(listed).collect();
+        return Ok(Listed { images, folder: colmap_images(source), is_in_scene_axes: false });
+    }
+    if is_dir || has_frames(source)? {
+        let images = capture::read_nerfstudio_masked(source)?;
+        let listed = |(posed, mask)| ListedImage { posed, mask, near: None };
+        let images = images.into_iter().map(listed).collect();
+        let folder = if is_dir { source.to_owned() } else { beside };
+        return Ok(Listed { images, folder, is_in_scene_axes: false });
+    }
+    let listed = cameras::read(source)?.into_iter().map(|listed| {
+        let name = listed.image.unwrap_or(listed.name);
+        let cameras::ListedCamera { camera, world_from_camera, mask, near, .. } = listed;
+        ListedImage { posed: PosedImage { name, camera, world_from_camera }, mask, near }
+    });
+    Ok(Listed { images: listed.collect(), folder: beside, is_in_scene_axes: true })
+}
+
+/// Whether a JSON file has the field `frames`, as transforms.json has.
+fn has_frames(path: &Path) -> anyhow::Result<bool> {
+    #[derive(Deserialize)]
+    struct Frames {
+        frames: Option<IgnoredAny>,
+    }
+    let text = ingest::read_whole(path, wildcity_twin::limits::CAPTURE_BYTES)?;
+    // serde would read a list as the fields of an object in their order.
+    let is_object = text.trim_ascii_start().first() == Some(&b'{');
+    let parsed: Result<Frames, serde_json::Error> = serde_json::from_slice(&text);
+    Ok(is_object && parsed.is_ok_and(|file| file.frames.is_some()))
+}
+
+/// The folder `images` in that of the model or in one of the two above, as COLMAP's workspaces have it.
+fn colmap_images(model: &Path) -> PathBuf {
+    let candidates = ["", "..", "../.."].map(|up| model.join(up).join("images"));
+    let [beside, ..] = &candidates;
+    candidates.iter().find(|dir| dir.is_dir()).unwrap_or(beside).clone()
+}
+
+/// The file of an image. instant-ngp's names have no extension.
+fn image_file(folder: &Path, name: &str) -> anyhow::Result<PathBuf> {
+    let named = folder.join(name);
+    let with = |extension: &str| PathBuf::from(format!("{}.{extension}", named.display()));
+    let candidates = [named.clone(), with("png"), with("jpg"), with("jpeg")];
+    candidates.into_iter().find(|file| file.is_file()).with_context(|| {
+        format!(
+            "there is no image {}: give the folder of the images as --image-dir",
+            named.display()
+        )
+    })
+}
+
+/// The mask of an image: with its name, with .png in place of its extension, or behind it, as COLMAP names masks.
+fn mask_file(masks: &Path, name: &str) -> anyhow::Result<PathBuf> {
+    let named = masks.join(name);
+    let appended = PathBuf::from(format!("{}.png", named.display()));
+    let candidates = [appended.clone(), named.with_extension("png"), named];
+    candidates.into_iter().find(|file| file.is_file()).with_context(|| {
+        format!(
+            "there is no mask {}: a mask for each image, white where it counts",
+            appended.display()
+        )
+    })
+}

@@ -1,0 +1,79 @@
+//! Small pictures of a pair for the page: the real image, the rendered one, and the map of their errors.
+
+use std::io::Cursor;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::imageops::{self, FilterType};
+use image::{ImageFormat, RgbImage};
+
+use super::pair::Pair;
+use wildcity_render::compare::heat::{HEAT_RGB, heat_rgb};
+
+/// Largest width of a picture on the page, in pixels. Three of them and their gaps are a page wide.
+const WIDTH_PX: u32 = 480;
+/// JPEG quality of the pictures on the page.
+const JPEG_QUALITY: u8 = 88;
+
+/// Pixels that do not count, in maps of errors.
+const UNCOUNTED_RGB: [u8; 3] = [120, 120, 120];
+
+/// JPEG files of at most 480 px of width.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Thumbnails {
+    /// The real image, the rendered one, and the map of their errors.
+    pub files: [Vec<u8>; 3],
+}
+
+impl Thumbnails {
+    /// Shrinks and encodes the pictures of a pair.
+    ///
+    /// # Errors
+    /// The encoder's message.
+    pub fn of(pair: &Pair, error_map: &[f32]) -> Result<Self, String> {
+        let picture = |rgb8: Vec<u8>| -> Result<Vec<u8>, String> {
+            let picture = picture(rgb8, pair.size_px())?;
+            let small = match picture.width() > WIDTH_PX {
+                true => {
+                    let height = (picture.height() * WIDTH_PX).div_ceil(picture.width());
+                    imageops::resize(&picture, WIDTH_PX, height, FilterType::Triangle)
+                }
+                false => picture,
+            };
+            let mut file = Vec::new();
+            let encoder = JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY);
+            small.write_with_encoder(encoder).map_err(|error| error.to_string())?;
+            Ok(file)
+        };
+        let files = [
+            picture(pair.truth().to_vec())?,
+            picture(pair.rendered().to_vec())?,
+            picture(colors(pair, error_map))?,
+        ];
+        Ok(Self { files })
+    }
+}
+
+/// The map of a pair's errors as a PNG file in full size.
+///
+/// # Errors
+/// The encoder's message.
+pub fn error_png(pair: &Pair, error_map: &[f32]) -> Result<Vec<u8>, String> {
+    let mut file = Cursor::new(Vec::new());
+    let picture = picture(colors(pair, error_map), pair.size_px())?;
+    picture.write_to(&mut file, ImageFormat::Png).map_err(|error| error.to_string())?;
+    Ok(file.into_inner())
+}
+
+/// Errors from 0 to 1 as colours; grey where pixels do not count.
+fn colors(pair: &Pair, error_map: &[f32]) -> Vec<u8> {
+    let last = (HEAT_RGB.len() - 1) as f32;
+    let color = |(pixel, error): (usize, &f32)| match pair.is_counted(pixel) {
+        true => heat_rgb(last * error),
+        false => UNCOUNTED_RGB,
+    };
+    error_map.iter().enumerate().flat_map(color).collect()
+}
+
+fn picture(rgb8: Vec<u8>, [width, height]: [u32; 2]) -> Result<RgbImage, String> {
+    RgbImage::from_raw(width, height, rgb8).ok_or_else(|| "the picture has another size".to_owned())
+}
