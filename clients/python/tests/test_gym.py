@@ -169,6 +169,39 @@ def test_a_scenario_that_cannot_be_driven_is_refused(server: Server, changes: di
     env.close()
 
 
+def sessions(server: Server) -> int:
+    """Sessions that the server holds, those without a connection too."""
+    lines = server.get("/metrics")[1].splitlines()
+    return int(next(line for line in lines if line.startswith("wildcity_sessions ")).split()[1])
+
+
+@pytest.mark.parametrize("kind", [DriveEnv, lambda **arguments: DriveVectorEnv(2, **arguments)])
+def test_a_refused_reset_leaves_no_session(server: Server, kind: Any) -> None:
+    without_dynamics = scenario(actors=[], ego={"start": {"trajectory": "log", "station_m": 0.0}})
+    env = kind(server=server.url, **{**SMALL, "scenario": without_dynamics})
+    before = sessions(server)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"no ego\.dynamics"):
+            env.reset(seed=1)
+    assert sessions(server) == before == 0
+    env.close()
+
+
+def test_an_error_of_one_environment_leaves_no_call_of_another_under_way(server: Server) -> None:
+    envs = DriveVectorEnv(4, server=server.url, **SMALL)
+    envs.reset(seed=1)
+    # The first action is refused before it is sent, while the others wait for their answers.
+    actions: Any = [np.zeros(3), STRAIGHT, STRAIGHT, STRAIGHT]
+    with pytest.raises(ValueError, match="too many values"):
+        envs.step(actions)
+    envs.step(np.zeros((4, 2), np.float32))
+    with pytest.raises(ValueError, match="too many values"):
+        envs.step(actions)
+    assert sessions(server) == 4
+    envs.close()
+    assert sessions(server) == 0
+
+
 def test_a_scenario_says_where_episodes_start(server: Server) -> None:
     env = DriveEnv(server=server.url, **{**SMALL, "scenario": scenario(actors=[])})
     assert env.reset(options={"start": Station("log", 3.0)})[1]["station_m"] == pytest.approx(3.0)
@@ -205,6 +238,26 @@ def test_starts_follow_the_seed(env: DriveEnv) -> None:
 def test_bad_arguments_are_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DriveConfig(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"trajectory": "log"},
+        {"dynamics": "kinematic"},
+        {"speed": 8.0},
+        {"off_route_m": 1.0},
+        {"start_m": (0.0, 5.0)},
+        {"waypoint_m": 2.0},
+        {"speed": 8.0, "trajectory": "log"},
+    ],
+)
+def test_arguments_of_a_drive_are_refused_with_a_scenario(changes: dict[str, Any]) -> None:
+    names = ", ".join(sorted(changes, reverse=True))
+    with pytest.raises(ValueError, match=f"scenario has no use for {names}:"):
+        DriveConfig(scenario="follow", **changes)
+    DriveConfig(**changes)
+    DriveConfig(scenario="follow", dt_us=50_000, horizon=10, speed=5.0)
 
 
 def test_unknown_cameras_are_refused_by_the_server(server: Server) -> None:

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sync import Client, Session, connect
+from ..sync import Session, connect
 from .task import DriveConfig, Seen, Task, task_of
 
 
@@ -27,7 +27,7 @@ class DriveEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self.observation_space = self.config.observation_space()
         self.action_space = self.config.action_space()
-        self._client: Client | None = None
+        self._open = contextlib.ExitStack()
         self._session: Session | None = None
         self._task: Task | None = None
         self._version: int | None = None
@@ -63,19 +63,19 @@ class DriveEnv(gymnasium.Env[Any, Any]):
 
     def close(self) -> None:
         """Ends session and connection."""
-        client = self._client
-        session = self._session
-        self._client = self._session = self._task = None
-        if client is not None:
-            # `Session.__exit__` closes the session if the connection still exists.
-            with client, session or contextlib.nullcontext():
-                pass
+        self._session = self._task = None
+        self._open.close()
 
     def _opened(self) -> tuple[Session, Task]:
         if self._session is None or self._task is None:
             config = self.config
-            self._client = connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token)
-            self._session = self._client.open(**config.open_options(self._client.welcome))
-            self._version = self._session.opened.version
-            self._task = task_of(config, self._session.opened)
+            # An error on the way closes what is open by then: the next call connects again.
+            with contextlib.ExitStack() as opening:
+                client = opening.enter_context(
+                    connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token)
+                )
+                session = opening.enter_context(client.open(**config.open_options(client.welcome)))
+                task = task_of(config, session.opened)
+                self._open = opening.pop_all()
+            self._session, self._task, self._version = session, task, session.opened.version
         return self._session, self._task

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,9 @@ ROUTE_M = 1000.0
 ROUTE_SPACING_M = 80 / 19
 """Distance between two points of a scenario's route."""
 
+OF_A_DRIVE = ("trajectory", "dynamics", "speed", "off_route_m", "start_m", "waypoint_m")
+"""Arguments of `DriveConfig` that a scenario replaces."""
+
 Seen = dict[str, NDArray[Any]]
 
 
@@ -74,7 +77,7 @@ class DriveConfig:
     server, token, timeout: as `wildcity.connect`.
     twin, version, trajectory: the twin and the recorded drive to follow; the latest version and the first drive if None.
     scenario: a scenario to drive in, as of `Client.open`. Route, start, dynamics and end are then those of the scenario,
-        and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m are not used.
+        and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m must have their defaults.
     rig, cameras, size: the rig (the twin's own if None), the cameras to see, and the (width, height) of each image.
     dynamics, speed, dt_us: the motion model, the speed at the start in m/s, the time of a step.
     horizon: steps after which an episode is truncated.
@@ -82,6 +85,8 @@ class DriveConfig:
     start_m: episodes start at a random distance along the drive within these two; the default ends 20 m before the end.
     waypoint_m: distance between two of the 20 points of the route ahead.
     reward: a function of the states before and after a step; `default_reward` if None.
+
+    Raises `ValueError` that names the argument.
     """
 
     server: str = "ws://127.0.0.1:8080/v1/session"
@@ -107,6 +112,11 @@ class DriveConfig:
         object.__setattr__(self, "cameras", tuple(self.cameras))
         if not self.cameras:
             raise ValueError("cameras is empty; name at least one camera")
+        if self.scenario is not None:
+            own = [one for one in fields(self) if one.name in OF_A_DRIVE]
+            given = [one.name for one in own if getattr(self, one.name) != one.default]
+            if given:
+                raise ValueError(f"scenario has no use for {', '.join(given)}: the scenario itself says these")
         if self.dynamics == "teleport":
             raise ValueError("dynamics is 'teleport'; actions need 'kinematic' or 'dynamic'")
         if self.horizon < 1:

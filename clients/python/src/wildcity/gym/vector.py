@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
@@ -154,16 +155,29 @@ class _Lane:
 
 
 async def _open_all(config: DriveConfig, count: int) -> list[_Lane]:
-    clients = await asyncio.gather(
-        *(connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token) for _ in range(count))
-    )
-    options = config.open_options(clients[0].welcome)
-    sessions = await asyncio.gather(*(client.open(**options) for client in clients))
-    return [
-        _Lane(client, session, task_of(config, session.opened))
-        for client, session in zip(clients, sessions, strict=True)
-    ]
+    # An error on the way closes what is open by then: the next call connects again.
+    async with contextlib.AsyncExitStack() as opening:
+
+        async def enter(work: Coroutine[Any, Any, contextlib.AbstractAsyncContextManager[T]]) -> T:
+            return await opening.enter_async_context(await work)
+
+        connecting = [
+            connect(config.server, name="wildcity-gym", timeout=config.timeout, token=config.token)
+            for _ in range(count)
+        ]
+        clients = await _gather([enter(one) for one in connecting])
+        options = config.open_options(clients[0].welcome)
+        sessions = await _gather([enter(client.open(**options)) for client in clients])
+        lanes = [
+            _Lane(client, session, task_of(config, session.opened))
+            for client, session in zip(clients, sessions, strict=True)
+        ]
+        opening.pop_all()
+    return lanes
 
 
 async def _gather(work: list[Coroutine[Any, Any, T]]) -> list[T]:
-    return list(await asyncio.gather(*work))
+    """The results of all. Raises the first error when all have ended, so that no call is under way after it."""
+    tasks = [asyncio.ensure_future(one) for one in work]
+    await asyncio.gather(*tasks, return_exceptions=True)
+    return [task.result() for task in tasks]
