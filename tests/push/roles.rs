@@ -177,7 +177,7 @@ async fn the_client_sends_its_token() {
     assert_eq!(driver.reset(0, None).await.unwrap().metadata().version, 2);
 }
 
-/// What a push did to the images is for all that may push to the twin, and for nobody else.
+/// What a push did to the images is for all tokens that may push to the twin, and for no other.
 #[tokio::test]
 async fn the_report_of_a_push_is_for_those_that_may_push() {
     let cpu = Arc::new(Cpu::new(1, Simd::Best).unwrap());
