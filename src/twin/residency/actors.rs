@@ -1,7 +1,8 @@
 //! Assets of actors in memory: one copy for all sessions.
 //!
 //! A scenario's assets are in memory from when it opens, with all levels of detail, until its last episode ends: no
-//! frame waits for an actor. They count against the memory of twins, and sections get what is left.
+//! frame waits for an actor. They count against the memory of twins, and sections get what is left. So do assets that
+//! a program makes and the store does not have.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -14,9 +15,9 @@ use super::resident::Shared;
 use crate::store::Catalog;
 use wildcity_scene::actor::ActorAsset;
 
-/// The assets in memory, by their hash.
+/// The assets in memory, by their hash, or by the key of one that is not in the store.
 #[derive(Debug, Default)]
-pub(super) struct ActorPool(Mutex<BTreeMap<String, Weak<ResidentActor>>>);
+pub(super) struct ActorPool(Mutex<Actors>);
 
 /// An asset in memory, until its last copy is dropped.
 #[derive(Debug)]
@@ -28,7 +29,7 @@ pub struct ResidentActor {
 }
 
 impl ResidentActor {
-    /// BLAKE3 of the asset, 64 lower-case hex digits.
+    /// BLAKE3 of the asset, 64 lower-case hex digits; of an asset that is not in the store, its key.
     pub fn hash(&self) -> &str {
         &self.hash
     }
@@ -52,21 +53,58 @@ impl ActorPool {
     ) -> Result<Arc<ResidentActor>, ResidencyError> {
         // Locked while reading, so that sessions that open at once do not read an asset twice.
         let mut actors = self.0.lock();
-        actors.retain(|_, actor| actor.strong_count() > 0);
-        if let Some(actor) = actors.get(hash).and_then(|actor| actor.upgrade()) {
-            return Ok(actor);
+        match present(&mut actors, hash) {
+            Some(actor) => Ok(actor),
+            None => add(&mut actors, shared, hash, catalog.actor(hash)?),
         }
-        let asset = catalog.actor(hash)?;
-        let bytes = asset.bytes();
-        let name = asset.description.name.clone();
-        let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes };
-        shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
-        shared.pager.with_table(|table| table.add_outside_bytes(bytes));
-        let shared = shared.clone();
-        let actor = Arc::new(ResidentActor { hash: hash.to_owned(), asset, claim, shared });
-        actors.insert(hash.to_owned(), Arc::downgrade(&actor));
-        Ok(actor)
     }
+
+    /// An asset that is not in the store, under a key that is no hash; the one of this key if there is one already.
+    ///
+    /// # Errors
+    /// [`ResidencyError::NoRoomForActor`].
+    pub(super) fn hold(
+        &self,
+        shared: &Arc<Shared>,
+        key: &str,
+        asset: ActorAsset,
+    ) -> Result<Arc<ResidentActor>, ResidencyError> {
+        let mut actors = self.0.lock();
+        match present(&mut actors, key) {
+            Some(actor) => Ok(actor),
+            None => add(&mut actors, shared, key, asset),
+        }
+    }
+}
+
+/// The assets of a pool.
+type Actors = BTreeMap<String, Weak<ResidentActor>>;
+
+/// The asset of a hash or a key, if it is in memory. Forgets those that are not any more.
+fn present(actors: &mut Actors, hash: &str) -> Option<Arc<ResidentActor>> {
+    actors.retain(|_, actor| actor.strong_count() > 0);
+    actors.get(hash).and_then(|actor| actor.upgrade())
+}
+
+/// Counts an asset against the memory of twins.
+///
+/// # Errors
+/// [`ResidencyError::NoRoomForActor`].
+fn add(
+    actors: &mut Actors,
+    shared: &Arc<Shared>,
+    hash: &str,
+    asset: ActorAsset,
+) -> Result<Arc<ResidentActor>, ResidencyError> {
+    let bytes = asset.bytes();
+    let name = asset.description.name.clone();
+    let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes };
+    shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
+    shared.pager.with_table(|table| table.add_outside_bytes(bytes));
+    let shared = shared.clone();
+    let actor = Arc::new(ResidentActor { hash: hash.to_owned(), asset, claim, shared });
+    actors.insert(hash.to_owned(), Arc::downgrade(&actor));
+    Ok(actor)
 }
 
 impl ResidencyError {
