@@ -125,3 +125,47 @@ impl Drop for ResidentActor {
         self.shared.budget.lock().release(&self.claim);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::residency::Cache;
+    use wildcity_scene::actor::AssetDescription;
+    use wildcity_scene::manifest::Provenance;
+    use wildcity_scene::{ActorBox, ActorClass, Gaussians};
+
+    fn asset() -> ActorAsset {
+        let gaussians = Gaussians {
+            sh_degree: 0,
+            means_m: vec![[0.0, 0.0, 1.0]],
+            quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
+            ln_scales: vec![[-2.0; 3]],
+            logit_opacities: vec![1.0],
+            sh: vec![0.0; 3],
+        };
+        let description = AssetDescription {
+            name: "box".to_owned(),
+            class: ActorClass::Object,
+            box_: ActorBox::PEDESTRIAN,
+            provenance: Provenance::of("test".to_owned()),
+        };
+        ActorAsset::new(&gaussians, description).unwrap()
+    }
+
+    #[test]
+    fn a_held_asset_is_counted_once_until_its_last_copy_is_dropped() {
+        let asset = asset();
+        let bytes = asset.bytes();
+        let dir = tempfile::tempdir().unwrap();
+        let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), Some(bytes));
+        let first = cache.hold_actor("4x2x1#808080", asset.clone()).unwrap();
+        let again = cache.hold_actor("4x2x1#808080", asset.clone()).unwrap();
+        assert!(Arc::ptr_eq(&first, &again));
+        assert_eq!(cache.stats().reserved_bytes, bytes);
+        let refused = cache.hold_actor("5x2x1#808080", asset.clone()).unwrap_err();
+        assert!(matches!(refused, ResidencyError::NoRoomForActor { .. }), "{refused}");
+        drop((first, again));
+        assert_eq!(cache.stats().reserved_bytes, 0);
+        assert!(cache.hold_actor("5x2x1#808080", asset).is_ok());
+    }
+}
