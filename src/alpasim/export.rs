@@ -1,13 +1,15 @@
 //! The files of a scene that AlpaSim's runtime reads itself: rig, cameras, tracks and map.
 //!
 //! The runtime reads them from a zip archive named `.usdz`. Poses are in the scene's local frame, so that
-//! `world_to_nre` is the identity. There is no mesh: the runtime's physics stays disabled.
+//! `world_to_nre` is the identity. There is no mesh: the runtime's physics is disabled, or that of this package.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use glam::{DMat4, DVec2, DVec3};
 use serde_json::{Value, json};
 
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::route::{Route, RouteError};
@@ -57,6 +59,20 @@ pub enum ExportError {
         /// The scene.
         scene: String,
     },
+    /// More recorded actors are there at once than an image may show.
+    #[error(
+        "{scene} has {count} recorded actors at {since_us} us; an image shows at most {most}: leave some out of the \
+         tracks, or choose other starts",
+        most = PlacedChunk::MAX_ACTORS
+    )]
+    Crowded {
+        /// The scene.
+        scene: String,
+        /// The first such time, in microseconds since the scene's start.
+        since_us: i64,
+        /// The actors at this time.
+        count: usize,
+    },
 }
 
 /// What a scene has beside its twin.
@@ -73,7 +89,7 @@ pub struct SceneContent<'a> {
 /// The files of a scene, by name. `hash` is that of the version's manifest.
 ///
 /// # Errors
-/// The manifest has no such scene, or it is too short, or a track is damaged.
+/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors are there at once.
 pub fn files(
     id: &SceneId,
     manifest: &Manifest,
@@ -103,6 +119,9 @@ pub fn files(
     let mut tracks = Vec::new();
     for section in sections {
         tracks.extend(track(section, start_us, &times_us, frame)?);
+    }
+    if let Some((since_us, count)) = crowded(&tracks) {
+        return Err(ExportError::Crowded { scene: id.to_string(), since_us, count });
     }
     Ok(vec![
         ("metadata.yaml", pretty(&metadata(id, hash, cameras, &poses))),
@@ -207,9 +226,19 @@ fn track(
         ActorClass::Bicycle => "bicycle",
         ActorClass::Object => "other",
     };
-    // AlpaSim fits a spline to the positions, which one pose has not.
+    // A spline needs at least two poses.
     let is_shown = poses.len() >= 2;
     Ok(is_shown.then_some(SceneTrack { id, label, size_m: section.size, poses }))
+}
+
+/// The first time, in microseconds since the scene's start, at which more actors are there than an image may show, and
+/// their number.
+fn crowded(tracks: &[SceneTrack]) -> Option<(i64, usize)> {
+    let mut counts: BTreeMap<i64, usize> = BTreeMap::new();
+    for (time_us, _) in tracks.iter().flat_map(|track| &track.poses) {
+        *counts.entry(time_us - limits::EPOCH_US as i64).or_default() += 1;
+    }
+    counts.into_iter().find(|&(_, count)| count > PlacedChunk::MAX_ACTORS)
 }
 
 /// One sequence with the tracks of a scene.
@@ -222,7 +251,7 @@ fn sequence_tracks(tracks: &[SceneTrack]) -> Value {
         "tracks_data": {
             "tracks_id": listed(&|track| json!(track.id)),
             "tracks_label_class": listed(&|track| json!(track.label)),
-            // Its motion may be another than the recorded one.
+            // The runtime may replace its recorded motion.
             "tracks_flags": listed(&|_| json!("CONTROLLABLE")),
             "tracks_timestamps_us": listed(&|track| json!(times(track))),
             "tracks_poses": listed(&|track| json!(poses(track))),
@@ -303,4 +332,27 @@ fn road(poses: &[(i64, Pose)]) -> String {
         left = lane(1),
         right = lane(-1),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_actors_at_once_than_an_image_shows_are_refused() {
+        let at = |since_us: i64| (limits::EPOCH_US as i64 + since_us, [0.0; 7]);
+        let track = |times_us: [i64; 2]| SceneTrack {
+            id: String::new(),
+            label: "other",
+            size_m: [1.0; 3],
+            poses: times_us.map(at).to_vec(),
+        };
+        let most = PlacedChunk::MAX_ACTORS;
+        let mut tracks: Vec<SceneTrack> = (0..most).map(|_| track([0, PERIOD_US])).collect();
+        // Not at the same time.
+        tracks.push(track([2 * PERIOD_US, 3 * PERIOD_US]));
+        assert_eq!(crowded(&tracks), None);
+        tracks.push(track([PERIOD_US, 2 * PERIOD_US]));
+        assert_eq!(crowded(&tracks), Some((PERIOD_US, most + 1)));
+    }
 }

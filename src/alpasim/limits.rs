@@ -18,12 +18,22 @@ pub const OPEN_SCENES: usize = 16;
 /// Images of one request: a minute of a rig of 16 cameras at 4 Hz would be 3,840.
 pub const BATCH_IMAGES: usize = 256;
 
-/// Dynamic objects whose assets stay in memory between requests.
-pub const OBJECT_ASSETS: usize = 512;
+/// Dynamic objects whose assets stay in memory between requests. A box has at most 1,280 Gaussians, which take about
+/// 160 kB with their coarser levels: 384 boxes take 61 MB. All assets count against the memory of twins.
+pub const OBJECT_ASSETS: usize = 384;
 
-/// Boxes that one request puts on the ground: a rollout of 20 s has 200 poses of the ego. At 1 ms each, for the
-/// longest drives, they take 4 s.
-pub const PHYSICS_BOXES: usize = 4096;
+/// Longest id of a track, in bytes.
+pub const TRACK_ID_BYTES: usize = 256;
+
+/// Longest message of a gRPC status, in bytes: HTTP/2 sends it as a header.
+pub const STATUS_BYTES: usize = 4096;
+
+/// Boxes that one request puts on the ground: a rollout of 20 s has 200 poses of the ego. At 1 ms each, for 170,000
+/// keyframes, they take 1 s.
+pub const PHYSICS_BOXES: usize = 1024;
+
+/// Requests that put boxes on the ground at once. Each takes a thread.
+pub const PHYSICS_REQUESTS: usize = 8;
 
 /// A box is moved by physics up to this far, in metres, as by AlpaSim's own service.
 pub const PHYSICS_TRANSLATION_M: f64 = 1.5;

@@ -21,19 +21,24 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{ActorBox, ActorClass, Gaussians, sh};
 
+use crate::limits;
+
 /// The box of an object of which nothing is known.
 const CAR: ActorBox = ActorBox { length_m: 4.6, width_m: 1.9, height_m: 1.6 };
 
 /// Red, green and blue of a box without a colour.
 const GREY: [u8; 3] = [128, 128, 128];
 
-/// Edge of a box's cells, in metres, and the most cells along an edge.
+/// Edge of a box's cells, in metres, and the most cells along an edge: a box has at most 1,280.
 const CELL_M: f64 = 0.1;
-const MOST_CELLS: f64 = 64.0;
+const MOST_CELLS: f64 = 16.0;
 
 /// Standard deviation of a cell's Gaussian, as a fraction of the cell's edge, and across the face, in metres.
 const OVERLAP: f64 = 0.66;
 const THICKNESS_M: f64 = 0.004;
+
+/// Characters of a long id that an error names.
+const NAMED: usize = 64;
 
 /// The logit of an opacity of 0.99.
 const LOGIT_OPACITY: f32 = 4.595;
@@ -43,7 +48,7 @@ const SHADES: [f64; 3] = [0.7, 0.85, 1.0];
 
 /// What an object is drawn from.
 #[derive(Clone, Debug, PartialEq)]
-pub enum ObjectLook {
+pub enum ObjectShape {
     /// An asset, by its hash or its name.
     Asset(String),
     /// A box.
@@ -57,27 +62,48 @@ pub enum ObjectLook {
     Unknown,
 }
 
-/// Why an id stands for nothing.
+/// Why a track id is invalid.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error(
     "dynamic_objects: track_id {id:?}: {reason}; expected NAME@ASSET, NAME@LxWxH or NAME@LxWxH#RRGGBB with metres, \
      or a NAME without @"
 )]
 pub struct ObjectError {
-    /// The refused id.
+    /// The refused id; of one that is too long, its first characters.
     pub id: String,
     /// What is wrong with it.
     pub reason: String,
 }
 
-impl ObjectLook {
+impl ObjectShape {
     /// What a track's id stands for.
     ///
     /// # Errors
-    /// What follows its `@` is no name, and no size that an actor may have.
+    /// It is longer than [`limits::TRACK_ID_BYTES`], or what follows its `@` is no name, and no size that an actor may
+    /// have.
     pub fn of_track(id: &str) -> Result<Self, ObjectError> {
-        let Some((_, look)) = id.rsplit_once('@') else { return Ok(Self::Unknown) };
-        look.parse().map_err(|reason| ObjectError { id: id.to_owned(), reason })
+        let most = limits::TRACK_ID_BYTES;
+        if id.len() > most {
+            let reason = format!(
+                "these are the first {NAMED} characters of {} bytes; at most {most} are accepted",
+                id.len()
+            );
+            return Err(ObjectError { id: id.chars().take(NAMED).collect(), reason });
+        }
+        let Some((_, shape)) = id.rsplit_once('@') else { return Ok(Self::Unknown) };
+        shape.parse().map_err(|reason| ObjectError { id: id.to_owned(), reason })
+    }
+
+    /// What it is drawn from, as a text: equal for equal boxes, however they were written. That of a box has a `#`,
+    /// which no name and no hash has.
+    pub fn key(&self) -> String {
+        let (size, [red, green, blue]) = match self {
+            Self::Asset(name) => return name.clone(),
+            Self::Box { size, rgb8 } => (size, *rgb8),
+            Self::Unknown => (&CAR, GREY),
+        };
+        let ActorBox { length_m, width_m, height_m } = size;
+        format!("{length_m}x{width_m}x{height_m}#{red:02x}{green:02x}{blue:02x}")
     }
 
     /// The box, unless it is that of an asset.
@@ -93,7 +119,7 @@ impl ObjectLook {
     ///
     /// # Errors
     /// It has too many Gaussians, which a checked box never has.
-    pub fn made(&self) -> Result<Option<ActorAsset>, AssetError> {
+    pub fn box_asset(&self) -> Result<Option<ActorAsset>, AssetError> {
         let (size, rgb8) = match self {
             Self::Asset(_) => return Ok(None),
             Self::Box { size, rgb8 } => (*size, *rgb8),
@@ -110,7 +136,7 @@ impl ObjectLook {
 }
 
 /// What follows the `@` of an id.
-impl FromStr for ObjectLook {
+impl FromStr for ObjectShape {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -126,6 +152,10 @@ impl FromStr for ObjectLook {
             _ if colour.is_none() && is_name(text) => return Ok(Self::Asset(text.to_owned())),
             _ => return Err(format!("{text:?} is no asset and no size")),
         };
+        // Rust reads 1e1 and +2 as numbers, too.
+        if !size.bytes().all(|byte| byte.is_ascii_digit() || b".x".contains(&byte)) {
+            return Err(format!("{size:?} is no size: metres have digits and one point"));
+        }
         let size = ActorBox { length_m, width_m, height_m };
         size.check().map_err(|error| error.to_string())?;
         let rgb8 = match colour {
@@ -210,32 +240,59 @@ mod tests {
     fn an_id_says_what_is_drawn() {
         let size = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
         let red = [0xc0, 0x10, 0x20];
-        let look = |id: &str| ObjectLook::of_track(id).unwrap();
-        assert_eq!(look("7@sedan"), ObjectLook::Asset("sedan".to_owned()));
-        assert_eq!(look("7@4.5x1.8x1.5"), ObjectLook::Box { size, rgb8: GREY });
-        assert_eq!(look("a@b@4.5x1.8x1.5#C01020"), ObjectLook::Box { size, rgb8: red });
-        assert_eq!(look("17"), ObjectLook::Unknown);
+        let shape = |id: &str| ObjectShape::of_track(id).unwrap();
+        assert_eq!(shape("7@sedan"), ObjectShape::Asset("sedan".to_owned()));
+        assert_eq!(shape("7@4.5x1.8x1.5"), ObjectShape::Box { size, rgb8: GREY });
+        assert_eq!(shape("a@b@4.5x1.8x1.5#C01020"), ObjectShape::Box { size, rgb8: red });
+        assert_eq!(shape("17"), ObjectShape::Unknown);
         // Two extents are no size, but may be a name.
-        assert_eq!(look("7@4.5x1.8"), ObjectLook::Asset("4.5x1.8".to_owned()));
-        assert_eq!(look(&id_of_box("7", &size)).size(), Some(size));
-        assert_eq!(look(&id_of_asset("7", "ab12")), ObjectLook::Asset("ab12".to_owned()));
+        assert_eq!(shape("7@4.5x1.8"), ObjectShape::Asset("4.5x1.8".to_owned()));
+        assert_eq!(shape(&id_of_box("7", &size)).size(), Some(size));
+        assert_eq!(shape(&id_of_asset("7", "ab12")), ObjectShape::Asset("ab12".to_owned()));
         for (id, reason) in [
             ("7@", "no asset and no size"),
             ("7@Sedan", "no asset and no size"),
             ("7@4.5x1.8x0", "height_m is 0.0"),
-            ("7@4.5xnanx1.5", "width_m is NaN"),
+            ("7@4.5xnanx1.5", "digits and one point"),
+            ("7@1e1x2x1", "digits and one point"),
+            ("7@4x+2x1", "digits and one point"),
+            ("7@4x-2x1", "digits and one point"),
             ("7@4.5x1.8x1.5#12345", "6 hex digits"),
             ("7@sedan#123456", "no asset and no size"),
         ] {
-            let text = ObjectLook::of_track(id).unwrap_err().to_string();
+            let text = ObjectShape::of_track(id).unwrap_err().to_string();
             assert!(text.contains(reason) && text.contains(id), "{text}");
         }
     }
 
     #[test]
+    fn a_long_id_is_refused_by_its_first_characters() {
+        let long = "é".repeat(limits::TRACK_ID_BYTES / 2);
+        assert_eq!(ObjectShape::of_track(&long), Ok(ObjectShape::Unknown));
+        let text = ObjectShape::of_track(&format!("{long}a")).unwrap_err().to_string();
+        assert!(text.contains("257 bytes; at most 256 are accepted"), "{text}");
+        assert_eq!(text.matches('é').count(), 64, "{text}");
+    }
+
+    #[test]
+    fn equal_boxes_have_one_key() {
+        let key = |id: &str| ObjectShape::of_track(id).unwrap().key();
+        assert_eq!(key("7@4x2x1"), "4x2x1#808080");
+        for same in ["8@4.0x2x1", "7@4x02.0x1.#808080"] {
+            assert_eq!(key(same), "4x2x1#808080", "{same}");
+        }
+        assert_eq!(key("7@4x2x1#C01020"), key("7@4x2x1#c01020"));
+        for other in ["7@4x2x1.5", "7@2x4x1", "7@4x2x1#808081"] {
+            assert_ne!(key(other), "4x2x1#808080", "{other}");
+        }
+        assert_eq!(key("17"), key("18@4.6x1.9x1.6"));
+        assert_eq!(key("7@sedan"), "sedan");
+    }
+
+    #[test]
     fn a_box_has_its_size_and_colour() {
         let size = ActorBox { length_m: 4.5, width_m: 1.8, height_m: 1.5 };
-        let asset = ObjectLook::Box { size, rgb8: [255, 0, 51] }.made().unwrap().unwrap();
+        let asset = ObjectShape::Box { size, rgb8: [255, 0, 51] }.box_asset().unwrap().unwrap();
         let all = gaussians(size, [255, 0, 51]);
         assert_eq!(asset.levels[0].chunk.len(), all.len());
         let bounds = ActorAsset::bounds(&all);
@@ -249,10 +306,10 @@ mod tests {
         }
         // The largest box that may be is no more than five faces of the most cells.
         let large = ActorBox { length_m: 100.0, width_m: 100.0, height_m: 100.0 };
-        assert_eq!(gaussians(large, GREY).len(), 5 * 64 * 64);
-        assert!(gaussians(ActorBox { height_m: 0.01, ..large }, GREY).len() <= 64 * 64 + 4 * 64);
-        assert!(ObjectLook::Unknown.made().unwrap().is_some());
-        assert!(ObjectLook::Asset("sedan".to_owned()).made().unwrap().is_none());
+        assert_eq!(gaussians(large, GREY).len(), 5 * 16 * 16);
+        assert!(gaussians(ActorBox { height_m: 0.01, ..large }, GREY).len() <= 16 * 16 + 4 * 16);
+        assert!(ObjectShape::Unknown.box_asset().unwrap().is_some());
+        assert!(ObjectShape::Asset("sedan".to_owned()).box_asset().unwrap().is_none());
     }
 
     #[test]

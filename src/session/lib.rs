@@ -84,5 +84,5 @@ pub use sensors::settings::{
 pub use sensors::{ImageSensor, SensorReason};
 pub use session::Session;
 pub use snapshot::{Snapshot, Snapshots};
-pub use stills::{Still, StillActor, StillAsset, Stills};
+pub use stills::{Still, StillActor, Stills};
 pub use viewpoint::viewpoints;

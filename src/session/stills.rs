@@ -9,7 +9,7 @@ use tokio::time::Instant;
 
 use wildcity_render::{Frame, MAX_VIEWS, Target, View};
 use wildcity_scene::RenderProfile;
-use wildcity_scene::actor::{ActorAsset, PlacedChunk};
+use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Pose;
 use wildcity_twin::residency::{Reservation, Resident, ResidentActor, RigExtent};
@@ -38,30 +38,11 @@ pub struct Still {
 #[derive(Clone, Debug)]
 pub struct StillActor {
     /// What it is drawn from.
-    pub asset: StillAsset,
+    pub asset: Arc<ResidentActor>,
     /// Its pose where the exposures end: its origin is on the ground under its middle, x points forward.
     pub world_from_actor: Pose,
     /// Its pose where the longest exposure begins.
     pub world_from_actor_at_start: Pose,
-}
-
-/// What an actor is drawn from.
-#[derive(Clone, Debug)]
-pub enum StillAsset {
-    /// An asset of the store.
-    Stored(Arc<ResidentActor>),
-    /// One that the caller has made. Its memory is not counted as that of twins.
-    Made(Arc<ActorAsset>),
-}
-
-impl StillAsset {
-    /// The asset.
-    pub fn asset(&self) -> &ActorAsset {
-        match self {
-            Self::Stored(actor) => actor.asset(),
-            Self::Made(asset) => asset,
-        }
-    }
 }
 
 /// A version that images are rendered of, and the memory for its worst frame.

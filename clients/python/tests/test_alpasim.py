@@ -382,8 +382,10 @@ def test_a_public_address_needs_consent() -> None:
     done = subprocess.run(serving, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1 and "--alpasim-open" in done.stderr, done.stderr
     with subprocess.Popen([*serving, "--alpasim-open"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert listening(process)["AlpaSim: listening on "].startswith("0.0.0.0:")
-        process.terminate()
+        try:
+            assert listening(process)["AlpaSim: listening on "].startswith("0.0.0.0:")
+        finally:
+            process.terminate()
 
 
 def test_a_server_that_stops_answers_unavailable(tmp_path: Path) -> None:
@@ -397,15 +399,18 @@ def test_a_server_that_stops_answers_unavailable(tmp_path: Path) -> None:
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0", "--alpasim", "127.0.0.1:0", "--backend", "reference"]
     serving += ["--episodes", str(tmp_path / "e"), "--uploads", str(tmp_path / "u")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True) as process:
-        address = listening(process)["AlpaSim: listening on "]
-        with grpc.insecure_channel(address, [("grpc.enable_retries", 0)]) as channel:
-            stub = Stub(channel)
-            # The reference backend takes seconds for it.
-            running = stub.render_rgb.future(request(resolution_w=640, resolution_h=480))
-            time.sleep(0.5)
+        try:
+            address = listening(process)["AlpaSim: listening on "]
+            with grpc.insecure_channel(address, [("grpc.enable_retries", 0)]) as channel:
+                stub = Stub(channel)
+                # The reference backend takes seconds for it.
+                running = stub.render_rgb.future(request(resolution_w=640, resolution_h=480))
+                time.sleep(0.5)
+                process.terminate()
+                assert running.exception(timeout=20).code() == grpc.StatusCode.UNAVAILABLE
+            assert process.wait(timeout=20) == 0
+        finally:
             process.terminate()
-            assert running.exception(timeout=20).code() == grpc.StatusCode.UNAVAILABLE
-        assert process.wait(timeout=20) == 0
 
 
 def test_too_little_memory_is_a_backend_that_was_waited_for(door: Door) -> None:
@@ -415,10 +420,12 @@ def test_too_little_memory_is_a_backend_that_was_waited_for(door: Door) -> None:
     serving += ["--listen", "127.0.0.1:0", "--alpasim", "127.0.0.1:0"]
     serving += ["--episodes", str(door.folder / "e"), "--uploads", str(door.folder / "u")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True) as process:
-        address = listening(process)["AlpaSim: listening on "]
-        with grpc.insecure_channel(address, [("grpc.enable_retries", 0)]) as channel:
-            with pytest.raises(grpc.RpcError) as refused:
-                Stub(channel).render_rgb(request())
-        process.terminate()
+        try:
+            address = listening(process)["AlpaSim: listening on "]
+            with grpc.insecure_channel(address, [("grpc.enable_retries", 0)]) as channel:
+                with pytest.raises(grpc.RpcError) as refused:
+                    Stub(channel).render_rgb(request())
+        finally:
+            process.terminate()
     assert refused.value.code() == grpc.StatusCode.DEADLINE_EXCEEDED
     assert refused.value.details().startswith("Stopped waiting for backend"), refused.value.details()

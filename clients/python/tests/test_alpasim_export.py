@@ -34,7 +34,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, byte
     exporting = [binary, "alpasim", "export", "corridor", "--out", str(folder / "scenes"), *twins]
     done = subprocess.run([*exporting, "--every-m", "4", "--length-s", "1"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "physics=disabled" in done.stdout
+    assert "physics=disabled" in done.stdout and "external_services.physics=[HOST:6000]" in done.stdout
     found = {}
     for path in sorted((folder / "scenes").iterdir()):
         assert str(path) in done.stdout
@@ -120,7 +120,10 @@ def test_tracks_are_within_the_scene_by_the_middle_of_their_boxes(tmp_path: Path
     assert data["tracks_label_class"] == ["automobile", "person", "automobile"]
     # AlpaSim moves what is CONTROLLABLE, and takes the rest as standing.
     assert data["tracks_flags"] == ["CONTROLLABLE"] * 3
-    assert sizes[0] == [4.0, 2.0, 1.5] and sizes[2] != sizes[0] and all(3.0 < sizes[2][0] < 6.0 for _ in sizes)
+    showing = [binary, "actor", "show", sedan, "--json", *twins]
+    shown = subprocess.run(showing, capture_output=True, text=True, check=True, timeout=60)
+    box = json.loads(shown.stdout)["description"]["box"]
+    assert sizes[0] == [4.0, 2.0, 1.5] and sizes[2] == [box["length_m"], box["width_m"], box["height_m"]] != sizes[0]
     times = [EPOCH_US + 100_000 * k for k in range(11)]
     assert data["tracks_timestamps_us"] == [times, times[4:7], times]
     poses = np.array(data["tracks_poses"][0])

@@ -109,7 +109,7 @@ def test_boxes_stand_on_the_ground_of_the_drive(door: Door) -> None:
     assert (first.vec.x, first.vec.y, first.vec.z) == pytest.approx((3.0, 0.5, 0.75), abs=1e-6)
     assert (second.vec.x, second.vec.y, second.vec.z) == pytest.approx((5.0, -0.5, 0.75), abs=1e-6)
     assert (second.quat.w, second.quat.x) == pytest.approx((1.0, 0.0), abs=1e-6)
-    # What cannot be meant is returned as it was.
+    # Implausible corrections are refused: the pose is as it was.
     assert (third, fourth) == (poses[2], poses[3])
     for one in (answer.ego_pose, *answer.other_poses):
         assert (one.pose, one.status) == (first, SUCCESSFUL_UPDATE)

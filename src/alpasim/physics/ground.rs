@@ -27,13 +27,13 @@ pub fn on_ground(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> (
 
 fn placed(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> Option<Pose> {
     let bottom = raised(world_from_box, -0.5 * height_m);
-    let tilted = ground.find(bottom)?;
-    // Tilting moves the middle of the lower face aside; the ground's height is that under its new place.
-    let half = tilted.rotation * DVec3::new(0.0, 0.0, 0.5 * height_m);
-    let aside = (world_from_box.position_m - half).with_z(tilted.position_m.z);
-    let under = ground.find(Pose { position_m: aside, ..tilted })?;
-    let z_m = under.position_m.z + half.z;
-    Some(Pose { position_m: world_from_box.position_m.with_z(z_m), rotation: tilted.rotation })
+    let on_plane = ground.find(bottom)?;
+    // The middle is half the height away from the ground's plane, along its normal, which is not vertical.
+    let up = on_plane.rotation * DVec3::Z;
+    let aside_m = world_from_box.position_m - on_plane.position_m;
+    let rise_m = (0.5 * height_m - aside_m.x * up.x - aside_m.y * up.y) / up.z;
+    let z_m = on_plane.position_m.z + rise_m;
+    Some(Pose { position_m: world_from_box.position_m.with_z(z_m), rotation: on_plane.rotation })
 }
 
 fn refused(from: &Pose, to: &Pose) -> Option<Status> {
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_that_cannot_be_meant_is_returned_with_the_reason() {
+    fn implausible_corrections_are_refused_with_a_reason() {
         let drives = uphill();
         let ground = Ground::from_drives(&drives);
         let flat = DQuat::IDENTITY;

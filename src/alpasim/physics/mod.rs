@@ -6,11 +6,12 @@ mod ground;
 
 use std::sync::Arc;
 
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
-use wildcity_session::Engine;
+use wildcity_session::{Engine, SessionError};
 use wildcity_sim::Ground;
 
 use crate::limits;
@@ -21,23 +22,37 @@ use crate::wire::physics as wire;
 
 pub use ground::on_ground;
 
-/// Puts the ego's boxes, and those of others, on the ground of a scene.
+/// Puts the ego's boxes, and those of others, on the ground of a scene. `running` has a permit for each request that
+/// may run at once.
 ///
 /// # Errors
-/// There is no such scene, or a pose or a size is missing or invalid.
+/// There is no such scene, or a pose or a size is missing or invalid, or too many requests run.
 pub(crate) async fn ground_intersection(
     engine: &Arc<Engine>,
+    running: &Arc<Semaphore>,
     asked: wire::GroundIntersectionRequest,
 ) -> Result<wire::GroundIntersectionReturn, Status> {
+    let permit = permit(running)?;
     let scene = OpenScene::open(engine, &asked.scene_id).await?;
     // Every keyframe of the drives is tested for every box.
     let work = move || {
+        // Held until the work ends, even if the client goes away before.
+        let _permit = permit;
         let drives = &scene.resident.version.manifest.trajectories;
         answer(drives, &scene.frame, &asked)
     };
     let answered = tokio::task::spawn_blocking(work).await;
     let answered = answered.map_err(|error| Status::internal(error.to_string()))?;
     Ok(answered?)
+}
+
+/// The permit to run a request.
+///
+/// # Errors
+/// None is free.
+fn permit(running: &Arc<Semaphore>) -> Result<OwnedSemaphorePermit, SensorsimError> {
+    let busy = SessionError::Busy { what: "requests of physics" };
+    running.clone().try_acquire_owned().map_err(|_| busy.into())
 }
 
 /// The answer to a request, in a scene's local frame, on the ground of some drives.
@@ -90,7 +105,9 @@ fn answer(
 }
 
 fn ego_boxes(ego: &wire::EgoData) -> usize {
-    ego.ego_trajectory_aabb.as_ref().map_or(0, |trajectory| trajectory.poses.len()) + 1
+    let of_trajectory =
+        ego.ego_trajectory_aabb.as_ref().map_or(0, |trajectory| trajectory.poses.len());
+    of_trajectory + usize::from(ego.pose_pair.is_some())
 }
 
 /// The height of a box, in metres.
@@ -192,10 +209,32 @@ mod tests {
         let text = refused(others(1));
         assert!(text.contains("other_objects.pose_pair.future_pose is missing"), "{text}");
         let text = refused(others(limits::PHYSICS_BOXES + 1));
-        assert!(text.contains("4097 poses; at most 4096"), "{text}");
+        assert!(text.contains("1025 poses; at most 1024"), "{text}");
         assert_eq!(
             answer(&level(), &frame, &Default::default()).unwrap(),
             wire::GroundIntersectionReturn::default()
         );
+    }
+
+    #[test]
+    fn the_ego_has_a_box_for_its_pair_and_for_each_pose_of_its_trajectory() {
+        let trajectory = common::Trajectory { poses: vec![common::PoseAtTime::default(); 2] };
+        let pair = wire::PosePair { now_pose: None, future_pose: None };
+        let mut ego = wire::EgoData::default();
+        assert_eq!(ego_boxes(&ego), 0);
+        ego.ego_trajectory_aabb = Some(trajectory);
+        assert_eq!(ego_boxes(&ego), 2);
+        ego.pose_pair = Some(pair);
+        assert_eq!(ego_boxes(&ego), 3);
+    }
+
+    #[test]
+    fn a_request_without_a_permit_is_refused_for_now() {
+        let running = Arc::new(Semaphore::new(1));
+        let first = permit(&running).unwrap();
+        let refused = permit(&running).unwrap_err().status();
+        assert_eq!(refused.code(), tonic::Code::Unavailable, "{refused}");
+        drop(first);
+        assert!(permit(&running).is_ok());
     }
 }

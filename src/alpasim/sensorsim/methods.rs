@@ -4,7 +4,7 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tonic::Status;
 
 use wildcity_scene::rig::RigCamera;
@@ -24,14 +24,16 @@ use crate::wire::{API_VERSION, common, physics, sensorsim as wire};
 pub(super) struct Sensorsim {
     engine: Arc<Engine>,
     open: OpenVersions,
-    assets: ObjectAssets,
+    assets: Arc<ObjectAssets>,
+    physics: Arc<Semaphore>,
     stopping: watch::Receiver<bool>,
 }
 
 impl Sensorsim {
     pub(super) fn new(engine: Arc<Engine>, stopping: watch::Receiver<bool>) -> Self {
-        let (open, assets) = (OpenVersions::default(), ObjectAssets::default());
-        Self { engine, open, assets, stopping }
+        let (open, assets) = (OpenVersions::default(), Arc::default());
+        let physics = Arc::new(Semaphore::new(limits::PHYSICS_REQUESTS));
+        Self { engine, open, assets, physics, stopping }
     }
 
     /// Frees the memory of scenes that are not drawn any more, until dropped.
@@ -39,7 +41,7 @@ impl Sensorsim {
         loop {
             tokio::time::sleep(Duration::from_secs(60)).await;
             self.open.forget_idle().await;
-            self.assets.forget_idle().await;
+            self.assets.forget_idle();
         }
     }
 
@@ -201,7 +203,7 @@ impl Sensorsim {
         &self,
         asked: physics::GroundIntersectionRequest,
     ) -> Result<physics::GroundIntersectionReturn, Status> {
-        self.unless_stopped(ground_intersection(&self.engine, asked)).await?
+        self.unless_stopped(ground_intersection(&self.engine, &self.physics, asked)).await?
     }
 
     /// Not offered.

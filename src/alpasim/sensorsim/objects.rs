@@ -1,32 +1,33 @@
 //! The assets of dynamic objects that were drawn lately.
 //!
 //! A rollout asks for the same objects ten times a second: an asset stays in memory for [`limits::SCENE_IDLE`], so that
-//! neither is a box made nor an asset read again.
+//! neither is a box made nor an asset read again. Names are resolved anew for every request, because an asset may be
+//! removed, and another get its name.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-use tokio::sync::Mutex;
+use parking_lot::Mutex;
 
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{Engine, StillActor, StillAsset};
+use wildcity_session::{Engine, SessionError, StillActor};
+use wildcity_twin::residency::{ResidencyError, ResidentActor};
 
 use super::status::SensorsimError;
 use crate::limits;
-use crate::object::{ObjectLook, actor_of_centre};
+use crate::object::{ObjectShape, actor_of_centre};
 use crate::scene::{LocalFrame, SceneError};
 use crate::wire::sensorsim as wire;
 
-/// Assets by what follows the `@` of a track's id.
+/// Assets by the hash of one of the store, or by the key of a box, and when they were drawn last.
 #[derive(Default)]
-pub(super) struct ObjectAssets(Mutex<BTreeMap<String, (StillAsset, Instant)>>);
+pub(super) struct ObjectAssets(Mutex<BTreeMap<String, (Arc<ResidentActor>, Instant)>>);
 
 /// A dynamic object of a request: what it is drawn from, and the poses of the middle of its box in the world.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Object {
-    id: String,
-    look: ObjectLook,
+    shape: ObjectShape,
     world_from_centre: Pose,
     world_from_centre_at_start: Pose,
 }
@@ -40,7 +41,7 @@ impl Object {
         object: &wire::DynamicObject,
         frame: &LocalFrame,
     ) -> Result<Self, SensorsimError> {
-        let look = ObjectLook::of_track(&object.track_id)?;
+        let shape = ObjectShape::of_track(&object.track_id)?;
         let field = "dynamic_objects.pose_pair";
         let pair = object.pose_pair.ok_or(SceneError::Missing { field })?;
         let end = frame.world_from("dynamic_objects.pose_pair.end_pose", pair.end_pose.as_ref())?;
@@ -48,18 +49,12 @@ impl Object {
             Some(start) => frame.world_from("dynamic_objects.pose_pair.start_pose", Some(start))?,
             None => end,
         };
-        let id = object.track_id.clone();
-        Ok(Self { id, look, world_from_centre: end, world_from_centre_at_start: start })
+        Ok(Self { shape, world_from_centre: end, world_from_centre_at_start: start })
     }
 
     /// Whether its id does not say what it is.
     pub(super) fn is_unknown(&self) -> bool {
-        self.look == ObjectLook::Unknown
-    }
-
-    /// What follows the `@` of its id.
-    fn key(&self) -> &str {
-        self.id.rsplit_once('@').map_or("", |(_, look)| look)
+        self.shape == ObjectShape::Unknown
     }
 }
 
@@ -69,56 +64,108 @@ impl ObjectAssets {
     /// # Errors
     /// There is no such asset, or too little memory for it.
     pub(super) async fn actors(
-        &self,
+        self: &Arc<Self>,
         engine: &Arc<Engine>,
         objects: &[Object],
     ) -> Result<Vec<StillActor>, SensorsimError> {
-        let mut actors = Vec::with_capacity(objects.len());
-        for object in objects {
-            let asset = self.asset(engine, object).await?;
+        if objects.is_empty() {
+            return Ok(Vec::new());
+        }
+        let shapes: Vec<ObjectShape> = objects.iter().map(|object| object.shape.clone()).collect();
+        let (own, engine) = (self.clone(), engine.clone());
+        let read = tokio::task::spawn_blocking(move || own.assets(&engine, &shapes));
+        let assets = read.await.map_err(|_| SessionError::Crashed)??;
+        let placed = objects.iter().zip(assets).map(|(object, asset)| {
             let size = asset.asset().description.box_;
-            actors.push(StillActor {
+            StillActor {
                 world_from_actor: actor_of_centre(&object.world_from_centre, &size),
                 world_from_actor_at_start: actor_of_centre(
                     &object.world_from_centre_at_start,
                     &size,
                 ),
                 asset,
-            });
-        }
-        Ok(actors)
+            }
+        });
+        Ok(placed.collect())
     }
 
-    async fn asset(
+    /// The asset of each shape. Equal shapes are looked up once.
+    fn assets(
         &self,
-        engine: &Arc<Engine>,
-        object: &Object,
-    ) -> Result<StillAsset, SensorsimError> {
-        // Held while an asset is read, so that simultaneous requests read it once.
-        let mut known = self.0.lock().await;
-        if let Some((asset, drawn)) = known.get_mut(object.key()) {
-            *drawn = Instant::now();
-            return Ok(asset.clone());
+        engine: &Engine,
+        shapes: &[ObjectShape],
+    ) -> Result<Vec<Arc<ResidentActor>>, SensorsimError> {
+        let mut by_key: BTreeMap<String, Arc<ResidentActor>> = BTreeMap::new();
+        let mut assets = Vec::with_capacity(shapes.len());
+        for shape in shapes {
+            let key = shape.key();
+            let asset = match by_key.get(&key) {
+                Some(asset) => asset.clone(),
+                None => {
+                    let asset = self.asset(engine, shape, &key)?;
+                    by_key.insert(key, asset.clone());
+                    asset
+                }
+            };
+            assets.push(asset);
         }
-        let asset = match &object.look {
-            ObjectLook::Asset(name) => StillAsset::Stored(engine.open_actor(name.clone()).await?),
-            look => {
-                let made = look.made().map_err(|error| SensorsimError::Invalid(error.to_string()));
-                let none = || SensorsimError::Invalid(format!("{:?} is no box", object.id));
-                StillAsset::Made(Arc::new(made?.ok_or_else(none)?))
+        Ok(assets)
+    }
+
+    fn asset(
+        &self,
+        engine: &Engine,
+        shape: &ObjectShape,
+        key: &str,
+    ) -> Result<Arc<ResidentActor>, SensorsimError> {
+        // That of a box, or of a whole hash: no name is a key here.
+        if let Some(asset) = self.known(key) {
+            return Ok(asset);
+        }
+        let made = shape.box_asset();
+        let made = made.map_err(|error| SensorsimError::Invalid(error.to_string()))?;
+        if let Some(box_asset) = made {
+            return self.load(key, || engine.hold_actor(key, box_asset.clone()));
+        }
+        let hash = engine.catalog().find_actor(key).map_err(SessionError::from)?.hash;
+        match self.known(&hash) {
+            Some(asset) => Ok(asset),
+            None => self.load(&hash, || engine.actor(&hash)),
+        }
+    }
+
+    fn known(&self, key: &str) -> Option<Arc<ResidentActor>> {
+        let mut known = self.0.lock();
+        let (asset, drawn) = known.get_mut(key)?;
+        *drawn = Instant::now();
+        Some(asset.clone())
+    }
+
+    /// Brings an asset into memory. If there is no room, forgets those that no request draws, and tries once more.
+    fn load(
+        &self,
+        key: &str,
+        load: impl Fn() -> Result<Arc<ResidentActor>, SessionError>,
+    ) -> Result<Arc<ResidentActor>, SensorsimError> {
+        let asset = match load() {
+            Err(SessionError::Residency(ResidencyError::NoRoomForActor { .. })) => {
+                self.0.lock().retain(|_, (asset, _)| Arc::strong_count(asset) > 1);
+                load()?
             }
+            loaded => loaded?,
         };
-        if known.len() >= limits::OBJECT_ASSETS {
+        let mut known = self.0.lock();
+        if !known.contains_key(key) && known.len() >= limits::OBJECT_ASSETS {
             let oldest = known.iter().min_by_key(|(_, (_, drawn))| *drawn);
             let oldest = oldest.map(|(key, _)| key.clone());
             oldest.and_then(|key| known.remove(&key));
         }
-        known.insert(object.key().to_owned(), (asset.clone(), Instant::now()));
+        known.insert(key.to_owned(), (asset.clone(), Instant::now()));
         Ok(asset)
     }
 
     /// Forgets the assets that were not drawn for [`limits::SCENE_IDLE`].
-    pub(super) async fn forget_idle(&self) {
-        self.0.lock().await.retain(|_, (_, drawn)| drawn.elapsed() < limits::SCENE_IDLE);
+    pub(super) fn forget_idle(&self) {
+        self.0.lock().retain(|_, (_, drawn)| drawn.elapsed() < limits::SCENE_IDLE);
     }
 }

@@ -112,7 +112,7 @@ pub fn offered_cameras(manifest: &Manifest) -> Vec<RigCamera> {
 pub(super) struct Renderer<'a> {
     pub(super) engine: &'a Arc<Engine>,
     pub(super) open: &'a OpenVersions,
-    pub(super) assets: &'a ObjectAssets,
+    pub(super) assets: &'a Arc<ObjectAssets>,
 }
 
 /// A request's image, or why there is none.

@@ -9,6 +9,7 @@ use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
 use crate::camera::CameraSpecError;
+use crate::limits;
 use crate::object::ObjectError;
 use crate::scene::SceneError;
 
@@ -53,17 +54,23 @@ impl From<SceneError> for SensorsimError {
 }
 
 impl SensorsimError {
-    /// What the client gets.
+    /// What the client gets: a message of at most [`limits::STATUS_BYTES`].
     pub(crate) fn status(&self) -> Status {
         let text = self.to_string();
-        match self {
+        let status = match self {
             Self::UnknownScene(_) => Status::not_found(text),
             Self::Invalid(_) | Self::Camera(_) | Self::Object(_) => Status::invalid_argument(text),
             Self::Stopping => Status::unavailable(text),
             Self::Unimplemented(what) => Status::unimplemented(*what),
             Self::Session(error) => of_session(error, text),
             Self::Repeated(status) => status.clone(),
+        };
+        let text = status.message();
+        if text.len() <= limits::STATUS_BYTES {
+            return status;
         }
+        let end = text.floor_char_boundary(limits::STATUS_BYTES);
+        Status::new(status.code(), &text[..end])
     }
 }
 
@@ -136,7 +143,7 @@ mod tests {
         };
         let no_actor = StoreError::NoActor { text, found: 0, known: Vec::new() };
         let id = "x".parse::<crate::scene::SceneId>().unwrap_err();
-        let object = crate::object::ObjectLook::of_track("7@").unwrap_err();
+        let object = crate::object::ObjectShape::of_track("7@").unwrap_err();
         let late = "Stopped waiting for backend: ";
         for (error, code, start) in [
             (SensorsimError::from(id), Code::NotFound, "\"x\" is no scene"),
@@ -159,5 +166,19 @@ mod tests {
             let repeated = SensorsimError::Repeated(error.status()).status();
             assert_eq!((repeated.code(), repeated.message()), (code, status.message()));
         }
+    }
+
+    #[test]
+    fn a_long_message_is_cut_between_two_characters() {
+        let message = |text: String| SensorsimError::Invalid(text).status().message().to_owned();
+        let whole = "a".repeat(limits::STATUS_BYTES);
+        assert_eq!(message(whole.clone()), whole);
+        // The two bytes of the last character would be on both sides of the limit.
+        let cut = format!("a{}", "é".repeat(limits::STATUS_BYTES / 2 - 1));
+        assert_eq!(message(format!("{cut}éé")), cut);
+        let unknown = SessionError::UnknownRig { name: "é".repeat(5000), known: Vec::new() };
+        let status = SensorsimError::from(unknown).status();
+        assert_eq!(status.code(), Code::Internal);
+        assert!(status.message().len() <= limits::STATUS_BYTES, "{}", status.message().len());
     }
 }

@@ -90,6 +90,11 @@ impl Export {
             "AlpaSim: physics=disabled ego_mask_rig_config_id=null \
              wizard.external_services.renderer=[HOST:6000]"
         )?;
+        writeln!(
+            out,
+            "To put vehicles on the ground of the drives, in place of physics=disabled: \
+             wizard.external_services.physics=[HOST:6000]"
+        )?;
         Ok(())
     }
 }

@@ -17,6 +17,7 @@ use tokio::time::{Instant, sleep};
 
 use wildcity_render::{Backend, RenderError};
 use wildcity_repair::Models;
+use wildcity_scene::actor::ActorAsset;
 use wildcity_scene::{Rays, RenderProfile};
 use wildcity_twin::residency::{
     Cache, Prefetcher, Reservation, ResidencyError, Resident, ResidentActor, RigExtent, Stats,
@@ -256,20 +257,26 @@ impl Engine {
         Ok(opened.await??)
     }
 
-    /// An asset by its name, its hash or the first digits of its hash, in memory until its last copy is dropped.
+    /// The asset of a hash, 64 lower-case hex digits, in memory until its last copy is dropped. Reads it unless it is
+    /// in memory already; blocks meanwhile.
     ///
     /// # Errors
-    /// There is none, or more than one, or it is damaged, or there is no room for it.
-    pub async fn open_actor(
-        self: &Arc<Self>,
-        name: String,
+    /// There is none, or it is damaged, or there is no room for it.
+    pub fn actor(&self, hash: &str) -> Result<Arc<ResidentActor>, SessionError> {
+        Ok(self.cache.actor(hash)?)
+    }
+
+    /// An asset that is not in the store, in memory until its last copy is dropped; the one of the same key if there is
+    /// one already. `key` stands for all that it is made from, and is no hash. Its memory counts as that of twins.
+    ///
+    /// # Errors
+    /// There is no room for it.
+    pub fn hold_actor(
+        &self,
+        key: &str,
+        asset: ActorAsset,
     ) -> Result<Arc<ResidentActor>, SessionError> {
-        let engine = self.clone();
-        let opened = run_blocking(move || {
-            let hash = engine.cache.catalog().find_actor(&name)?.hash;
-            engine.cache.actor(&hash)
-        });
-        Ok(opened.await??)
+        Ok(self.cache.hold_actor(key, asset)?)
     }
 
     /// Bakes the cube map of the twin's sky that frames of this profile look up, so that no frame waits

@@ -1,7 +1,8 @@
 //! Assets of actors in memory: one copy for all sessions.
 //!
 //! A scenario's assets are in memory from when it opens, with all levels of detail, until its last episode ends: no
-//! frame waits for an actor. They count against the memory of twins, and sections get what is left.
+//! frame waits for an actor. They count against the memory of twins, and sections get what is left. So do assets that
+//! a program makes and the store does not have.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -14,9 +15,9 @@ use super::resident::Shared;
 use crate::store::Catalog;
 use wildcity_scene::actor::ActorAsset;
 
-/// The assets in memory, by their hash.
+/// The assets in memory, by their hash, or by the key of one that is not in the store.
 #[derive(Debug, Default)]
-pub(super) struct ActorPool(Mutex<BTreeMap<String, Weak<ResidentActor>>>);
+pub(super) struct ActorPool(Mutex<Actors>);
 
 /// An asset in memory, until its last copy is dropped.
 #[derive(Debug)]
@@ -28,7 +29,7 @@ pub struct ResidentActor {
 }
 
 impl ResidentActor {
-    /// BLAKE3 of the asset, 64 lower-case hex digits.
+    /// BLAKE3 of the asset, 64 lower-case hex digits; of an asset that is not in the store, its key.
     pub fn hash(&self) -> &str {
         &self.hash
     }
@@ -52,21 +53,58 @@ impl ActorPool {
     ) -> Result<Arc<ResidentActor>, ResidencyError> {
         // Locked while reading, so that sessions that open at once do not read an asset twice.
         let mut actors = self.0.lock();
-        actors.retain(|_, actor| actor.strong_count() > 0);
-        if let Some(actor) = actors.get(hash).and_then(|actor| actor.upgrade()) {
-            return Ok(actor);
+        match present(&mut actors, hash) {
+            Some(actor) => Ok(actor),
+            None => add(&mut actors, shared, hash, catalog.actor(hash)?),
         }
-        let asset = catalog.actor(hash)?;
-        let bytes = asset.bytes();
-        let name = asset.description.name.clone();
-        let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes };
-        shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
-        shared.pager.with_table(|table| table.add_outside_bytes(bytes));
-        let shared = shared.clone();
-        let actor = Arc::new(ResidentActor { hash: hash.to_owned(), asset, claim, shared });
-        actors.insert(hash.to_owned(), Arc::downgrade(&actor));
-        Ok(actor)
     }
+
+    /// An asset that is not in the store, under a key that is no hash; the one of this key if there is one already.
+    ///
+    /// # Errors
+    /// [`ResidencyError::NoRoomForActor`].
+    pub(super) fn hold(
+        &self,
+        shared: &Arc<Shared>,
+        key: &str,
+        asset: ActorAsset,
+    ) -> Result<Arc<ResidentActor>, ResidencyError> {
+        let mut actors = self.0.lock();
+        match present(&mut actors, key) {
+            Some(actor) => Ok(actor),
+            None => add(&mut actors, shared, key, asset),
+        }
+    }
+}
+
+/// The assets of a pool.
+type Actors = BTreeMap<String, Weak<ResidentActor>>;
+
+/// The asset of a hash or a key, if it is in memory. Forgets those that are not any more.
+fn present(actors: &mut Actors, hash: &str) -> Option<Arc<ResidentActor>> {
+    actors.retain(|_, actor| actor.strong_count() > 0);
+    actors.get(hash).and_then(|actor| actor.upgrade())
+}
+
+/// Counts an asset against the memory of twins.
+///
+/// # Errors
+/// [`ResidencyError::NoRoomForActor`].
+fn add(
+    actors: &mut Actors,
+    shared: &Arc<Shared>,
+    hash: &str,
+    asset: ActorAsset,
+) -> Result<Arc<ResidentActor>, ResidencyError> {
+    let bytes = asset.bytes();
+    let name = asset.description.name.clone();
+    let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes };
+    shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
+    shared.pager.with_table(|table| table.add_outside_bytes(bytes));
+    let shared = shared.clone();
+    let actor = Arc::new(ResidentActor { hash: hash.to_owned(), asset, claim, shared });
+    actors.insert(hash.to_owned(), Arc::downgrade(&actor));
+    Ok(actor)
 }
 
 impl ResidencyError {
@@ -85,5 +123,49 @@ impl Drop for ResidentActor {
     fn drop(&mut self) {
         self.shared.pager.with_table(|table| table.remove_outside_bytes(self.claim.bytes));
         self.shared.budget.lock().release(&self.claim);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::residency::Cache;
+    use wildcity_scene::actor::AssetDescription;
+    use wildcity_scene::manifest::Provenance;
+    use wildcity_scene::{ActorBox, ActorClass, Gaussians};
+
+    fn asset() -> ActorAsset {
+        let gaussians = Gaussians {
+            sh_degree: 0,
+            means_m: vec![[0.0, 0.0, 1.0]],
+            quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
+            ln_scales: vec![[-2.0; 3]],
+            logit_opacities: vec![1.0],
+            sh: vec![0.0; 3],
+        };
+        let description = AssetDescription {
+            name: "box".to_owned(),
+            class: ActorClass::Object,
+            box_: ActorBox::PEDESTRIAN,
+            provenance: Provenance::of("test".to_owned()),
+        };
+        ActorAsset::new(&gaussians, description).unwrap()
+    }
+
+    #[test]
+    fn a_held_asset_is_counted_once_until_its_last_copy_is_dropped() {
+        let asset = asset();
+        let bytes = asset.bytes();
+        let dir = tempfile::tempdir().unwrap();
+        let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), Some(bytes));
+        let first = cache.hold_actor("4x2x1#808080", asset.clone()).unwrap();
+        let again = cache.hold_actor("4x2x1#808080", asset.clone()).unwrap();
+        assert!(Arc::ptr_eq(&first, &again));
+        assert_eq!(cache.stats().reserved_bytes, bytes);
+        let refused = cache.hold_actor("5x2x1#808080", asset.clone()).unwrap_err();
+        assert!(matches!(refused, ResidencyError::NoRoomForActor { .. }), "{refused}");
+        drop((first, again));
+        assert_eq!(cache.stats().reserved_bytes, 0);
+        assert!(cache.hold_actor("5x2x1#808080", asset).is_ok());
     }
 }

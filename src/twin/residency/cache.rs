@@ -6,6 +6,7 @@ use std::sync::{Arc, Weak};
 use parking_lot::Mutex;
 
 use crate::store::{Catalog, Version};
+use wildcity_scene::actor::ActorAsset;
 use wildcity_scene::manifest::SkyRef;
 use wildcity_scene::{Manifest, Sky};
 
@@ -104,6 +105,19 @@ impl Cache {
     /// As [`Catalog::actor`]; [`ResidencyError::NoRoomForActor`].
     pub fn actor(&self, hash: &str) -> Result<Arc<ResidentActor>, ResidencyError> {
         self.actors.get(&self.catalog, &self.shared, hash)
+    }
+
+    /// An asset that is not in the store, in memory until its last copy is dropped; the one of the same key if there is
+    /// one already. `key` stands for all that it is made from, and is no hash.
+    ///
+    /// # Errors
+    /// [`ResidencyError::NoRoomForActor`].
+    pub fn hold_actor(
+        &self,
+        key: &str,
+        asset: ActorAsset,
+    ) -> Result<Arc<ResidentActor>, ResidencyError> {
+        self.actors.hold(&self.shared, key, asset)
     }
 
     /// Counts since the start, and what is in memory now.
