@@ -38,7 +38,7 @@ const RGB_FROM_XYZ: [[f64; 3]; 3] = [
     [0.055_639_423, -0.204_011_202, 1.057_148_933],
 ];
 /// XYZ of white (D65).
-const WHITE: [f32; 3] = [0.950_428_545, 1.0, 1.088_900_371];
+const WHITE: [f32; 3] = [0.950_428_55, 1.0, 1.088_900_3];
 
 /// One value per pixel, row by row.
 type Plane = Vec<f32>;

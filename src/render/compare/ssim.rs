@@ -200,7 +200,7 @@ mod tests {
     /// Stripes of 4 px, with a band of noise in the first `noisy` columns.
     fn striped(noisy: usize) -> Vec<f64> {
         let value = |i: usize| {
-            let stripe = if i % 40 / 4 % 2 == 0 { 0.2 } else { 0.7 };
+            let stripe = if (i % 40 / 4).is_multiple_of(2) { 0.2 } else { 0.7 };
             let noise =
                 if i % 40 < noisy { 0.1 * ((i * 7919 % 13) as f64 / 6.0 - 1.0) } else { 0.0 };
             stripe + noise
