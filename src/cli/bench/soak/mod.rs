@@ -1,6 +1,7 @@
 //! `wildcity bench soak`.
 
 mod agent;
+mod memory;
 mod others;
 
 use std::io::{self, Write};
@@ -16,6 +17,7 @@ use wildcity_server::Running;
 use wildcity_twin::store::Catalog;
 
 use self::agent::{Agent, Driven};
+use self::memory::Memory;
 use self::others::Pusher;
 use super::benched_twin::BenchedTwin;
 use super::memory::{mib, rss_bytes};
@@ -25,9 +27,9 @@ use crate::cli::exit::Exit;
 ///
 /// The server runs in this process. The twin needs a recorded drive: each session drives the same stretch of the first
 /// one again and again, and compares the hash of every image with that of its first round. Prints the memory of the
-/// process every minute. The exit code is 1 if a request fails, a hash changes, or the most memory after the first sixth
-/// of the time exceeds the most memory in it by more than --growth. With --memory-gib below what the twin needs, the
-/// server evicts and loads all the time.
+/// process every minute. The exit code is 1 if a request fails, a hash changes, or memory grows by more than --growth: the
+/// median of the first sixth of the time is compared with the largest median of a later sixth. With --memory-gib below
+/// what the twin needs, the server evicts and loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {
@@ -64,8 +66,6 @@ Examples:
 
 /// Time between two lines.
 const LINE_EVERY: Duration = Duration::from_secs(60);
-/// Share of the time after which memory is compared: caches and pools are full by then.
-const SETTLED_SHARE: f64 = 1.0 / 6.0;
 
 /// Sessions beyond those of the agents: clients that do not read leave theirs to be resumed.
 const OTHER_SESSIONS: usize = 64;
@@ -86,13 +86,6 @@ struct Others {
     pushes: u64,
     damaged: u64,
     unread: u64,
-}
-
-/// The most memory of the process, in bytes: while caches and pools fill, and after that.
-#[derive(Default)]
-struct Memory {
-    settling: u64,
-    settled: u64,
 }
 
 impl Soak {
@@ -209,11 +202,7 @@ impl Soak {
             tick.tick().await;
             let bytes = rss_bytes()?.now;
             let elapsed = begun.elapsed();
-            let most = match elapsed < self.length().mul_f64(SETTLED_SHARE) {
-                true => &mut memory.settling,
-                false => &mut memory.settled,
-            };
-            *most = bytes.max(*most);
+            memory.add(elapsed.div_duration_f64(self.length()), bytes);
             if Instant::now() >= next_line {
                 next_line += LINE_EVERY;
                 let minutes = elapsed.as_secs_f64() / 60.0;
@@ -241,21 +230,20 @@ impl Soak {
                  not read"
             )?;
         }
-        anyhow::ensure!(
-            memory.settling > 0 && memory.settled > 0,
-            "the soak was too short to compare memory: give more --minutes"
-        );
-        let settling = memory.settling;
-        let growth = 100.0 * (memory.settled as f64 / settling as f64 - 1.0);
+        let memory = memory
+            .growth()
+            .context("the soak was too short to compare memory: give more --minutes")?;
+        let growth = memory.percent();
         writeln!(
             out,
-            "{} steps in {} rounds of {} sessions, every image as in its first round; memory at most {:.1} MiB, \
-             later at most {:.1} MiB ({growth:+.2} %)",
+            "{} steps in {} rounds of {} sessions, every image as in its first round; memory {:.1} MiB in the first \
+             sixth of the time, at most {:.1} MiB in a later one ({growth:+.2} %), medians; {:.1} MiB at most",
             driven.steps,
             driven.rounds,
             self.sessions,
-            mib(memory.settling),
-            mib(memory.settled),
+            mib(memory.first),
+            mib(memory.later),
+            mib(memory.most),
         )?;
         if growth > self.growth {
             let message =
