@@ -11,7 +11,6 @@ use tokio::time::timeout;
 
 use wildcity_session::Engine;
 
-use crate::limits;
 use crate::listen::listen;
 use crate::state::ServerState;
 use crate::tls::{self, Tls};
