@@ -47,6 +47,7 @@
 //!    sensors there is no buffer, pass, pipeline or library for them.
 //! 10. One table maps each fault to its wire code and its HTTP status, exhaustively.
 //!
+//! [`wildcity_heap`]: ../wildcity_heap/index.html
 //! [`wildcity_score`]: ../wildcity_score/index.html
 
 pub mod cli;
