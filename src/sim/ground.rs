@@ -79,8 +79,12 @@ impl Plane {
         let aside_m = position_m - point_m;
         position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
         let forward = world_from_rig.rotation * DVec3::X;
+        let forward = forward.reject_from_normalized(up);
         // A rig that points along the normal has no heading.
-        let forward = forward.reject_from_normalized(up).try_normalize()?;
+        if forward.length() < limits::GROUND_HEADING {
+            return None;
+        }
+        let forward = forward.normalize();
         let rotation = DQuat::from_mat3(&DMat3::from_cols(forward, up.cross(forward), up));
         Some(Pose { position_m, rotation: rotation.normalize() })
     }

@@ -34,6 +34,10 @@ pub const GROUND_NEAR_M: f64 = 25.0;
 /// Smallest z component of a ground plane's unit normal: a slope of 45 degrees, steeper than any street.
 pub const GROUND_UP: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
+/// Smallest length of a unit vector's part along the ground that gives a heading. Rounding leaves about 1e-16 of a vector along the
+/// normal.
+pub const GROUND_HEADING: f64 = 1e-9;
+
 /// Longest sub-step of traffic, in microseconds.
 pub const SUB_STEP_US: i64 = 10_000;
 
