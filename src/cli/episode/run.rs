@@ -19,10 +19,10 @@ use crate::cli::{output, progress};
 
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
-/// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if all
-/// is as wanted, 1 if an episode failed by driving, 2 if the command line, the suite or a scenario is wrong, 3 if an
-/// episode was not driven for technical reasons or more than a tenth of them left the trained area, 4 if an episode
-/// does not repeat (--verify).
+/// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if no
+/// episode failed by driving (with --at-least, if the pass rate is as wanted), 1 if that is not so, 2 if the command
+/// line, the suite or a scenario is wrong, 3 if an episode was not driven for technical reasons or more than a tenth of
+/// them left the trained area, 4 if an episode does not repeat (--verify).
 ///
 /// An agent that is a command is started by the shell, once for each episode. It finds in its environment
 /// WILDCITY_URL, WILDCITY_OPEN (the fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and
