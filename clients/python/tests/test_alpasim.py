@@ -21,7 +21,7 @@ import wildcity
 from carla_driver_interface._proto import common_pb2, sensorsim_pb2
 from google.protobuf.message_factory import GetMessageClass
 from PIL import Image
-from test_end_to_end import PAIR, write_corridor, write_log
+from test_end_to_end import PAIR, import_corridor
 from wildcity import Camera, Exposure, Outputs, Pose, Rig, png_data_uri
 
 SCENE = "corridor@1+log+0"
@@ -71,13 +71,8 @@ def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
     binary = os.environ.get("WILDCITY_BIN")
     assert binary, "set WILDCITY_BIN to the built wildcity binary"
     folder = tmp_path_factory.mktemp("alpasim")
-    write_corridor(folder / "corridor.ply")
-    write_log(folder / "log.json")
     write_rig(folder / "rig.json")
-    twins = ["--twins", str(folder / "twins")]
-    files = ["--trajectory", str(folder / "log.json"), "--rig", str(folder / "rig.json")]
-    importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
-    subprocess.run([*importing, *twins, *files], check=True, timeout=60)
+    twins = import_corridor(folder, "--rig", folder / "rig.json")
     subprocess.run([binary, "actor", "generate", *twins], check=True, timeout=120, stdout=subprocess.DEVNULL)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0", "--alpasim", "127.0.0.1:0"]
     serving += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads")]
@@ -391,11 +386,7 @@ def test_a_public_address_needs_consent() -> None:
 def test_a_server_that_stops_answers_unavailable(tmp_path: Path) -> None:
     """AlpaSim's runtime tries again after this status."""
     binary = os.environ["WILDCITY_BIN"]
-    write_corridor(tmp_path / "corridor.ply")
-    write_log(tmp_path / "log.json")
-    twins = ["--twins", str(tmp_path / "twins")]
-    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
-    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    twins = import_corridor(tmp_path)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0", "--alpasim", "127.0.0.1:0", "--backend", "reference"]
     serving += ["--episodes", str(tmp_path / "e"), "--uploads", str(tmp_path / "u")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True) as process:

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
-from test_end_to_end import write_corridor, write_log
+from test_end_to_end import import_corridor, write_corridor
 
 EPOCH_US = 1_700_000_000_000_000
 
@@ -26,11 +26,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, byte
     binary = os.environ.get("WILDCITY_BIN")
     assert binary, "set WILDCITY_BIN to the built wildcity binary"
     folder = tmp_path_factory.mktemp("export")
-    write_corridor(folder / "corridor.ply")
-    write_log(folder / "log.json")
-    twins = ["--twins", str(folder / "twins")]
-    importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor", *twins]
-    subprocess.run([*importing, "--trajectory", str(folder / "log.json")], check=True, timeout=60)
+    twins = import_corridor(folder)
     exporting = [binary, "alpasim", "export", "corridor", "--out", str(folder / "scenes"), *twins]
     done = subprocess.run([*exporting, "--every-m", "4", "--length-s", "1"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -85,11 +81,7 @@ def test_one_sequence_without_tracks(scenes: dict[str, dict[str, bytes]]) -> Non
 
 def test_tracks_are_within_the_scene_by_the_middle_of_their_boxes(tmp_path: Path) -> None:
     binary = os.environ["WILDCITY_BIN"]
-    write_corridor(tmp_path / "corridor.ply")
-    write_log(tmp_path / "log.json")
-    twins = ["--twins", str(tmp_path / "twins")]
-    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
-    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    twins = import_corridor(tmp_path)
     made = subprocess.run([binary, "actor", "generate", *twins], capture_output=True, text=True, check=True, timeout=120)
     (sedan,) = (line.split()[1] for before, line in itertools.pairwise(made.stdout.splitlines()) if "actor sedan:" in before)
 
@@ -147,11 +139,7 @@ def test_tracks_are_within_the_scene_by_the_middle_of_their_boxes(tmp_path: Path
 )
 def test_bad_tracks_are_refused(tmp_path: Path, text: str, message: str) -> None:
     binary = os.environ["WILDCITY_BIN"]
-    write_corridor(tmp_path / "corridor.ply")
-    write_log(tmp_path / "log.json")
-    twins = ["--twins", str(tmp_path / "twins")]
-    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
-    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    twins = import_corridor(tmp_path)
     (tmp_path / "tracks.json").write_text(text)
     exporting = [binary, "alpasim", "export", "corridor", "--out", str(tmp_path / "scenes"), *twins]
     done = subprocess.run([*exporting, "--tracks", str(tmp_path / "tracks.json")], capture_output=True, text=True)

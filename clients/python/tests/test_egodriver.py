@@ -17,7 +17,7 @@ from carla_driver_interface.driver import BaseDriver, DriveContext, DriveResult
 from carla_driver_interface.geometry import Pose, Trajectory
 from carla_driver_interface.policies import load_policy
 from carla_driver_interface.server import serving
-from test_end_to_end import PAIR, Server, server, write_corridor, write_log
+from test_end_to_end import PAIR, Server, import_corridor, server
 
 COMMON = ["--steps", "6", "--warm-up-us", "500000", "--cameras", "front", "--size", "96x64", "--rig", "vehicle6"]
 
@@ -166,12 +166,7 @@ def test_episodes_run_beside_each_other(server: Server) -> None:
 
 def test_a_driver_follows_a_scenario_to_its_end(tmp_path: Path) -> None:
     """The route is the scenario's, 1 m beside the recorded drive, and its rule ends the episode."""
-    binary = os.environ["WILDCITY_BIN"]
-    write_corridor(tmp_path / "corridor.ply")
-    write_log(tmp_path / "log.json")
-    twins = ["--twins", str(tmp_path / "twins")]
-    importing = [binary, "import", str(tmp_path / "corridor.ply"), "--twin", "corridor", *twins]
-    subprocess.run([*importing, "--trajectory", str(tmp_path / "log.json")], check=True, timeout=60)
+    import_corridor(tmp_path)
     scenario = {
         "format": "wildcity.scenario/1",
         "name": "aside",
@@ -198,12 +193,8 @@ def test_a_driver_follows_a_scenario_to_its_end(tmp_path: Path) -> None:
 def run_suite(folder: Path, agent: str) -> tuple[int, dict[str, Any]]:
     """Runs a scenario of 0.6 s along the corridor, and returns the exit code and result.json."""
     binary = os.environ["WILDCITY_BIN"]
-    write_corridor(folder / "corridor.ply")
-    write_log(folder / "log.json")
     (folder / "rig.json").write_text(json.dumps(wildcity.protocol.encode(PAIR)))
-    twins = ["--twins", str(folder / "twins")]
-    files = ["--trajectory", str(folder / "log.json"), "--rig", str(folder / "rig.json")]
-    subprocess.run([binary, "import", str(folder / "corridor.ply"), "--twin", "corridor", *files, *twins], check=True)
+    twins = import_corridor(folder, "--rig", folder / "rig.json")
     scenario = {
         "format": "wildcity.scenario/1",
         "name": "straight",

@@ -89,14 +89,9 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     binary = os.environ.get("WILDCITY_BIN")
     assert binary, "set WILDCITY_BIN to the built wildcity binary"
     folder = tmp_path_factory.mktemp("end_to_end")
-    write_corridor(folder / "corridor.ply")
-    write_log(folder / "log.json")
-    twins = ["--twins", str(folder / "twins")]
-    files = ["--trajectory", str(folder / "log.json"), "--geo", ",".join(map(str, ORIGIN))]
-    importing = [binary, "import", str(folder / "corridor.ply"), "--twin", "corridor"]
-    subprocess.run([*importing, *twins, *files], check=True, timeout=60)
+    twins = import_corridor(folder, "--geo", ",".join(map(str, ORIGIN)))
     zone = ["--twin", "zone", "--geo", ",".join(map(str, ZONE_ORIGIN))]
-    subprocess.run([*importing[:3], *zone, *twins], check=True, timeout=60)
+    subprocess.run([binary, "import", folder / "corridor.ply", *zone, *twins], check=True, timeout=60)
     serving = [binary, "serve", *twins, "--listen", "127.0.0.1:0"]
     serving += ["--episodes", str(folder / "episodes"), "--uploads", str(folder / "uploads")]
     with subprocess.Popen(serving, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
@@ -546,6 +541,16 @@ def listening_url(process: subprocess.Popen[str]) -> str:
         if line.startswith("listening on "):
             return line.removeprefix("listening on ").strip()
     raise AssertionError("the server did not say where it listens")
+
+
+def import_corridor(folder: Path, *options: str | Path) -> list[str]:
+    """Imports the corridor and its recorded drive into `folder`/twins. Returns the arguments that name these twins."""
+    write_corridor(folder / "corridor.ply")
+    write_log(folder / "log.json")
+    twins = ["--twins", str(folder / "twins")]
+    files = [folder / "corridor.ply", "--twin", "corridor", "--trajectory", folder / "log.json"]
+    subprocess.run([os.environ["WILDCITY_BIN"], "import", *files, *twins, *options], check=True, timeout=60)
+    return twins
 
 
 def write_corridor(path: Path) -> None:

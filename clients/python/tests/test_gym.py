@@ -15,7 +15,7 @@ import pytest
 import wildcity
 import wildcity.gym
 from gymnasium.utils.env_checker import check_env
-from test_end_to_end import PAIR, Server, server, write_corridor, write_log
+from test_end_to_end import PAIR, Server, import_corridor, server
 from wildcity import Drive, DrivePose, Pose, Refused, ServeFailed, Station, serving
 from wildcity.gym import DriveConfig, DriveEnv, DriveState, DriveVectorEnv, Route
 
@@ -335,12 +335,8 @@ def test_a_route_that_crosses_itself_is_followed_by_its_stations() -> None:
 
 
 def test_serve_starts_and_stops_the_program(tmp_path: Path) -> None:
-    write_corridor(tmp_path / "corridor.ply")
-    write_log(tmp_path / "log.json")
-    twins = tmp_path / "twins"
-    importing = [serving.binary(), "import", tmp_path / "corridor.ply", "--twin", "corridor"]
-    serving.subprocess.run([*importing, "--twins", twins, "--trajectory", tmp_path / "log.json"], check=True)
-    with wildcity.serve(twins, memory_gib=1) as running:
+    import_corridor(tmp_path)
+    with wildcity.serve(tmp_path / "twins", memory_gib=1) as running:
         process = running.process
         with wildcity.connect(running.url) as client:
             assert [twin.name for twin in client.welcome.twins] == ["corridor"]
