@@ -3,7 +3,6 @@
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
-use std::process::Output;
 
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::{Value, json};
@@ -13,24 +12,8 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Rig, Trajectory};
 use wildcity_twin::store::{Catalog, CommitKind, StorageOptions, VersionChange};
 
+use crate::in_folder::{done, refused};
 use crate::scene_files::{inria_columns, ply};
-use crate::wildcity;
-
-fn run(dir: &Path, arguments: &[&str]) -> Output {
-    wildcity().args(arguments).current_dir(dir).env("XDG_DATA_HOME", dir).output().unwrap()
-}
-
-fn done(dir: &Path, arguments: &[&str]) -> String {
-    let output = run(dir, arguments);
-    assert!(output.status.success(), "{arguments:?}: {output:?}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-fn refused(dir: &Path, arguments: &[&str]) -> String {
-    let output = run(dir, arguments);
-    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {output:?}");
-    String::from_utf8(output.stderr).unwrap()
-}
 
 /// The axes of a capture: the street, upside down, tilted, moved, and half as large.
 fn capture_from_street() -> (Pose, f64) {

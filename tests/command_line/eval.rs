@@ -2,36 +2,19 @@
 
 use std::fs;
 use std::path::Path;
-use std::process::Output;
 
 use glam::{DMat3, DVec3};
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::{Value, json};
 
 use crate::data::real;
+use crate::in_folder::{done, refused};
 use crate::scene_files::{gaussians, inria_columns, ply};
-use crate::wildcity;
 
 const WIDTH: u32 = 120;
 const HEIGHT: u32 = 80;
 /// What is added to each value of the image `b`, of 255.
 const OFF: u8 = 10;
-
-fn run(dir: &Path, arguments: &[&str]) -> Output {
-    wildcity().args(arguments).current_dir(dir).env("XDG_DATA_HOME", dir).output().unwrap()
-}
-
-fn done(dir: &Path, arguments: &[&str]) -> String {
-    let output = run(dir, arguments);
-    assert!(output.status.success(), "{arguments:?}: {output:?}");
-    String::from_utf8(output.stdout).unwrap()
-}
-
-fn refused(dir: &Path, arguments: &[&str]) -> String {
-    let output = run(dir, arguments);
-    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {output:?}");
-    String::from_utf8(output.stderr).unwrap()
-}
 
 /// Names, positions and the rows of `R_world_to_cam` of cameras that look at the origin, each rolled a little.
 fn cameras() -> Vec<(&'static str, DVec3, [DVec3; 3])> {

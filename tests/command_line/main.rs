@@ -52,6 +52,7 @@ mod eval;
 mod garbage;
 mod generate;
 mod import;
+mod in_folder;
 mod kills;
 mod load;
 mod operations;

@@ -31,7 +31,7 @@ use wildcity_twin::store::{Catalog, RetryPolicy, StoreError};
 use crate::disk::{Fault, Plant, SimClock};
 use crate::medium::Medium;
 use crate::random::Random;
-use crate::reads::{BadReads, Carries, ReadFault};
+use crate::reads::{BadReads, Carries, ReadFault, Reads};
 
 /// Prefix of the twins' keys.
 const PREFIX: &str = "twins";
@@ -72,9 +72,7 @@ struct State {
     plant: Option<Plant>,
     /// Objects whose put was answered and is not done ([`Plant::RecordBeforeObjects`]).
     withheld: Vec<(Key, Bytes)>,
-    bad_reads: Option<BadReads>,
-    /// Number of reads that failed or were damaged.
-    failed_reads: u64,
+    reads: Reads,
     /// What counts as absent ([`Plant::FailedReadIsAbsent`]).
     absent: BTreeSet<Key>,
 }
@@ -117,8 +115,7 @@ impl SimBucket {
             delayed: Vec::new(),
             plant,
             withheld: Vec::new(),
-            bad_reads: None,
-            failed_reads: 0,
+            reads: Reads::default(),
             absent: BTreeSet::new(),
         };
         Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
@@ -143,19 +140,12 @@ impl SimBucket {
         if state.absent.contains(key) {
             return Err(not_found(key));
         }
-        let fault = BadReads::next(&mut state.bad_reads, carries);
-        match fault {
-            None => {}
-            Some(ReadFault::Slow) => self.clock.wait(ReadFault::SLOW_US),
-            Some(fault) => {
-                state.failed_reads += 1;
-                if state.plant == Some(Plant::FailedReadIsAbsent) {
-                    state.absent.insert(key.clone());
-                }
-                if fault == ReadFault::Error {
-                    return Err(refused());
-                }
-            }
+        let fault = state.reads.next(carries, |us| self.clock.wait(us));
+        if fault.is_some() && state.plant == Some(Plant::FailedReadIsAbsent) {
+            state.absent.insert(key.clone());
+        }
+        if fault == Some(ReadFault::Error) {
+            return Err(refused());
         }
         Ok((state, fault))
     }
@@ -268,7 +258,7 @@ impl State {
     fn end_process(&mut self, random: &mut Random, now_us: i64) {
         self.fault = None;
         self.refusals = None;
-        self.bad_reads = None;
+        self.reads.planned = None;
         self.withheld.clear();
         self.absent.clear();
         let Some(last) = self.last.take() else { return };
@@ -311,23 +301,23 @@ impl Medium for SimBucket {
     }
 
     fn fail_reads(&self, reads: BadReads) {
-        self.lock_state().bad_reads = Some(reads);
+        self.lock_state().reads.planned = Some(reads);
     }
 
     fn stop_failing_reads(&self) {
-        self.lock_state().bad_reads = None;
+        self.lock_state().reads.planned = None;
     }
 
     fn take_failed_reads(&self) -> bool {
         // A single request is repeated.
-        std::mem::take(&mut self.lock_state().failed_reads) >= u64::from(TRIES)
+        self.lock_state().reads.take_failed() >= u64::from(TRIES)
     }
 
     fn stop_failing(&self) {
         let mut state = self.lock_state();
         state.fault = None;
         state.refusals = None;
-        state.bad_reads = None;
+        state.reads.planned = None;
     }
 
     fn is_stopped(&self) -> bool {

@@ -18,7 +18,7 @@ use wildcity_twin::store::disk::{
 };
 
 use super::random::Random;
-use super::reads::{BadReads, Carries, ReadFault};
+use super::reads::{BadReads, Carries, ReadFault, Reads};
 
 /// The root of the disk.
 pub(crate) const ROOT: &str = "/twins";
@@ -121,9 +121,7 @@ struct State {
     plant: Option<Plant>,
     /// Directories whose sync is withheld until the record's ([`Plant::RecordBeforeObjects`]).
     withheld: Vec<PathBuf>,
-    bad_reads: Option<BadReads>,
-    /// Number of reads that failed or were damaged.
-    failed_reads: u64,
+    reads: Reads,
     /// What counts as absent ([`Plant::FailedReadIsAbsent`]).
     absent: BTreeSet<PathBuf>,
 }
@@ -161,8 +159,7 @@ impl SimDisk {
             stopped_by: None,
             plant,
             withheld: Vec::new(),
-            bad_reads: None,
-            failed_reads: 0,
+            reads: Reads::default(),
             absent: BTreeSet::new(),
         };
         Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
@@ -175,12 +172,12 @@ impl SimDisk {
 
     /// Lets some reads fail, or none.
     pub(crate) fn set_bad_reads(&self, reads: Option<BadReads>) {
-        self.lock_state().bad_reads = reads;
+        self.lock_state().reads.planned = reads;
     }
 
     /// Number of reads that failed or were damaged since this was last called.
     pub(crate) fn take_failed_reads(&self) -> u64 {
-        std::mem::take(&mut self.lock_state().failed_reads)
+        self.lock_state().reads.take_failed()
     }
 
     /// Whether a fault waits for its write.
@@ -204,7 +201,7 @@ impl SimDisk {
         let mut state = self.lock_state();
         state.locked.clear();
         state.fault = None;
-        state.bad_reads = None;
+        state.reads.planned = None;
         state.withheld.clear();
         state.absent.clear();
         if state.stopped_by.take() == Some(Fault::PowerCut) {
@@ -246,20 +243,13 @@ impl SimDisk {
         if state.absent.contains(path) {
             return Err(not_found());
         }
-        let fault = BadReads::next(&mut state.bad_reads, carries);
-        match fault {
-            None => {}
-            Some(ReadFault::Slow) => self.clock.wait(ReadFault::SLOW_US),
-            Some(fault) => {
-                state.failed_reads += 1;
-                if state.plant == Some(Plant::FailedReadIsAbsent) {
-                    state.absent.insert(path.to_owned());
-                }
-                // What has content may fail later, when that is read.
-                if fault == ReadFault::Error && carries == Carries::Names {
-                    return Err(failed_read());
-                }
-            }
+        let fault = state.reads.next(carries, |us| self.clock.wait(us));
+        if fault.is_some() && state.plant == Some(Plant::FailedReadIsAbsent) {
+            state.absent.insert(path.to_owned());
+        }
+        // What has content may fail later, when that is read.
+        if fault == Some(ReadFault::Error) && carries == Carries::Names {
+            return Err(failed_read());
         }
         Ok((state, fault))
     }

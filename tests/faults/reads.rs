@@ -25,7 +25,7 @@ pub(crate) enum Carries {
     Digested,
 }
 
-/// Reads that fail.
+/// Reads that fail, one after the other.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BadReads {
     /// Reads before the first of them.
@@ -35,10 +35,37 @@ pub(crate) struct BadReads {
     pub(crate) times: u64,
 }
 
-impl BadReads {
-    /// What is wrong with the next read, of the reads that are planned.
-    pub(crate) fn next(planned: &mut Option<Self>, carries: Carries) -> Option<ReadFault> {
-        let reads = planned.as_mut()?;
+/// The reads of a disk or bucket.
+#[derive(Debug, Default)]
+pub(crate) struct Reads {
+    /// Those that will fail.
+    pub(crate) planned: Option<BadReads>,
+    /// Number of reads that failed or were damaged.
+    failed: u64,
+}
+
+impl Reads {
+    /// What is wrong with the next read. A slow one waits for some microseconds, and nothing else is wrong with it.
+    pub(crate) fn next(&mut self, carries: Carries, wait: impl FnOnce(i64)) -> Option<ReadFault> {
+        match self.next_planned(carries)? {
+            ReadFault::Slow => {
+                wait(ReadFault::SLOW_US);
+                None
+            }
+            fault => {
+                self.failed += 1;
+                Some(fault)
+            }
+        }
+    }
+
+    /// Number of reads that failed or were damaged since this was last called.
+    pub(crate) fn take_failed(&mut self) -> u64 {
+        std::mem::take(&mut self.failed)
+    }
+
+    fn next_planned(&mut self, carries: Carries) -> Option<ReadFault> {
+        let reads = self.planned.as_mut()?;
         if reads.after > 0 {
             reads.after -= 1;
             return None;
@@ -54,7 +81,7 @@ impl BadReads {
         }
         reads.times -= 1;
         if reads.times == 0 {
-            *planned = None;
+            self.planned = None;
         }
         Some(fault)
     }
