@@ -41,4 +41,4 @@ pub use lines::{
 };
 pub use listing::{Listed, list, read_mcap, read_text, record_bytes};
 pub use outcome::result;
-pub use scenario::{DriveStart, pose_at, scenario_line};
+pub use scenario::{DriveStart, ground_of, pose_at, scenario_line};

@@ -44,6 +44,10 @@ pub struct ScenarioLine {
     /// The lanes of a map near the route; none without a map.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub lanes: Vec<LaneLine>,
+    /// The road under the lanes for vehicles, each by the points of its middle line; none without a map. The ego stands
+    /// on it where no recorded drive is near.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub ground: Vec<Vec<GroundPoint>>,
     /// Whether contact with the twin's Gaussians is looked for.
     #[serde(default)]
     pub checks_static: bool,
@@ -75,6 +79,24 @@ pub struct ActorLine {
 /// A point of the recorded drive: time since the episode's start in microseconds, and place in metres.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RoutePoint(pub i64, pub [f64; 3]);
+
+/// A point of a road: place in metres, and unit normal, which is left out if it is vertical.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct GroundPoint {
+    /// Where it is.
+    pub at: [f64; 3],
+    /// The normal.
+    #[serde(default = "vertical", skip_serializing_if = "is_vertical")]
+    pub up: [f64; 3],
+}
+
+fn vertical() -> [f64; 3] {
+    [0.0, 0.0, 1.0]
+}
+
+fn is_vertical(up: &[f64; 3]) -> bool {
+    *up == vertical()
+}
 
 /// A lane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -1,12 +1,14 @@
 //! The line of a scenario: what a record needs of it to be judged later.
 
+use glam::{DVec2, DVec3};
+
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
-use wildcity_sim::map::{AreaKind, LaneKind, Map};
+use wildcity_sim::map::{AreaKind, LaneKind, LaneSurface, Map, SurfacePoint};
 use wildcity_sim::scenario::{ContactRule, EgoStart, Scenario};
 
-use crate::lines::{ActorLine, EgoLine, LaneLine, RoutePoint, ScenarioLine};
+use crate::lines::{ActorLine, EgoLine, GroundPoint, LaneLine, RoutePoint, ScenarioLine};
 
 /// Distance between two points of a route that was not driven, in metres.
 const SPACING_M: f64 = 2.0;
@@ -36,11 +38,30 @@ pub fn scenario_line(
         ego: EgoLine::new(&resolved.traffic.ego_box),
         actors: actors.map(|actor| ActorLine::new(&actor.spec)).collect(),
         lanes: map.map_or(Vec::new(), |map| lanes(map, &route)),
+        ground: map.map_or(Vec::new(), |map| ground_lines(map.surface())),
         route,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
         checks_static: resolved.end.contact == Some(ContactRule::Static),
     }
+}
+
+fn ground_lines(surface: &LaneSurface) -> Vec<Vec<GroundPoint>> {
+    let point = |point: &SurfacePoint| GroundPoint {
+        at: point.position_m.to_array(),
+        up: point.up.to_array(),
+    };
+    surface.lines().map(|line| line.iter().map(point).collect()).collect()
+}
+
+/// The road that a line of a scenario tells of; none without a map.
+pub fn ground_of(line: &ScenarioLine) -> Option<LaneSurface> {
+    let point = |point: &GroundPoint| SurfacePoint {
+        position_m: DVec3::from_array(point.at),
+        up: DVec3::from_array(point.up),
+    };
+    let lines = line.ground.iter().map(|line| line.iter().map(point).collect());
+    (!line.ground.is_empty()).then(|| LaneSurface::from_lines(lines))
 }
 
 /// The place on a recorded drive where an episode starts.
@@ -132,7 +153,7 @@ fn lanes(map: &Map, route: &[RoutePoint]) -> Vec<LaneLine> {
     let of_lanes = driving.map(|(index, lane)| {
         let outline = lane.left.iter().chain(lane.right.iter().rev()).map(flat).collect();
         let is_on = |point: &RoutePoint| {
-            let place_m = glam::DVec2::new(point.1[0], point.1[1]);
+            let place_m = DVec2::new(point.1[0], point.1[1]);
             map.lanes_at(place_m).any(|at| at == index)
         };
         let center = lane.center.iter().map(flat).collect();

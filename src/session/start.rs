@@ -7,6 +7,7 @@ use wildcity_scene::random::Random;
 use wildcity_scene::route::Route;
 use wildcity_scene::trajectory::Keyframe;
 use wildcity_scene::{Manifest, Trajectory};
+use wildcity_sim::map::LaneSurface;
 use wildcity_sim::{Dynamics, Ego, Ground};
 
 use crate::episode::Episode;
@@ -24,7 +25,8 @@ pub(crate) struct EpisodeStart {
 }
 
 impl EpisodeStart {
-    /// Resolves a start; `seed` is that of the episode. Without a start, the episode starts where the first recorded drive begins, or after
+    /// Resolves a start; `seed` is that of the episode, `lanes` the road of its scenario's
+    /// map. Without a start, the episode starts where the first recorded drive begins, or after
     /// `warm_up_us` of that drive; on a twin without a drive, at the world's origin.
     ///
     /// # Errors
@@ -35,6 +37,7 @@ impl EpisodeStart {
         warm_up_us: i64,
         dynamics: Dynamics,
         seed: u64,
+        lanes: Option<&LaneSurface>,
     ) -> Result<Self, SessionError> {
         let drives = &manifest.trajectories;
         let mut resolved = match start {
@@ -45,7 +48,7 @@ impl EpisodeStart {
             Some(Start::Random(random)) => Self::at_random(drives, random, warm_up_us, seed)?,
             None => Self::at_first_drive(drives, warm_up_us)?,
         };
-        let ground = Ground::from_drives(drives);
+        let ground = Ground::from_drives(drives).and_lanes(lanes);
         resolved.world_from_rig = dynamics.start_pose(resolved.world_from_rig, &ground);
         Ok(resolved)
     }
@@ -187,10 +190,9 @@ impl EpisodeStart {
         Self { warm_up, world_from_rig }
     }
 
-    /// The same start for other dynamics, on the ground if they need one.
-    pub(crate) fn placed(&self, manifest: &Manifest, dynamics: Dynamics) -> Self {
-        let ground = Ground::from_drives(&manifest.trajectories);
-        let world_from_rig = dynamics.start_pose(self.world_from_rig, &ground);
+    /// The same start for other dynamics, on this ground if they need one.
+    pub(crate) fn placed(&self, ground: &Ground<'_>, dynamics: Dynamics) -> Self {
+        let world_from_rig = dynamics.start_pose(self.world_from_rig, ground);
         Self { warm_up: self.warm_up.clone(), world_from_rig }
     }
 

@@ -1,51 +1,71 @@
-//! The ground under the ego, derived from recorded drives.
+//! The ground under cars and pedestrians: recorded drives, and the lanes of a map where no drive is near.
 //!
 //! A rig's origin is on the ground under its rear axle, and its z axis is normal to the ground. So every
 //! keyframe of a recorded drive defines a ground plane: through its origin, perpendicular to its z axis. This
 //! needs only the manifest and works for every twin with a drive. The Gaussians represent surfaces, most of
-//! which are not ground, and classifying them would be a guess. In a twin without a drive there is no ground,
-//! and a car stays in its own plane.
+//! which are not ground, and classifying them would be a guess.
+//!
+//! A scenario may have a map. Its lanes for vehicles define the ground where no drive is near: a drive was on the
+//! road, a map may be off by its survey. Where neither is near there is no ground, and a car stays in its own plane.
 
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::limits;
+use crate::map::LaneSurface;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 
-/// The ground defined by recorded drives.
+/// The ground defined by recorded drives and lanes.
 #[derive(Clone, Copy, Debug)]
 pub struct Ground<'a> {
     drives: &'a [Trajectory],
+    lanes: Option<&'a LaneSurface>,
 }
 
 /// A plane through a point, with unit normal `up`.
-struct Plane {
-    point_m: DVec3,
-    up: DVec3,
+pub(crate) struct Plane {
+    pub(crate) point_m: DVec3,
+    pub(crate) up: DVec3,
 }
 
 impl<'a> Ground<'a> {
     /// The ground of some recorded drives.
     pub fn from_drives(drives: &'a [Trajectory]) -> Self {
-        Self { drives }
+        Self { drives, lanes: None }
+    }
+
+    /// The same, and lanes where no drive is near.
+    pub fn and_lanes(self, lanes: Option<&'a LaneSurface>) -> Self {
+        Self { lanes, ..self }
     }
 
     /// Places a pose (`world_from_rig`) on the ground: moves it vertically onto the ground plane and tilts it to
     /// the plane's normal, keeping its heading. A pose farther than [`limits::GROUND_NEAR_M`] from every drive
-    /// is returned unchanged.
+    /// and lane is returned unchanged.
     ///
-    /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are distinguished.
-    /// Between keyframes it is interpolated. Every keyframe is tested: 170,000 take a millisecond.
+    /// The plane is that of the nearest drive in 3D, so a bridge and the street below it are distinguished; of the
+    /// nearest lane if no drive is that near. Between keyframes, and between points of a lane, it is interpolated.
+    /// Every keyframe is tested: 170,000 take a millisecond.
     pub fn place(&self, world_from_rig: Pose) -> Pose {
         self.find(world_from_rig).unwrap_or(world_from_rig)
     }
 
     /// As [`Ground::place`]; `None` for a pose that it leaves unchanged because there is no ground, or no heading.
     pub fn find(&self, world_from_rig: Pose) -> Option<Pose> {
-        self.under(world_from_rig.position_m)?.place(world_from_rig)
+        let point_m = world_from_rig.position_m;
+        if let Some(plane) = self.of_drives(point_m) {
+            return plane.place(world_from_rig);
+        }
+        let plane = self.lanes?.plane_near(point_m, limits::GROUND_NEAR_M)?;
+        if plane.up == DVec3::Z && is_upright(world_from_rig.rotation) {
+            // A flat map changes no orientation, not even by rounding.
+            let position_m = DVec3::new(point_m.x, point_m.y, plane.point_m.z);
+            return Some(Pose { position_m, ..world_from_rig });
+        }
+        plane.place(world_from_rig)
     }
 
-    fn under(&self, point_m: DVec3) -> Option<Plane> {
+    fn of_drives(&self, point_m: DVec3) -> Option<Plane> {
         let mut nearest_m = limits::GROUND_NEAR_M;
         let mut under = None;
         for drive in self.drives {
@@ -66,6 +86,12 @@ impl<'a> Ground<'a> {
         let pose = from.interpolate(to, t);
         Some(Plane { point_m: pose.position_m, up: pose.rotation * DVec3::Z })
     }
+}
+
+/// Whether the z axis is exactly vertical.
+fn is_upright(rotation: DQuat) -> bool {
+    let up = rotation * DVec3::Z;
+    up.x == 0.0 && up.y == 0.0 && up.z > 0.0
 }
 
 impl Plane {
@@ -93,6 +119,7 @@ impl Plane {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::map::SurfacePoint;
     use wildcity_scene::trajectory::Keyframe;
 
     /// A bridge uphill along x with a slope of 0.1, above a level street along y.
@@ -153,6 +180,43 @@ mod tests {
         };
         assert_eq!(Ground::from_drives(&drives).find(upwards), None);
         assert_eq!(Ground::from_drives(&drives).place(upwards), upwards);
+    }
+
+    #[test]
+    fn lanes_are_the_ground_where_no_drive_is_near() {
+        let drives = drives();
+        let up = DVec3::new(0.0, -0.06, 1.0).normalize();
+        let point =
+            |y_m: f64| SurfacePoint { position_m: DVec3::new(0.0, y_m, 1.0 + 0.06 * y_m), up };
+        let lanes = LaneSurface::from_lines([vec![point(-100.0), point(100.0)]]);
+        let ground = Ground::from_drives(&drives).and_lanes(Some(&lanes));
+        let at = |y_m: f64| {
+            let rotation = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2);
+            ground.place(Pose { position_m: DVec3::new(0.0, y_m, 5.0), rotation })
+        };
+        // The bridge begins 3 m above the lane's origin.
+        assert!((at(0.0).position_m.z - 8.0).abs() < 1e-12);
+        let placed = at(60.0);
+        assert!((placed.position_m.z - 4.6).abs() < 1e-12, "{placed:?}");
+        let ahead = placed.rotation * DVec3::X;
+        assert!((ahead.z / ahead.y - 0.06).abs() < 1e-12 && ahead.x.abs() < 1e-12, "{ahead}");
+        assert_eq!(at(200.0).position_m.z, 5.0);
+    }
+
+    /// Frame hashes of episodes on flat maps depend on it.
+    #[test]
+    fn a_flat_lane_changes_no_bit_of_an_upright_pose() {
+        let point = |x_m: f64| SurfacePoint { position_m: DVec3::X * x_m, up: DVec3::Z };
+        let lanes = LaneSurface::from_lines([vec![point(0.0), point(50.0)]]);
+        let ground = Ground::from_drives(&[]).and_lanes(Some(&lanes));
+        for heading_rad in [0.0, 0.3, 1.9, -2.7] {
+            let rotation = DQuat::from_rotation_z(heading_rad);
+            let pose = Pose { position_m: DVec3::new(7.3, 2.1, 0.0), rotation };
+            assert_eq!(ground.find(pose), Some(pose));
+            let tilted = Pose { rotation: rotation * DQuat::from_rotation_y(0.1), ..pose };
+            let up = ground.place(tilted).rotation * DVec3::Z;
+            assert!((up - DVec3::Z).length() < 1e-12, "{up}");
+        }
     }
 
     /// The distance includes the difference in height.

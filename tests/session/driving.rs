@@ -27,11 +27,19 @@ pub(crate) fn bench(cache: Cache) -> Bench {
 }
 
 pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend>) -> Bench {
+    bench_of(cache, backend, Scenarios::in_dir(""))
+}
+
+pub(crate) fn bench_of(
+    cache: Cache,
+    backend: Arc<dyn wildcity_render::Backend>,
+    scenarios: Scenarios,
+) -> Bench {
     let episodes = tempfile::tempdir().unwrap();
     let engine = Engine::start(EngineSettings {
         cache,
         episodes: episodes.path().to_owned(),
-        scenarios: Scenarios::in_dir(""),
+        scenarios,
         backend,
         step_timeout: wildcity_session::limits::STEP_TIMEOUT,
         repairs: Arc::default(),

@@ -14,6 +14,7 @@ mod actors;
 mod before_actors;
 mod driving;
 mod fairness;
+mod lanes;
 mod long;
 mod solids;
 mod trust;

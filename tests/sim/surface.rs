@@ -29,7 +29,7 @@ fn map() -> Map {
 }
 
 #[test]
-fn actors_follow_the_tilt_of_drives_and_the_height_of_drives_and_lanes() {
+fn actors_follow_the_height_and_the_tilt_of_drives_and_lanes() {
     let scenario = json!({
     "format": "wildcity.scenario/1", "name": "hills", "twin": { "name": "street" },
     "map": { "file": "map.json" },
@@ -49,13 +49,13 @@ fn actors_follow_the_tilt_of_drives_and_the_height_of_drives_and_lanes() {
     let far = Pose { position_m: DVec3::new(0.0, 900.0, 0.0), ..Pose::IDENTITY };
     let ego = EgoState { world_from_rig: far, velocity_mps: DVec3::ZERO, yaw_rate_radps: 0.0 };
     let uphill = DVec3::new(-0.1, 0.0, 1.0).normalize();
+    let downhill = DVec3::new(0.05, 0.0, 1.0).normalize();
     for _ in 0..20 {
         world.step(100_000, &EgoMotion::standing(ego), &mut |_| {});
         for (state, actor) in world.states().iter().zip(&scenario.traffic.actors) {
             let Pose { position_m, rotation } = state.world_from_actor;
             let (height_m, up) = match &*actor.spec.name {
-                // Actors on lanes stay upright.
-                "down" => (30.0 - 0.05 * position_m.x, DVec3::Z),
+                "down" => (30.0 - 0.05 * position_m.x, downhill),
                 _ => (5.0 + 0.1 * position_m.x, uphill),
             };
             let off_m = (position_m.z - height_m).abs();

@@ -2,11 +2,13 @@
 
 use std::sync::Arc;
 
+use wildcity_episode::ground_of;
 use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_repair::Models;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::rig::RigCamera;
 use wildcity_sim::Ground;
+use wildcity_sim::map::LaneSurface;
 use wildcity_twin::residency::{Cache, Resident};
 
 use super::actor_replay::ActorReplay;
@@ -91,6 +93,8 @@ struct Replay<'a> {
     resident: Arc<Resident>,
     profile: &'a RenderProfile,
     ego: EgoReplay,
+    /// The road of the scenario's map, if it has one.
+    lanes: Option<LaneSurface>,
     actors: ActorReplay<'a>,
     /// Lines of the file, from 1, at which the frames are.
     frame_lines: &'a [usize],
@@ -143,6 +147,7 @@ impl<'a> Replay<'a> {
             resident,
             profile: &header.profile,
             ego: EgoReplay::new(header),
+            lanes: episode.scenario.as_ref().and_then(|line| ground_of(line)),
             actors,
             frame_lines: &episode.frame_lines,
             repair,
@@ -177,7 +182,8 @@ impl<'a> Replay<'a> {
 
     /// Drives the step of a frame, if it is one.
     fn drive(&mut self, frame: &FrameRecord, index: usize) -> Result<(), ReplayError> {
-        let ground = Ground::from_drives(&self.resident.version.manifest.trajectories);
+        let ground = Ground::from_drives(&self.resident.version.manifest.trajectories)
+            .and_lanes(self.lanes.as_ref());
         let diverged = self
             .ego
             .drive(frame, self.frame_lines[index], &ground)

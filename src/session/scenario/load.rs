@@ -10,7 +10,7 @@ use serde_json::Value;
 use wildcity_scene::Manifest;
 use wildcity_scene::rig::is_name;
 use wildcity_sim::limits::{MAP_BYTES, SCENARIO_BYTES};
-use wildcity_sim::map::{Map, MapFile};
+use wildcity_sim::map::{LaneSurface, Map, MapFile};
 use wildcity_sim::scenario::{
     AssetInfo, Document, FileError, Scenario, ScenarioFile, Surroundings, TracksFile,
 };
@@ -41,6 +41,13 @@ pub struct LoadedScenario {
     pub hash: String,
     /// Hashes that differ from those that the scenario names; always empty unless they are ignored.
     pub unpinned: Vec<String>,
+}
+
+impl LoadedScenario {
+    /// The road under the lanes of its map, if it names one.
+    pub(crate) fn lanes(&self) -> Option<&LaneSurface> {
+        self.map.as_ref().map(Map::surface)
+    }
 }
 
 /// Why a scenario cannot be used.

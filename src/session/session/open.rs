@@ -143,6 +143,7 @@ impl Session {
             options.warm_up_us,
             options.dynamics,
             options.seed,
+            loaded.as_ref().and_then(|found| found.loaded.lanes()),
         )?;
         let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
         let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));

@@ -68,8 +68,10 @@ impl Session {
     ) -> Result<Observation, SessionError> {
         let steps = self.plan_steps(&command, options.until_us)?;
         check_notes(options.notes.as_ref())?;
-        let ground = Ground::from_drives(&self.resident().version.manifest.trajectories);
         let now = &self.state.episode;
+        let lanes = self.state.traffic.as_ref().and_then(|traffic| traffic.loaded().lanes());
+        let ground =
+            Ground::from_drives(&self.resident().version.manifest.trajectories).and_lanes(lanes);
         let (mut next, egos) = now.followed(&command, steps, &ground, options.terminate)?;
         let traffic = self.state.traffic.as_ref();
         let traffic =
@@ -178,16 +180,22 @@ impl Session {
         let start = start
             .or_else(|| settings.random_start.clone().map(Start::Random))
             .or_else(|| settings.scenario.as_ref()?.start_of(&loaded.as_ref()?.loaded));
+        let manifest = &self.resident().version.manifest;
+        let lanes = loaded.as_ref().and_then(|found| found.loaded.lanes());
         let start = match &start {
             // Dynamics decide whether a start is placed on the ground.
             None if dynamics.model == settings.dynamics.model => settings.start.clone(),
-            None => settings.start.placed(&self.resident().version.manifest, dynamics),
+            None => {
+                let ground = Ground::from_drives(&manifest.trajectories).and_lanes(lanes);
+                settings.start.placed(&ground, dynamics)
+            }
             Some(start) => EpisodeStart::resolve(
-                &self.resident().version.manifest,
+                manifest,
                 Some(start),
                 settings.warm_up_us,
                 dynamics,
                 seed,
+                lanes,
             )
             .map_err(|error| error.of_reset(Some(start)))?,
         };

@@ -4,17 +4,20 @@
 //! |---|---|
 //! | `file` | `wildcity.map/1` |
 //! | `strips` | areas beside recorded drives, for twins without a map |
+//! | `surface` | the road under lanes |
 //! | `geojson`, `opendrive` | import |
 
 mod file;
 mod strips;
+mod surface;
 
 use std::collections::BTreeMap;
 
-use glam::{DVec2, DVec3};
+use glam::DVec2;
 
 pub use file::{Area, AreaKind, Lane, LaneKind, MapFile, StopLine};
 pub use strips::strips_beside;
+pub use surface::{LaneSurface, SurfacePoint};
 
 use crate::scenario::FileError;
 
@@ -27,6 +30,7 @@ pub struct Map {
     /// Outlines of the lanes, then of the areas, with their boxes.
     lanes: Vec<Outline>,
     areas: Vec<Outline>,
+    surface: LaneSurface,
 }
 
 /// A polygon seen from above.
@@ -48,12 +52,18 @@ impl Map {
         let indices = indices.map(|(index, lane)| (lane.id.clone(), index)).collect();
         let lanes = file.lanes.iter().map(Outline::of_lane).collect();
         let areas = file.areas.iter().map(|area| Outline::of(area.outline.iter())).collect();
-        Ok(Self { file, indices, lanes, areas })
+        let surface = LaneSurface::of_driving(&file.lanes);
+        Ok(Self { file, indices, lanes, areas, surface })
     }
 
     /// The file.
     pub fn file(&self) -> &MapFile {
         &self.file
+    }
+
+    /// The surface of the lanes for vehicles.
+    pub fn surface(&self) -> &LaneSurface {
+        &self.surface
     }
 
     /// A lane by its id.
@@ -87,19 +97,16 @@ impl Map {
         in_area || through
     }
 
-    /// The middle of lanes in order.
+    /// The surface of lanes in order. Their middle is the way along them.
     ///
     /// # Errors
     /// There is no such lane: the index within `ids`, and what to write.
-    pub(crate) fn center_of(&self, ids: &[String]) -> Result<Vec<DVec3>, (usize, String)> {
-        let mut points_m = Vec::new();
-        for (index, id) in ids.iter().enumerate() {
-            let Some(lane) = self.lane(id) else {
-                return Err((index, format!("there is no lane {id:?}; name a lane of the map")));
-            };
-            points_m.extend(lane.center.iter().map(|point| DVec3::from_array(*point)));
-        }
-        Ok(points_m)
+    pub(crate) fn surface_of(&self, ids: &[String]) -> Result<LaneSurface, (usize, String)> {
+        let lanes = ids.iter().enumerate().map(|(index, id)| {
+            let none = || (index, format!("there is no lane {id:?}; name a lane of the map"));
+            self.lane(id).ok_or_else(none)
+        });
+        Ok(LaneSurface::of(lanes.collect::<Result<Vec<_>, _>>()?.into_iter()))
     }
 }
 

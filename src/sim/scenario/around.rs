@@ -7,8 +7,8 @@ use wildcity_scene::{ActorBox, ActorClass, Trajectory};
 
 use super::error::{FileError, in_range, listed};
 use super::tracks::TracksFile;
-use crate::limits;
 use crate::map::Map;
+use crate::{Ground, limits};
 
 /// What a scenario refers to.
 #[derive(Clone, Copy)]
@@ -46,6 +46,13 @@ pub enum EgoStart {
         /// Distance along it, in metres.
         station_m: f64,
     },
+}
+
+impl Surroundings<'_> {
+    /// The ground that cars and pedestrians stand on.
+    pub(super) fn ground(&self) -> Ground<'_> {
+        Ground::from_drives(self.drives).and_lanes(self.map.map(Map::surface))
+    }
 }
 
 impl std::fmt::Debug for Surroundings<'_> {

@@ -8,8 +8,8 @@ use super::actor_file::{CollideSection, JitterDraw};
 use super::around::{Surroundings, drive_named};
 use super::error::{FileError, in_range};
 use super::jitter::{displaced, displacement_m, heading_rad};
+use crate::limits;
 use crate::traffic::{Track, TrackKeyframe};
-use crate::{Ground, limits};
 
 /// The track of a collision course, displaced by its jitter.
 pub(super) fn collide_of(
@@ -58,7 +58,7 @@ fn through_positions(
     let yaw_rad = in_range("yaw_rad", yaw_rad, [-100.0, 100.0])?;
     let first_rad = facing_rad(&points_m, 0).unwrap_or(yaw_rad);
     let shift_m = displacement_m(drawn, along_rad.unwrap_or(first_rad));
-    let ground = Ground::from_drives(around.drives);
+    let ground = around.ground();
     let mut heading_rad = first_rad;
     let keyframes =
         points_m.iter().zip(&times_us).enumerate().map(|(index, (point_m, time_us))| {

@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use glam::DVec3;
+
 use super::around::{Surroundings, drive_named, points_of};
 use super::error::FileError;
 use crate::Ground;
@@ -44,19 +46,21 @@ impl<'a> Courses<'a> {
             }
             (None, Some(points), None) => {
                 let points_m = points_of("points", points)?;
-                let ground = Ground::from_drives(self.around.drives);
-                Course::from_points(&points_m, &ground)
+                Course::from_points(&points_m, &self.around.ground())
                     .ok_or_else(|| FileError::new("points", none()))?
             }
             (None, None, Some(ids)) => {
                 let map = self.around.map.ok_or_else(|| {
                     FileError::new("lanes", "need a map: write \"map\": {\"file\": ..}")
                 })?;
-                let points_m = map.center_of(ids).map_err(|(index, message)| {
+                let surface = map.surface_of(ids).map_err(|(index, message)| {
                     FileError::new(format!("lanes[{index}]"), message)
                 })?;
-                // The lanes have heights; the ground of recorded drives may be of another level.
-                Course::from_points(&points_m, &Ground::from_drives(&[]))
+                let points = surface.lines().flatten();
+                let points_m: Vec<DVec3> = points.map(|point| point.position_m).collect();
+                // Not of the drives nearby, which may be of another level.
+                let ground = Ground::from_drives(&[]).and_lanes(Some(&surface));
+                Course::from_points(&points_m, &ground)
                     .ok_or_else(|| FileError::new("lanes", none()))?
             }
             _ => {

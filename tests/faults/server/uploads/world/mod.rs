@@ -1,9 +1,9 @@
-//! Histories of uploads: two tokens begin, send, cut off, continue and delete uploads, while the process is killed, the
-//! power fails, the disk is full, reads fail, are slow, end early or have wrong bits, and the clock jumps.
+//! The machine of a history of uploads, and what its clients were promised.
+
+mod promises;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -17,20 +17,10 @@ use crate::config::{Limits, SpoolLimits};
 use crate::limits;
 use crate::spool::{Spool, SpoolMedium};
 
-use super::disk::{Fault, Plant, ROOT, SimClock, SimDisk};
-use super::machine::{CLIENT_TIMEOUT, Machine, SimServer};
-use super::network::{Cut, CutStream};
-use super::random::Random;
-use super::reads::{BadReads, ReadFault};
-
-/// The names of the tokens.
-const OWNERS: [&str; 2] = ["a", "b"];
-
-/// Sizes of the files that are uploaded, in bytes.
-const SIZES: [u64; 4] = [0, 40, 100, 160];
-
-/// How long an upload is kept, in seconds.
-const AGE_S: i64 = 86_400;
+use super::super::disk::{Fault, Plant, ROOT, SimClock, SimDisk};
+use super::super::machine::{CLIENT_TIMEOUT, Machine, SimServer};
+use super::super::network::{Cut, CutStream};
+use super::{AGE_S, Name, OWNERS, Operation, SIZES, Step};
 
 /// Room for about three uploads of a token.
 const LIMITS: SpoolLimits = SpoolLimits {
@@ -44,140 +34,8 @@ const LIMITS: SpoolLimits = SpoolLimits {
 /// Uploads of one token, at most: its share of [`LIMITS`].
 const OWN_UPLOADS: usize = 3;
 
-/// Writes of a request, about.
-const WRITES: u64 = 8;
-
 /// What is this close to a time-out may be on either side of it: a slow read takes a minute.
 const SLACK_US: i64 = 70_000_000;
-
-/// One of the files of one of the tokens.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Name {
-    owner: usize,
-    file: usize,
-}
-
-#[derive(Clone, Copy, Debug)]
-enum Operation {
-    Begin(Name),
-    /// Sends up to so many of the missing bytes, cut off after so many bytes of the request if it is cut.
-    Append {
-        name: Name,
-        bytes: u64,
-        cut: Option<u64>,
-    },
-    /// Sends bytes for another offset than the upload's.
-    WrongOffset(Name),
-    Delete(Name),
-    /// Deletes and continues another token's upload.
-    Foreign(Name),
-    /// Removes what is too old.
-    Expire,
-    /// Changes the time of day.
-    Jump {
-        seconds: i64,
-    },
-    /// Lets time pass.
-    Wait {
-        seconds: i64,
-    },
-    /// Ends the process between two requests.
-    Stop(Fault),
-}
-
-/// An operation, and what fails meanwhile.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Step {
-    seed: u64,
-    operation: Operation,
-    fault: Option<(u64, Fault)>,
-    bad_reads: Option<BadReads>,
-}
-
-/// A history of uploads.
-#[derive(Clone)]
-pub(super) struct Uploads {
-    seed: u64,
-    pub(super) steps: Vec<Step>,
-}
-
-impl super::History for Uploads {
-    type Plant = Plant;
-
-    fn of(seed: u64) -> Self {
-        let mut random = Random::new(seed);
-        let count = 4 + random.below(12);
-        let steps = (0..count).map(|_| Step::random(&mut random)).collect();
-        Self { seed, steps }
-    }
-
-    fn run(&self, machine: &Machine, plant: Option<Plant>) -> Result<(), String> {
-        machine.runtime.block_on(async {
-            let mut world = World::new(machine, plant)?;
-            for (index, step) in self.steps.iter().enumerate() {
-                let done = world.run(step).await;
-                done.map_err(|reason| format!("operation {index}: {reason}"))?;
-            }
-            world.finish().await.map_err(|reason| format!("at the end: {reason}"))
-        })
-    }
-
-    fn shorter(&self) -> Vec<Self> {
-        let without_step = (0..self.steps.len()).map(|index| {
-            let mut shorter = self.clone();
-            shorter.steps.remove(index);
-            shorter
-        });
-        let without_fault = (0..self.steps.len()).filter_map(|index| {
-            let mut without_fault = self.clone();
-            let Step { fault, bad_reads, .. } = &mut without_fault.steps[index];
-            let had_fault = fault.take().is_some() || bad_reads.take().is_some();
-            had_fault.then_some(without_fault)
-        });
-        without_step.chain(without_fault).collect()
-    }
-}
-
-impl fmt::Display for Uploads {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "seed {}", self.seed)?;
-        for (index, Step { operation, fault, bad_reads, .. }) in self.steps.iter().enumerate() {
-            writeln!(f, "  {index} {operation:?}, fault {fault:?}, reads {bad_reads:?}")?;
-        }
-        Ok(())
-    }
-}
-
-impl Step {
-    fn random(random: &mut Random) -> Self {
-        let name = Name { owner: random.below(2) as usize, file: random.below(4) as usize };
-        let bytes = random.below(SIZES[name.file] + 2);
-        let bytes = if random.once_in(2) { SIZES[name.file] } else { bytes };
-        let operation = match random.below(24) {
-            0..7 => Operation::Begin(name),
-            7..15 => {
-                // A request has about 200 bytes before its body.
-                let cut = random.once_in(3).then(|| random.below(400));
-                Operation::Append { name, bytes, cut }
-            }
-            15 => Operation::WrongOffset(name),
-            16 | 17 => Operation::Delete(name),
-            18 => Operation::Foreign(name),
-            19 => Operation::Expire,
-            20 => Operation::Jump { seconds: [-3_600, 3_600, AGE_S][random.below(3) as usize] },
-            21 => Operation::Wait { seconds: [60, 130, 700][random.below(3) as usize] },
-            _ => Operation::Stop([Fault::Kill, Fault::PowerCut][random.below(2) as usize]),
-        };
-        let faults = [Fault::Kill, Fault::PowerCut, Fault::PowerCut, Fault::Full];
-        let fault = faults[random.below(4) as usize];
-        let fault = random.once_in(3).then(|| (random.below(WRITES), fault));
-        let faults = [ReadFault::Error, ReadFault::Short, ReadFault::Flip, ReadFault::Slow];
-        let bad = faults[random.below(4) as usize];
-        let bad_reads = BadReads { after: 0, fault: bad, times: 1 };
-        let bad_reads = Some(bad_reads).filter(|_| fault.is_none() && random.once_in(4));
-        Self { seed: random.next(), operation, fault, bad_reads }
-    }
-}
 
 /// What is known of an upload.
 #[derive(Clone, Copy, Debug)]
@@ -193,7 +51,7 @@ struct Known {
 }
 
 /// The machine, and what its clients were promised.
-struct World<'a> {
+pub(super) struct World<'a> {
     machine: &'a Machine,
     clock: Arc<SimClock>,
     disk: SimDisk,
@@ -219,7 +77,7 @@ struct Answer {
 }
 
 /// The promise that is broken, if one is.
-type Promise = Result<(), String>;
+pub(super) type Promise = Result<(), String>;
 
 /// How an operation ended.
 type Outcome = Result<(), Failure>;
@@ -292,7 +150,7 @@ fn open(machine: &Machine, disk: &SimDisk, clock: &Arc<SimClock>) -> Result<SimS
 }
 
 impl<'a> World<'a> {
-    fn new(machine: &'a Machine, plant: Option<Plant>) -> Result<Self, String> {
+    pub(super) fn new(machine: &'a Machine, plant: Option<Plant>) -> Result<Self, String> {
         let clock = Arc::new(SimClock::new());
         let disk = SimDisk::new(clock.clone(), plant);
         let server = open(machine, &disk, &clock)?;
@@ -300,7 +158,7 @@ impl<'a> World<'a> {
     }
 
     /// Carries out one step. If it stops the process, starts the next one.
-    async fn run(&mut self, step: &Step) -> Promise {
+    pub(super) async fn run(&mut self, step: &Step) -> Promise {
         self.disk.set_fault(step.fault);
         self.disk.set_bad_reads(step.bad_reads);
         let mut allowed = Allowed::default();
@@ -328,6 +186,7 @@ impl<'a> World<'a> {
         match operation {
             Operation::Begin(name) => self.begin(name, allowed).await,
             Operation::Append { name, bytes, cut } => self.append(name, bytes, cut, allowed).await,
+            Operation::AppendTwice { name, bytes } => self.append_twice(name, bytes, allowed).await,
             Operation::WrongOffset(name) => self.wrong_offset(name).await,
             Operation::Delete(name) => self.delete(name, allowed).await,
             Operation::Foreign(name) => self.foreign(name).await,
@@ -463,25 +322,72 @@ impl<'a> World<'a> {
         let Some(answer) = answer else { return Ok(()) };
         match answer.status {
             404 if !self.known.contains_key(&name) => Ok(()),
-            200 => {
-                let now_us = self.clock.now_us();
-                let active_us = self.clock.monotonic_us();
-                let known = self.known.get_mut(&name);
-                let known = known.ok_or_else(|| "an unknown upload is continued".to_owned())?;
-                if end > held {
-                    *known = Known { held: end, written_us: now_us, active_us, ..*known };
-                }
-                known.used_us = now_us;
-                known.is_complete = end == SIZES[name.file];
-                let body = &answer.body;
-                if body["complete"] != json!(known.is_complete) {
-                    let reason = format!("{end} bytes of {name:?} are answered with {body}");
-                    return Err(Failure::Broken(reason));
-                }
-                Ok(self.expect_offset(name, body)?)
-            }
+            200 => self.appended(name, end, &answer.body),
             507 if pressure.is_some() => Ok(()),
             _ => Err(Failure::of("a part", &answer)),
+        }
+    }
+
+    /// Takes over that an upload has bytes up to `end`, as an answer says.
+    fn appended(&mut self, name: Name, end: u64, body: &Value) -> Outcome {
+        let now_us = self.clock.now_us();
+        let active_us = self.clock.monotonic_us();
+        let known = self.known.get_mut(&name);
+        let known = known.ok_or_else(|| "an unknown upload is continued".to_owned())?;
+        if end > known.held {
+            *known = Known { held: end, written_us: now_us, active_us, ..*known };
+        }
+        known.used_us = now_us;
+        known.is_complete = end == SIZES[name.file];
+        if body["complete"] != json!(known.is_complete) {
+            let reason = format!("{end} bytes of {name:?} are answered with {body}");
+            return Err(Failure::Broken(reason));
+        }
+        Ok(self.expect_offset(name, body)?)
+    }
+
+    /// At most one of two parts for one offset is taken. The other is refused for its offset, or because the later
+    /// connection replaced it.
+    async fn append_twice(
+        &mut self,
+        name: Name,
+        bytes: [u64; 2],
+        allowed: &mut Allowed,
+    ) -> Outcome {
+        let held = self.known.get(&name).map_or(0, |known| known.held);
+        let ends = bytes.map(|bytes| (held + bytes).min(SIZES[name.file]));
+        let pressure = self.pressure(name);
+        if self.known.contains_key(&name) {
+            allowed.gone.extend(pressure.iter().flatten());
+            allowed.grown.insert(name, ends[0].max(ends[1]));
+        }
+        let head = format!("PATCH /v1/uploads/{} HTTP/1.1\r\nupload-offset: {held}", id(name.file));
+        let content = content(name.file);
+        let part = |end: u64| &content[held as usize..end as usize];
+        let answers = tokio::join!(
+            self.request(name.owner, &head, part(ends[0]), None),
+            self.request(name.owner, &head, part(ends[1]), None),
+        );
+        self.settle(name).await?;
+        let mut taken = None;
+        for (answer, end) in [(answers.0?, ends[0]), (answers.1?, ends[1])] {
+            let Some(answer) = answer else { continue };
+            match answer.status {
+                404 if !self.known.contains_key(&name) => {}
+                200 if end == held => {}
+                200 if taken.is_none() => taken = Some((end, answer.body)),
+                200 => {
+                    let reason = format!("{name:?} took two parts for offset {held}");
+                    return Err(Failure::Broken(reason));
+                }
+                409 => {}
+                507 if pressure.is_some() => {}
+                _ => return Err(Failure::of("one of two parts", &answer)),
+            }
+        }
+        match taken {
+            Some((end, body)) => self.appended(name, end, &body),
+            None => Ok(()),
         }
     }
 
@@ -558,161 +464,5 @@ impl<'a> World<'a> {
             }
         }
         Ok(())
-    }
-
-    /// Compares what the server has with what it promised, and takes it over.
-    fn compare(&mut self, allowed: &Allowed) -> Promise {
-        let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
-        let now_us = self.clock.now_us();
-        let active_us = self.clock.monotonic_us();
-        let mut held_bytes = 0;
-        for (owner, token) in OWNERS.into_iter().enumerate() {
-            for file in 0..SIZES.len() {
-                let name = Name { owner, file };
-                let before = self.known.get(&name).copied();
-                let Ok(upload) = spool.get(token, &id(file)) else {
-                    if before.is_some() && !allowed.gone.contains(&name) {
-                        return Err(format!("{name:?} is lost: {before:?}"));
-                    }
-                    self.known.remove(&name);
-                    continue;
-                };
-                let held = upload.offset();
-                held_bytes += held;
-                let least = before.filter(|_| !allowed.gone.contains(&name)).map_or(0, |k| k.held);
-                let most = before.map(|known| known.held).max(allowed.grown.get(&name).copied());
-                if held < least || most.is_none_or(|most| held > most) {
-                    return Err(format!("{name:?} has {held} bytes, not {least} to {most:?}"));
-                }
-                let was_complete = before.is_some_and(|known| known.is_complete);
-                if was_complete && !upload.is_complete() && !allowed.gone.contains(&name) {
-                    return Err(format!("{name:?} is no longer complete"));
-                }
-                let new = Known {
-                    held,
-                    is_complete: upload.is_complete(),
-                    written_us: now_us,
-                    used_us: now_us,
-                    active_us,
-                };
-                let known = self.known.entry(name).or_insert(new);
-                if known.held != held {
-                    *known = new;
-                }
-                known.is_complete = upload.is_complete();
-            }
-        }
-        let usage = spool.usage();
-        if usage.uploads != self.known.len() {
-            return Err(format!("{} uploads count as {}", self.known.len(), usage.uploads));
-        }
-        self.compare_files(held_bytes)
-    }
-
-    /// Compares the bytes that count with those on the disk.
-    fn compare_files(&self, held_bytes: u64) -> Promise {
-        let files = self.disk.files_below("");
-        let kind =
-            |path: &PathBuf| path.extension().and_then(|kind| kind.to_str()).map(str::to_owned);
-        let mut stored_bytes = 0;
-        let mut leftovers = Vec::new();
-        for (path, bytes) in &files {
-            match kind(path).as_deref() {
-                Some("part" | "data") => stored_bytes += bytes,
-                Some("gone") => leftovers.push(path),
-                _ => {}
-            }
-        }
-        if !self.has_leftovers && (stored_bytes != held_bytes || !leftovers.is_empty()) {
-            return Err(format!(
-                "{held_bytes} bytes count, and {stored_bytes} are on the disk: {files:?}"
-            ));
-        }
-        Ok(())
-    }
-
-    /// Starts the next process, as after a kill or a power cut.
-    fn restart(&mut self, step: &Step, allowed: &Allowed) -> Promise {
-        let fault = match (step.operation, step.fault) {
-            (Operation::Stop(fault), _) => fault,
-            (_, Some((_, fault))) => fault,
-            (_, None) => Fault::Kill,
-        };
-        self.disk = self.disk.restarted(&mut Random::new(step.seed));
-        if step.seed.is_multiple_of(4) {
-            // A process that cannot read some of the uploads leaves them to the next one.
-            let bad = [ReadFault::Error, ReadFault::Short][step.seed as usize / 4 % 2];
-            let after = 3 + step.seed / 8 % 6;
-            self.disk.set_bad_reads(Some(BadReads { after, fault: bad, times: 1 }));
-            drop(open(self.machine, &self.disk, &self.clock)?);
-            self.disk.stop(Fault::Kill);
-            self.disk = self.disk.restarted(&mut Random::new(step.seed));
-        }
-        self.server = open(self.machine, &self.disk, &self.clock)?;
-        self.has_leftovers = false;
-        let active_us = self.clock.monotonic_us();
-        let mut gone = allowed.gone.clone();
-        let mut grown = allowed.grown.clone();
-        if fault == Fault::PowerCut {
-            // What was removed may be there again.
-            let names = (0..OWNERS.len() * SIZES.len())
-                .map(|index| Name { owner: index % OWNERS.len(), file: index / OWNERS.len() });
-            grown.extend(names.map(|name| (name, SIZES[name.file])));
-        }
-        for (name, known) in &mut self.known {
-            known.active_us = active_us;
-            known.used_us = known.used_us.max(known.written_us);
-            // An incomplete upload may lose its last bytes in a power cut, or all.
-            if fault == Fault::PowerCut && !known.is_complete {
-                gone.insert(*name);
-            }
-        }
-        self.compare(&Allowed { gone, grown })
-    }
-
-    /// Checks that the spool goes on working, and that nothing is left that counts.
-    async fn finish(mut self) -> Promise {
-        let kill =
-            Step { seed: 1, operation: Operation::Stop(Fault::Kill), fault: None, bad_reads: None };
-        self.run(&kill).await?;
-        for name in self.known.clone().into_keys() {
-            if self.pressure(name).is_none() {
-                self.finish_upload(name).await?;
-            }
-            self.delete(name, &mut Allowed::default()).await?;
-        }
-        self.compare(&Allowed::default())?;
-        let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
-        let left = self.disk.files_below("");
-        if spool.usage() != Default::default() || left.len() != 1 {
-            return Err(format!("{:?} count, and the disk has {left:?}", spool.usage()));
-        }
-        // As much as a token may have finds room.
-        for file in [3, 1] {
-            self.finish_upload(Name { owner: 0, file }).await?;
-        }
-        Ok(())
-    }
-
-    /// Begins an upload, or continues it, and sends the rest.
-    async fn finish_upload(&mut self, name: Name) -> Outcome {
-        let mut allowed = Allowed::default();
-        self.begin(name, &mut allowed).await?;
-        self.append(name, SIZES[name.file], None, &mut allowed).await?;
-        if !self.known.get(&name).is_some_and(|known| known.is_complete) {
-            let known = self.known.get(&name);
-            return Err(Failure::Broken(format!("{name:?} cannot be finished: {known:?}")));
-        }
-        Ok(())
-    }
-}
-
-impl Operation {
-    /// The upload that it changes.
-    fn name(self) -> Option<Name> {
-        match self {
-            Self::Begin(name) | Self::Append { name, .. } => Some(name),
-            _ => None,
-        }
     }
 }
