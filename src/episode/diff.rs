@@ -1,7 +1,11 @@
 //! Where two episodes part.
 
+use std::collections::BTreeSet;
+
+use serde_json::{Map, Value};
+
 use crate::file::{EpisodeFile, Frame};
-use crate::lines::ActorsLine;
+use crate::lines::{ActorsLine, ScenarioLine};
 
 /// What differs, in the order of cause and effect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -78,28 +82,83 @@ pub fn diff(a: &EpisodeFile, b: &EpisodeFile) -> Option<Difference> {
     })
 }
 
+/// The first field in which two episodes were not set up alike, with both values.
 fn setup(a: &EpisodeFile, b: &EpisodeFile) -> Option<String> {
-    let scenario = |episode: &EpisodeFile| match &episode.scenario {
-        Some(scenario) => scenario.hash.clone(),
-        None => "none".to_owned(),
-    };
     let cameras = |episode: &EpisodeFile| {
         let names: Vec<&str> = episode.header.rig.cameras.iter().map(|c| c.name.as_str()).collect();
         names.join(", ")
     };
-    let pairs = [
-        ("twin", a.header.twin.clone(), b.header.twin.clone()),
-        ("version hash", a.header.version_hash.clone(), b.header.version_hash.clone()),
-        // Before the scenario, whose hash contains it.
-        ("seed", a.header.seed.to_string(), b.header.seed.to_string()),
-        ("scenario", scenario(a), scenario(b)),
-        ("dynamics", format!("{:?}", a.header.dynamics), format!("{:?}", b.header.dynamics)),
-        ("step", format!("{} us", a.header.dt_us), format!("{} us", b.header.dt_us)),
-        ("start", format!("{:?}", a.header.start), format!("{:?}", b.header.start)),
-        ("cameras", cameras(a), cameras(b)),
-    ];
-    let found = pairs.into_iter().find(|(_, a, b)| a != b);
-    found.map(|(name, a, b)| format!("{name} {a} against {b}"))
+    let seconds = |dt_us: i64| format!("{} s", dt_us as f64 / 1e6);
+    let version = |episode: &EpisodeFile| {
+        let header = &episode.header;
+        let hash: String = header.version_hash.chars().take(8).collect();
+        format!("{} ({hash})", header.version)
+    };
+    let field =
+        |name: &str, a: String, b: String| (a != b).then(|| format!("{name} {a} against {b}"));
+    field("twin", a.header.twin.clone(), b.header.twin.clone())
+        .or_else(|| field(&format!("version of twin {}", a.header.twin), version(a), version(b)))
+        // Before the scenario, which contains it.
+        .or_else(|| field("seed", a.header.seed.to_string(), b.header.seed.to_string()))
+        .or_else(|| scenario(a.scenario.as_ref(), b.scenario.as_ref()))
+        .or_else(|| {
+            value_difference("dynamics", &json(&a.header.dynamics), &json(&b.header.dynamics))
+        })
+        .or_else(|| field("length of a step", seconds(a.header.dt_us), seconds(b.header.dt_us)))
+        .or_else(|| value_difference("start", &json(&a.header.start), &json(&b.header.start)))
+        .or_else(|| field("cameras", cameras(a), cameras(b)))
+}
+
+fn scenario(a: Option<&ScenarioLine>, b: Option<&ScenarioLine>) -> Option<String> {
+    let name = |line: Option<&ScenarioLine>| line.map_or("none", |line| &line.name).to_owned();
+    if name(a) != name(b) {
+        return Some(format!("scenario {} against {}", name(a), name(b)));
+    }
+    let (a, b) = a.zip(b)?;
+    if a.hash == b.hash {
+        return None;
+    }
+    let at = format!("scenario {}", a.name);
+    let hashes = || format!("{at}: hash {} against {}", a.hash, b.hash);
+    Some(value_difference(&at, &a.scenario, &b.scenario).unwrap_or_else(hashes))
+}
+
+/// A value of numbers and texts as JSON, which cannot fail.
+fn json(value: &impl serde::Serialize) -> Value {
+    serde_json::to_value(value).unwrap_or_default()
+}
+
+/// The first place at which two values differ, and both values there: `at: actors[0].idm.speed 8.0 against 9.0`.
+fn value_difference(at: &str, a: &Value, b: &Value) -> Option<String> {
+    let (path, a, b) = first_difference(String::new(), a, b)?;
+    let text = |value: &Value| match value {
+        Value::Null => "none".to_owned(),
+        value => shortened(&value.to_string()),
+    };
+    Some(format!("{at}: {}{} against {}", path.trim_start_matches('.'), text(a), text(b)))
+}
+
+/// The path of the first difference, with a space behind it, and both values.
+fn first_difference<'a>(
+    path: String,
+    a: &'a Value,
+    b: &'a Value,
+) -> Option<(String, &'a Value, &'a Value)> {
+    match (a, b) {
+        _ if a == b => None,
+        (Value::Object(a), Value::Object(b)) => {
+            let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+            let of = |map: &'a Map<String, Value>, key: &str| map.get(key).unwrap_or(&Value::Null);
+            keys.into_iter()
+                .find_map(|key| first_difference(format!("{path}.{key}"), of(a, key), of(b, key)))
+        }
+        (Value::Array(a), Value::Array(b)) => {
+            let of = |list: &'a [Value], index: usize| list.get(index).unwrap_or(&Value::Null);
+            (0..a.len().max(b.len()))
+                .find_map(|k| first_difference(format!("{path}[{k}]"), of(a, k), of(b, k)))
+        }
+        _ => Some((format!("{path} "), a, b)),
+    }
 }
 
 fn command(a: &Frame, b: &Frame) -> Option<(What, String)> {

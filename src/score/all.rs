@@ -22,6 +22,13 @@ pub fn range_of(name: &str) -> [f64; 2] {
     }
 }
 
+/// Whether a lower value of a score is a better one; not so of a name that is none of [`score`]'s.
+pub fn lower_is_better(name: &str) -> bool {
+    // Deviation of plans, their collisions, and their distances from the recorded drive.
+    let of_plans = alpasim_plans::NAMES;
+    [alpasim::OFF_ROAD, alpasim::WRONG_LANE].contains(&name) || of_plans.contains(&name)
+}
+
 /// All scores of an episode, in a fixed order.
 pub fn score(record: &DriveRecord) -> Vec<Score> {
     let mut scores = vec![own::verdict(record).score()];

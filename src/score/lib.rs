@@ -35,7 +35,7 @@ mod savgol;
 mod scored;
 pub mod statistics;
 
-pub use all::{range_of, score};
+pub use all::{lower_is_better, range_of, score};
 pub use alpasim_box::RoundedBox;
 pub use map::{Lane, LaneMap, RedArea};
 pub use plan::{Plan, PlannedPose};

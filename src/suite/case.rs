@@ -15,6 +15,7 @@ use wildcity_session::{
 use wildcity_sim::scenario::{Case as Seeded, Scenario, ScenarioFile};
 use wildcity_twin::store::{Catalog, Version};
 
+use crate::cameras;
 use crate::error::SuiteError;
 use crate::file::{SuiteFile, SuiteScenario};
 use crate::limits;
@@ -79,7 +80,7 @@ pub fn cases(
                 true => format!("{}-{}", file.name, case.seed),
                 false => format!("{}-{}-{}", file.name, combinations.len() - 1, case.seed),
             };
-            let version = versions.of(&file)?;
+            let version = versions.of(&file, suite)?;
             let pinned = (&version.manifest, version.hash.as_str());
             let dir = scenario.path.parent().unwrap_or(Path::new(""));
             let loaded = Scenarios::in_dir(dir)
@@ -138,14 +139,15 @@ struct Versions<'a> {
 }
 
 impl Versions<'_> {
-    /// The version that a scenario names; the latest if it names none.
-    fn of(&mut self, file: &ScenarioFile) -> Result<Arc<Version>, SuiteError> {
+    /// The version that a scenario names; the latest if it names none. It must have the cameras of the suite.
+    fn of(&mut self, file: &ScenarioFile, suite: &SuiteFile) -> Result<Arc<Version>, SuiteError> {
         let wanted = file.twin.version_hash.clone().filter(|_| !self.latest);
         let key = (file.twin.name.clone(), wanted);
         if let Some(version) = self.opened.get(&key) {
             return Ok(version.clone());
         }
         let version = Arc::new(self.open(file, key.1.as_deref())?);
+        cameras::check(suite, &version)?;
         self.opened.insert(key, version.clone());
         Ok(version)
     }

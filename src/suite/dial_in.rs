@@ -11,6 +11,7 @@ use wildcity_episode::EpisodeFile;
 
 use crate::case::Case;
 use crate::limits;
+use crate::stderr::Tail;
 use crate::technical::Technical;
 
 /// A command that is started.
@@ -27,6 +28,21 @@ pub(crate) struct Dialled<'a> {
     pub(crate) timeout: Duration,
 }
 
+/// Why an episode was not driven to its end.
+#[derive(Debug)]
+pub(crate) enum NotDriven {
+    /// The shell finds no such command, or cannot run it: no other episode can be driven either. What the shell says.
+    NoCommand(String),
+    /// Something failed; it may go well another time.
+    Technical(Technical),
+}
+
+impl From<Technical> for NotDriven {
+    fn from(technical: Technical) -> Self {
+        Self::Technical(technical)
+    }
+}
+
 /// Starts the command and waits for it and for the end of its record.
 ///
 /// The command finds in its environment `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as JSON, which it sends
@@ -35,22 +51,60 @@ pub(crate) async fn drive(
     dialled: &Dialled<'_>,
     case: &Case,
     record: &Path,
-) -> Result<(), Technical> {
-    let child = start(dialled, case).map_err(|error| Technical {
-        kind: "agent_lost",
-        message: format!("{:?} cannot be started: {error}", dialled.name),
-    })?;
-    let status = wait(child, dialled.timeout).await?;
-    if !status.success() {
-        let kind = match status.code() {
-            Some(limits::TIMEOUT_STATUS) => "agent_timeout",
-            Some(limits::LOST_STATUS) => "agent_lost",
-            _ => "agent_error",
-        };
-        let message = format!("{:?} ended with {status}", dialled.name);
-        return Err(Technical { kind, message });
+) -> Result<(), NotDriven> {
+    let mut running = Running(start(dialled, case).map_err(|error| {
+        Technical::new("agent_lost", format!("the shell cannot be started: {error}"))
+    })?);
+    let tail = Tail::of(running.0.stderr.take());
+    let status = wait(&mut running.0, dialled.timeout).await;
+    drop(running);
+    let stderr = tail.text().await;
+    let said = |technical: Technical| Technical { stderr: stderr.clone(), ..technical };
+    let status = status.map_err(said)?;
+    let Some(drove) = ended(dialled, status, record.exists()) else {
+        let reason = if stderr.is_empty() { status.to_string() } else { stderr };
+        return Err(NotDriven::NoCommand(reason));
+    };
+    drove.map_err(said)?;
+    Ok(wait_for_end(record).await.map_err(said)?)
+}
+
+/// What the end of a command says; `None` if it never was one. `has_driven` says whether it has reset its session: a
+/// record begins with that.
+fn ended(
+    dialled: &Dialled<'_>,
+    status: ExitStatus,
+    has_driven: bool,
+) -> Option<Result<(), Technical>> {
+    let is_no_command =
+        status.code().is_some_and(|code| limits::NO_COMMAND_STATUSES.contains(&code));
+    let kind = match status.code() {
+        _ if is_no_command && !has_driven => return None,
+        Some(0) if has_driven => return Some(Ok(())),
+        Some(0 | limits::LOST_STATUS) => "agent_lost",
+        Some(limits::TIMEOUT_STATUS) => "agent_timeout",
+        _ => "agent_error",
+    };
+    let name = dialled.name;
+    let message = match has_driven {
+        true => format!("{name:?} ended with {status}"),
+        false => format!(
+            "{name:?} ended with {status} and drove nothing: it must connect to $WILDCITY_URL, then open and reset the \
+             session of $WILDCITY_OPEN"
+        ),
+    };
+    Some(Err(Technical::new(kind, message)))
+}
+
+/// A process that does not outlive the run, which may end early.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // It may have ended; then there is nothing to kill.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
-    wait_for_end(record).await
 }
 
 fn start(dialled: &Dialled<'_>, case: &Case) -> std::io::Result<Child> {
@@ -65,6 +119,7 @@ fn start(dialled: &Dialled<'_>, case: &Case) -> std::io::Result<Child> {
         .env("WILDCITY_STEPS", case.steps.to_string())
         .stdin(Stdio::null())
         .stdout(Stdio::null())
+        .stderr(Stdio::piped())
         .spawn()
 }
 
@@ -82,20 +137,17 @@ fn open_json(session: &str, case: &Case) -> serde_json::Value {
     })
 }
 
-/// Waits for a process without blocking others; kills it when its time is over.
-async fn wait(mut child: Child, timeout: Duration) -> Result<ExitStatus, Technical> {
-    let lost = |error: std::io::Error| Technical { kind: "agent_lost", message: error.to_string() };
+/// Waits for a process without blocking others, until its time is over.
+async fn wait(child: &mut Child, timeout: Duration) -> Result<ExitStatus, Technical> {
+    let lost = |error: std::io::Error| Technical::new("agent_lost", error.to_string());
     let end = Instant::now() + timeout;
     loop {
         if let Some(status) = child.try_wait().map_err(lost)? {
             return Ok(status);
         }
         if Instant::now() >= end {
-            // It may have ended just now; then there is nothing to kill.
-            let _ = child.kill();
-            let _ = child.wait();
             let message = format!("the agent took more than {} s", timeout.as_secs());
-            return Err(Technical { kind: "agent_timeout", message });
+            return Err(Technical::new("agent_timeout", message));
         }
         sleep(limits::AGENT_POLL).await;
     }
@@ -108,10 +160,10 @@ async fn wait_for_end(record: &Path) -> Result<(), Technical> {
         let last = match EpisodeFile::read(record) {
             Ok(episode) if episode.end.is_some() => return Ok(()),
             Ok(_) => "the agent ended without closing its session".to_owned(),
-            Err(error) => format!("the agent drove nothing: {error}"),
+            Err(error) => format!("the record cannot be read: {error}"),
         };
         if Instant::now() >= end {
-            return Err(Technical { kind: "agent_lost", message: last });
+            return Err(Technical::new("agent_lost", last));
         }
         sleep(limits::AGENT_POLL).await;
     }

@@ -9,6 +9,10 @@ use wildcity_sim::scenario::FileError;
 use wildcity_twin::residency::ResidencyError;
 use wildcity_twin::store::StoreError;
 
+/// Every kind of agent, in words.
+pub const AGENTS: &str =
+    "log, stand or idm, which are built in; egodriver:HOST:PORT; or a command that drives";
+
 /// Why a suite could not be run.
 #[derive(Debug, thiserror::Error)]
 pub enum SuiteError {
@@ -47,6 +51,25 @@ pub enum SuiteError {
         path: PathBuf,
         /// Where and why.
         cause: ScenarioError,
+    },
+    /// A file is no result of a run.
+    #[error(
+        "{} is no result of a run: {reason}; give the result.json of `wildcity episode run`, or its --out directory",
+        path.display()
+    )]
+    NoResult {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The command of the agent cannot be started.
+    #[error("the agent {agent:?} cannot be started: {reason}; an agent is {AGENTS}")]
+    NoAgent {
+        /// The agent.
+        agent: String,
+        /// What the shell says.
+        reason: String,
     },
     /// The version of a twin that a scenario was made for is not there.
     #[error(

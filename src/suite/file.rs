@@ -46,6 +46,9 @@ pub struct SuiteFile {
     /// The least pass rate, held against the lower end of its interval; if absent, every episode must pass.
     #[serde(default)]
     pub at_least: Option<f64>,
+    /// Its own file.
+    #[serde(skip)]
+    pub path: PathBuf,
 }
 
 /// A scenario of a suite.
@@ -66,7 +69,7 @@ impl SuiteFile {
     /// # Errors
     /// Names the file and the place of the first mistake.
     pub fn read(path: &Path) -> Result<(Self, Vec<SuiteScenario>), SuiteError> {
-        let bytes = read(path)?;
+        let bytes = read(path, limits::FILE_BYTES)?;
         let wrong = |cause| SuiteError::File { path: path.to_owned(), cause };
         let value: serde_json::Value = serde_json::from_slice(&bytes)
             .map_err(|error| wrong(FileError::new("suite", format!("not JSON: {error}"))))?;
@@ -75,17 +78,18 @@ impl SuiteFile {
             let suite = Self::of_one(path);
             return Ok((suite, vec![SuiteScenario { path: path.to_owned(), document }]));
         }
-        let suite: Self = serde_path_to_error::deserialize(value).map_err(|error| {
+        let mut suite: Self = serde_path_to_error::deserialize(value).map_err(|error| {
             let at = error.path().to_string();
             wrong(FileError::new(at, error.into_inner().to_string()))
         })?;
+        suite.path = path.to_owned();
         suite.check().map_err(wrong)?;
         let dir = path.parent().unwrap_or(Path::new("."));
         let mut scenarios = Vec::new();
         for file in &suite.scenarios {
             let path = dir.join(file);
             let wrong = |cause| SuiteError::File { path: path.clone(), cause };
-            let document = Document::parse(&read(&path)?).map_err(wrong)?;
+            let document = Document::parse(&read(&path, limits::FILE_BYTES)?).map_err(wrong)?;
             if path.parent() != Some(dir) {
                 check_alone(&document).map_err(wrong)?;
             }
@@ -108,6 +112,7 @@ impl SuiteFile {
             size: None,
             dt_us: None,
             at_least: None,
+            path: path.to_owned(),
         }
     }
 
@@ -144,12 +149,11 @@ fn check_alone(document: &Document) -> Result<(), FileError> {
     }
 }
 
-/// Reads a file of at most [`limits::FILE_BYTES`].
-pub(crate) fn read(path: &Path) -> Result<Vec<u8>, SuiteError> {
+/// Reads a file of at most `limit_bytes`.
+pub(crate) fn read(path: &Path, limit_bytes: u64) -> Result<Vec<u8>, SuiteError> {
     let failed = |cause| SuiteError::Io { what: "read", path: path.to_owned(), cause };
     let bytes = fs::metadata(path).map_err(failed)?.len();
-    if bytes > limits::FILE_BYTES {
-        let limit_bytes = limits::FILE_BYTES;
+    if bytes > limit_bytes {
         return Err(SuiteError::TooLarge { path: path.to_owned(), bytes, limit_bytes });
     }
     fs::read(path).map_err(failed)

@@ -20,6 +20,8 @@ pub(crate) struct Finished {
     pub(crate) result: EpisodeResult,
     /// BLAKE3 of all frame hashes, in hex: equal for equal drives.
     pub(crate) frames_hash: String,
+    /// BLAKE3 of poses, actors and images, in hex.
+    pub(crate) drive_hash: String,
 }
 
 /// Judges an episode from its record.
@@ -36,10 +38,8 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     let episode =
         EpisodeFile::read(record).map_err(|error| Technical::server(error.to_string()))?;
     check(case, &episode)?;
-    let end = episode.end.clone().ok_or_else(|| Technical {
-        kind: "agent_lost",
-        message: "the record has no end".to_owned(),
-    })?;
+    let end = episode.end.clone();
+    let end = end.ok_or_else(|| Technical::new("agent_lost", "the record has no end"))?;
     let kind = match end.outcome.as_str() {
         "completed" | "off_model" | "driving_failure" => None,
         "agent_error" => Some("agent_error"),
@@ -48,13 +48,12 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
         _ => Some("server_error"),
     };
     if let Some(kind) = kind {
-        return Err(Technical { kind, message: format!("the session ended as {}", end.outcome) });
+        return Err(Technical::new(kind, format!("the session ended as {}", end.outcome)));
     }
-    let judged = result(&episode).ok_or_else(|| Technical {
-        kind: "agent_error",
-        message:
-            "a verdict needs every step: nothing was driven, or several steps with one request"
-                .to_owned(),
+    let judged = result(&episode).ok_or_else(|| {
+        let message =
+            "a verdict needs every step: nothing was driven, or several steps with one request";
+        Technical::new("agent_error", message)
     })?;
     let mut frames = blake3::Hasher::new();
     for frame in &episode.frames {
@@ -66,7 +65,25 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
         end,
         result: judged,
         frames_hash: frames.finalize().to_hex().to_string(),
+        drive_hash: drive_hash(&episode),
     })
+}
+
+/// What was driven: where the ego and the actors were, and what was seen. Images alone would not do: an actor may be out of
+/// sight, and an agent may ask for no camera.
+fn drive_hash(episode: &EpisodeFile) -> String {
+    let mut hasher = blake3::Hasher::new();
+    // Numbers and texts: writing them into memory cannot fail.
+    let mut add = |line: serde_json::Result<Vec<u8>>| {
+        hasher.update(&line.unwrap_or_default());
+    };
+    for frame in episode.driven() {
+        add(serde_json::to_vec(&(frame.time_us, &frame.poses, &frame.frame_hash)));
+    }
+    for line in &episode.actors {
+        add(serde_json::to_vec(line));
+    }
+    hasher.finalize().to_hex().to_string()
 }
 
 /// An agent must drive what was ordered.
@@ -86,10 +103,10 @@ fn check(case: &Case, episode: &EpisodeFile) -> Result<(), Technical> {
     ];
     match wrong.into_iter().find(|(_, wrong)| *wrong) {
         None => Ok(()),
-        Some((field, _)) => Err(Technical {
-            kind: "agent_error",
-            message: format!("the agent opened with another {field} than WILDCITY_OPEN says"),
-        }),
+        Some((field, _)) => Err(Technical::new(
+            "agent_error",
+            format!("the agent opened with another {field} than WILDCITY_OPEN says"),
+        )),
     }
 }
 

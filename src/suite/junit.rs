@@ -2,10 +2,14 @@
 
 use std::fmt::Write as _;
 
-use crate::result::{EpisodeEntry, Status, SuiteResult};
+use crate::ending::Ending;
+use crate::entry::{EpisodeEntry, Status, TechnicalEntry};
+use crate::result::SuiteResult;
 
-/// The result as JUnit XML: `failure` is driving, `error` technical, `skipped` off the model.
-pub fn junit(result: &SuiteResult) -> String {
+/// The result as JUnit XML: `failure` is driving, `error` technical, `skipped` off the model or not judged.
+///
+/// A failure is one whatever the exit code is: the properties of the suite say what that is, and why.
+pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
     let skipped = counts.off_model + counts.not_judged;
     let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");
@@ -18,6 +22,19 @@ pub fn junit(result: &SuiteResult) -> String {
         counts.failed,
         counts.technical,
     );
+    text.push_str("  <properties>\n");
+    let at_least = result.at_least.map(|least| least.to_string());
+    for (name, value) in [
+        ("agent", Some(result.agent.clone())),
+        ("at_least", at_least),
+        ("exit_code", Some((ending.code as u8).to_string())),
+        ("why", Some(ending.why.clone())),
+    ] {
+        if let Some(value) = value.map(|value| escaped(&value)) {
+            let _ = writeln!(text, "    <property name=\"{name}\" value=\"{value}\"/>");
+        }
+    }
+    text.push_str("  </properties>\n");
     for episode in &result.episodes {
         case(&mut text, result, episode);
     }
@@ -52,18 +69,27 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
             let last = episode.errors.last();
             let kind = last.map_or("server_error", |error| &error.kind);
             let message = last.map_or("", |error| &error.message);
-            let lines: Vec<String> = episode
-                .errors
-                .iter()
-                .map(|error| format!("{}: {}", error.kind, error.message))
-                .collect();
+            let lines: Vec<String> = episode.errors.iter().map(TechnicalEntry::text).collect();
             element("error", kind, message, &lines.join("\n"))
         }
     };
+    let inner = inner + &notes(episode);
     if inner.is_empty() {
         text.push_str("/>\n");
     } else {
         let _ = writeln!(text, ">{inner}</testcase>");
+    }
+}
+
+/// What the status does not say: what was not judged, and whether the episode says anything new.
+fn notes(episode: &EpisodeEntry) -> String {
+    let is_told = episode.status == Status::NotJudged;
+    let not_judged = episode.not_judged.iter().filter(|_| !is_told);
+    let mut lines: Vec<String> = not_judged.map(|reason| format!("not judged: {reason}")).collect();
+    lines.extend(episode.duplicate_text());
+    match lines.is_empty() {
+        true => String::new(),
+        false => format!("<system-out>{}</system-out>", escaped(&lines.join("\n"))),
     }
 }
 

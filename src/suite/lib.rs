@@ -9,22 +9,30 @@
 //! | `file` | the format `wildcity.suite/1` |
 //! | `case` | one scenario with one seed: what is opened, what is recorded about it |
 //! | `driver` | the built-in agents: `log`, `stand`, `idm` |
-//! | `dial_in` | agents that are commands |
+//! | `cameras` | what a suite says about cameras, checked against a twin |
+//! | `dial_in`, `stderr` | agents that are commands, and what they say |
 //! | `run` | drives all cases, some at once, technical failures once more |
 //! | `finish` | judges the record of a driven episode |
 //! | `verify` | renders all episodes again |
 //! | `technical` | failures that are not driving |
-//! | `result` | `result.json`: episodes, rates, means, exit code |
-//! | `junit`, `page` | `junit.xml`, `report.html` |
+//! | `result`, `entry` | `result.json`: episodes, rates, means |
+//! | `compare` | two results: what got worse, what got better |
+//! | `ending` | the exit code, and why |
+//! | `junit`, `page`, `html` | `junit.xml`, `report.html` |
 //! | `picture` | the picture of a fault |
 //! | [`limits`] | limits |
 
+mod cameras;
 mod case;
+mod compare;
 mod dial_in;
 mod driver;
+mod ending;
+mod entry;
 mod error;
 mod file;
 mod finish;
+mod html;
 mod junit;
 pub mod limits;
 mod page;
@@ -32,18 +40,23 @@ mod picture;
 mod plot;
 mod result;
 mod run;
+mod stderr;
 mod technical;
 mod verify;
 
 pub use case::{Case, CaseOptions, cases};
+pub use compare::{
+    Change, ChangeCounts, CompareError, ComparedEpisode, Comparison, Direction, PASS_RATE,
+    PairedRate, Rule, RunName, ScoreChange, Side, Tolerance,
+};
 pub use driver::BuiltIn;
-pub use error::SuiteError;
+pub use ending::{Ending, ExitCode};
+pub use entry::{EpisodeEntry, Status, TechnicalEntry};
+pub use error::{AGENTS, SuiteError};
 pub use file::{SuiteFile, SuiteScenario};
 pub use junit::junit;
 pub use page::page;
 pub use picture::{Picture, pictures};
-pub use result::{
-    Counts, EpisodeEntry, ExitCode, MeanEntry, Rate, Status, SuiteResult, TechnicalEntry,
-};
+pub use result::{Counts, MeanEntry, Rate, SuiteResult};
 pub use run::{AgentChoice, RunSettings, run};
 pub use verify::verify;

@@ -5,6 +5,9 @@ use std::time::Duration;
 /// Largest suite or scenario file, in bytes.
 pub const FILE_BYTES: u64 = 16 << 20;
 
+/// Largest result of a run, in bytes: an episode has 21 scores with their parts, 7 kB, and there are at most 100,000.
+pub const RESULT_BYTES: u64 = 1 << 30;
+
 /// Most episodes of a suite.
 pub const EPISODES: usize = 100_000;
 
@@ -31,6 +34,17 @@ pub const OFF_MODEL_SHARE: f64 = 0.1;
 
 /// Worst episodes that the report shows with pictures.
 pub const WORST: usize = 12;
+
+/// What is kept of the standard error of an agent: its last lines, at most so many, and at most so many bytes of them.
+pub const STDERR_LINES: usize = 12;
+/// See [`STDERR_LINES`].
+pub const STDERR_BYTES: usize = 4 << 10;
+
+/// How long the rest of an agent's standard error is waited for after it has ended: a process that it started may hold it.
+pub const STDERR_WAIT: Duration = Duration::from_millis(500);
+
+/// Exit statuses of a shell that finds no such command, or cannot run it.
+pub const NO_COMMAND_STATUSES: [i32; 2] = [127, 126];
 
 /// Exit status of an agent that ran out of time: that of the command `timeout`.
 pub const TIMEOUT_STATUS: i32 = 124;

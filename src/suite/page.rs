@@ -1,50 +1,40 @@
 //! `report.html`: one page that loads nothing else.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use data_encoding::BASE64;
-use maud::{DOCTYPE, Markup, PreEscaped, html};
+use maud::{Markup, PreEscaped, html};
 
+use crate::ending::Ending;
+use crate::entry::{EpisodeEntry, Status, TechnicalEntry};
+use crate::html::{document, percent};
 use crate::picture::Picture;
 use crate::plot::plots;
 use crate::result::{Rate, SuiteResult};
 
-const STYLE: &str = "\
-body{font:15px/1.45 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#111}
-h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
-table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:left}
-.passed{color:#00703c}.failed{color:#b00020;font-weight:600}.technical{color:#b05a00}.off_model,.not_judged{color:#777}
-figure{margin:0 0 1.5em 0}img{max-width:420px}svg{border:1px solid #eee;margin-right:6px}";
-
 /// The page. `episodes` has the records, of which the worst are drawn.
-pub fn page(result: &SuiteResult, pictures: &[Picture], episodes: &Path) -> String {
+pub fn page(
+    result: &SuiteResult,
+    ending: &Ending,
+    pictures: &[Picture],
+    episodes: &Path,
+) -> String {
     let title = format!("{}: {}", result.suite, result.agent);
-    let markup = html! {
-        (DOCTYPE)
-        html lang="en" {
-            head {
-                meta charset="utf-8";
-                title { (title) }
-                style { (PreEscaped(STYLE)) }
-            }
-            body {
-                h1 { (title) }
-                (outcome(result))
-                h2 { "Scenarios" }
-                (scenarios(result))
-                h2 { "Scores" }
-                (means(result))
-                (worst(result, pictures, episodes))
-                h2 { "Episodes" }
-                (table(result))
-            }
-        }
+    let body = html! {
+        (outcome(result, ending))
+        h2 { "Scenarios" }
+        (scenarios(result))
+        h2 { "Scores" }
+        (means(result))
+        (worst(result, pictures, episodes))
+        h2 { "Episodes" }
+        (table(result))
     };
-    markup.into_string() + "\n"
+    document(&title, &body)
 }
 
-fn outcome(result: &SuiteResult) -> Markup {
+fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
     let counts = &result.counts;
     html! {
         p {
@@ -52,42 +42,45 @@ fn outcome(result: &SuiteResult) -> Markup {
             (counts.off_model) " off the model, " (counts.not_judged) " not judged, "
             (counts.technical) " not driven for technical reasons."
         }
-        p { "Pass rate " (rate(&result.pass_rate)) "." }
-        @if let Some(least) = result.at_least {
-            p { "Wanted: the lower end of the interval at least " (percent(least)) "." }
-        }
+        p { "Pass rate: " (rate(&result.pass_rate)) "." }
+        @if counts.duplicates > 0 { p.failed { (duplicates(result)) } }
+        p { "Exit code " (ending.code as u8) ": " (ending.why) "." }
         @if result.latest { p { "Run on the latest versions of the twins, whatever the scenarios name." } }
     }
 }
 
-fn rate(rate: &Rate) -> String {
-    let [low, high] = rate.interval;
-    match rate.rate {
-        Some(value) => format!(
-            "{} ({} of {}; 95 %: {} to {})",
-            percent(value),
-            rate.passed,
-            rate.runs,
-            percent(low),
-            percent(high)
-        ),
-        None => "unknown: no episode was judged".to_owned(),
-    }
+/// The warning about duplicates.
+fn duplicates(result: &SuiteResult) -> String {
+    format!("Warning: {}.", result.duplicates_text().unwrap_or_default())
 }
 
-fn percent(share: f64) -> String {
-    format!("{:.1} %", 100.0 * share)
+fn rate(rate: &Rate) -> String {
+    match rate.rate {
+        Some(share) => format!("{}: {}", percent(share), rate.text()),
+        None => rate.text(),
+    }
 }
 
 fn scenarios(result: &SuiteResult) -> Markup {
     html! {
         table {
-            tr { th { "scenario" } th { "pass rate" } }
+            tr { th { "scenario" } th { "pass rate" } th { "not judged" } }
             @for (name, of) in &result.scenarios {
-                tr { td { (name) } td { (rate(of)) } }
+                tr {
+                    td { (name) }
+                    td { (rate(of)) }
+                    td { (not_judged(result, name).join("; ")) }
+                }
             }
         }
     }
+}
+
+/// What was not judged in some episode of a scenario.
+fn not_judged<'a>(result: &'a SuiteResult, scenario: &str) -> Vec<&'a str> {
+    let of_scenario = result.episodes.iter().filter(|episode| episode.scenario == scenario);
+    let reasons = of_scenario.flat_map(|episode| episode.not_judged.iter().map(String::as_str));
+    reasons.collect::<BTreeSet<&str>>().into_iter().collect()
 }
 
 fn means(result: &SuiteResult) -> Markup {
@@ -155,10 +148,7 @@ fn table(result: &SuiteResult) -> Markup {
                     td { (episode.name) }
                     td { (episode.seed) }
                     td class=(episode.status.name()) { (episode.status.name()) }
-                    td {
-                        (episode.fault_texts().join("; "))
-                        @if let Some(error) = episode.errors.last() { " " (error.kind) ": " (error.message) }
-                    }
+                    td { (why(episode)) }
                     td { (episode.steps) }
                     td { (format!("{:.1}", episode.distance_m)) }
                     td {
@@ -172,5 +162,18 @@ fn table(result: &SuiteResult) -> Markup {
                 }
             }
         }
+    }
+}
+
+/// What the status of an episode comes from.
+fn why(episode: &EpisodeEntry) -> Markup {
+    let is_not_judged = episode.status == Status::NotJudged;
+    let reasons = episode.not_judged.iter().filter(|_| is_not_judged);
+    let mut texts = episode.fault_texts();
+    texts.extend(reasons.cloned());
+    texts.extend(episode.duplicate_text());
+    html! {
+        (texts.join("; "))
+        @if let Some(error) = episode.errors.last() { pre { (TechnicalEntry::text(error)) } }
     }
 }

@@ -7,8 +7,9 @@ use wildcity_session::{FrameRequest, RecordedEpisode, ReplayUntil, jpeg, limits 
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
+use crate::entry::{EpisodeEntry, Status};
 use crate::limits;
-use crate::result::{EpisodeEntry, Status, SuiteResult};
+use crate::result::SuiteResult;
 
 /// A picture for the report.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,10 +48,11 @@ pub fn pictures(
 
 impl SuiteResult {
     /// The failed episodes: those with a contact or off the road before those that only lack progress, and of these
-    /// those with the earliest fault first.
+    /// those with the earliest fault first. Without duplicates, which would show the same again.
     pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
+        let distinct = self.episodes.iter().filter(|episode| episode.duplicate_of.is_none());
         let mut worst: Vec<&EpisodeEntry> =
-            self.episodes.iter().filter(|episode| episode.status == Status::Failed).collect();
+            distinct.filter(|episode| episode.status == Status::Failed).collect();
         worst.sort_by_key(|episode| {
             let lacks_progress_alone = episode.faults.iter().all(|fault| fault.fault == "progress");
             let first_us = episode.faults.first().map_or(i64::MAX, |fault| fault.time_us);

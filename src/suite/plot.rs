@@ -8,7 +8,14 @@ use glam::DVec2;
 use wildcity_episode::{EpisodeFile, drive_record};
 use wildcity_score::DriveRecord;
 
-use crate::result::EpisodeEntry;
+use crate::entry::EpisodeEntry;
+
+/// The colour of each thing that is drawn.
+const DRIVEN: &str = "#0072b2";
+const RECORDED: &str = "#bbb";
+const ACTORS: &str = "#d55e00";
+const FAULT: &str = "#b00020";
+const TEXT: &str = "#444";
 
 /// Width and height of a plot, and its margin, in pixels.
 const SIZE_PX: DVec2 = DVec2::new(420.0, 220.0);
@@ -51,17 +58,18 @@ fn from_above(drive: &DriveRecord, fault_us: Option<i64>) -> String {
     let route = drive.reference.as_ref().map_or(Vec::new(), |drive| drive.line.points_m().to_vec());
     let all: Vec<DVec2> = ego.iter().chain(&route).copied().collect();
     let frame = Frame::around(&all, true);
-    let mut svg =
-        begin("from above: driven (blue), recorded (grey), actors (orange), first fault (red)");
+    let legend =
+        [(DRIVEN, "driven"), (RECORDED, "recorded"), (ACTORS, "actors"), (FAULT, "first fault")];
+    let mut svg = begin("from above", &legend);
     scale_bar(&mut svg, &frame);
-    line(&mut svg, &frame, &route, "#bbb", 4.0);
+    line(&mut svg, &frame, &route, RECORDED, 4.0);
     let tracks = drive.tracks.iter().flatten();
     for track in tracks {
         let there: Vec<DVec2> =
             track.samples.iter().flatten().map(|sample| sample.footprint.center_m).collect();
-        line(&mut svg, &frame, &there, "#d55e00", 1.5);
+        line(&mut svg, &frame, &there, ACTORS, 1.5);
     }
-    line(&mut svg, &frame, &ego, "#0072b2", 2.0);
+    line(&mut svg, &frame, &ego, DRIVEN, 2.0);
     if let Some(at) = sample_at(drive, fault_us) {
         dot(&mut svg, frame.at(ego[at]));
     }
@@ -80,10 +88,10 @@ fn speed(drive: &DriveRecord, fault_us: Option<i64>) -> String {
     let frame = Frame::around(&with_zero, false);
     let most = points.iter().map(|point| point.y).fold(0.0, f64::max);
     let end_s = points.last().map_or(0.0, |point| point.x);
-    let mut svg = begin(&format!("speed, 0 to {most:.1} m/s over {end_s:.1} s"));
+    let mut svg = begin(&format!("speed, 0 to {most:.1} m/s over {end_s:.1} s"), &[]);
     let axis = [DVec2::ZERO, DVec2::new(end_s, 0.0)];
-    line(&mut svg, &frame, &axis, "#bbb", 1.0);
-    line(&mut svg, &frame, &points, "#0072b2", 2.0);
+    line(&mut svg, &frame, &axis, RECORDED, 1.0);
+    line(&mut svg, &frame, &points, DRIVEN, 2.0);
     if let Some(at) = sample_at(drive, fault_us) {
         dot(&mut svg, frame.at(points[at]));
     }
@@ -98,12 +106,18 @@ fn sample_at(drive: &DriveRecord, fault_us: Option<i64>) -> Option<usize> {
 
 // Writing into a text cannot fail.
 
-fn begin(title: &str) -> String {
+/// The head of a plot: what it shows, and the name of each colour. At 12 px a character takes 7 px on average at most, and a
+/// plot is 420 px wide.
+fn begin(title: &str, legend: &[(&str, &str)]) -> String {
     let DVec2 { x, y } = SIZE_PX;
-    format!(
+    let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{x}\" height=\"{y}\" viewBox=\"0 0 {x} {y}\">\
-         <text x=\"6\" y=\"14\" font-size=\"12\" fill=\"#444\">{title}</text>"
-    )
+         <text x=\"6\" y=\"14\" font-size=\"12\" fill=\"{TEXT}\">{title}"
+    );
+    for (color, name) in legend {
+        let _ = write!(svg, " <tspan dx=\"6\" fill=\"{color}\">\u{25cf}</tspan> {name}");
+    }
+    svg + "</text>"
 }
 
 fn line(svg: &mut String, frame: &Frame, points: &[DVec2], color: &str, width: f64) {
@@ -129,8 +143,8 @@ fn scale_bar(svg: &mut String, frame: &Frame) {
     let to_x = from.x + bar_m * frame.scale.x;
     let _ = write!(
         svg,
-        "<path d=\"M{:.1} {:.1}H{to_x:.1}\" stroke=\"#444\" stroke-width=\"2\"/>\
-         <text x=\"{:.1}\" y=\"{:.1}\" font-size=\"11\" fill=\"#444\">{bar_m} m</text>",
+        "<path d=\"M{:.1} {:.1}H{to_x:.1}\" stroke=\"{TEXT}\" stroke-width=\"2\"/>\
+         <text x=\"{:.1}\" y=\"{:.1}\" font-size=\"11\" fill=\"{TEXT}\">{bar_m} m</text>",
         from.x,
         from.y,
         to_x + 6.0,
@@ -140,5 +154,5 @@ fn scale_bar(svg: &mut String, frame: &Frame) {
 
 fn dot(svg: &mut String, at: DVec2) {
     let DVec2 { x, y } = at;
-    let _ = write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" fill=\"#b00020\"/>");
+    let _ = write!(svg, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" fill=\"{FAULT}\"/>");
 }

@@ -3,37 +3,37 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use serde::Serialize;
-use serde_json::Value;
+use serde::{Deserialize, Serialize};
 
-use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
+use wildcity_score::range_of;
 use wildcity_score::statistics::{Mean, wilson};
-use wildcity_score::{own, range_of};
-use wildcity_session::Engine;
 
-use crate::case::Case;
-use crate::finish::Finished;
+use crate::entry::{EpisodeEntry, Status};
+use crate::error::SuiteError;
+use crate::file::read;
 use crate::limits;
-use crate::technical::Technical;
 
 /// All episodes of a run, and what they say together. It has no times of the clock: the same drives give the same
 /// bytes.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SuiteResult {
     /// `wildcity.suite-result/1`.
-    pub format: &'static str,
+    pub format: String,
     /// Name of the suite.
     pub suite: String,
     /// The agent.
     pub agent: String,
     /// Whether versions that scenarios name were ignored.
     pub latest: bool,
+    /// Simulated time of a step, in microseconds; absent in results of older builds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dt_us: Option<i64>,
     /// The least pass rate that was asked for.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_least: Option<f64>,
     /// How many episodes ended how.
     pub counts: Counts,
-    /// The pass rate, of the episodes that were judged.
+    /// The pass rate, of the episodes that were judged, without duplicates.
     pub pass_rate: Rate,
     /// Mean of each score over the scenarios, of the means over their seeds.
     pub means: BTreeMap<String, MeanEntry>,
@@ -43,8 +43,29 @@ pub struct SuiteResult {
     pub episodes: Vec<EpisodeEntry>,
 }
 
+/// What a run was.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct RunHead {
+    /// Name of the suite.
+    pub(crate) suite: String,
+    /// The agent.
+    pub(crate) agent: String,
+    /// Whether versions that scenarios name were ignored.
+    pub(crate) latest: bool,
+    /// Simulated time of a step, in microseconds.
+    pub(crate) dt_us: Option<i64>,
+    /// The least pass rate that was asked for.
+    pub(crate) at_least: Option<f64>,
+}
+
+/// What says what a file is.
+#[derive(Deserialize)]
+struct Head {
+    format: String,
+}
+
 /// How many episodes ended how.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
     /// All.
     pub episodes: u64,
@@ -58,10 +79,13 @@ pub struct Counts {
     pub not_judged: u64,
     /// Not driven, for technical reasons.
     pub technical: u64,
+    /// Driven as another episode of the same scenario was. They are counted above, and are in no rate and no mean.
+    #[serde(default)]
+    pub duplicates: u64,
 }
 
 /// A rate with its 95 % interval (Wilson).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rate {
     /// Passed.
     pub passed: u64,
@@ -74,7 +98,7 @@ pub struct Rate {
 }
 
 /// A mean with its 95 % interval ([`Mean::interval`]).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MeanEntry {
     /// The mean.
     pub mean: f64,
@@ -84,99 +108,16 @@ pub struct MeanEntry {
     pub scenarios: u64,
 }
 
-/// One episode.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct EpisodeEntry {
-    /// Its name.
-    pub name: String,
-    /// Name of the scenario.
-    pub scenario: String,
-    /// The seed.
-    pub seed: u64,
-    /// The values of the sweep.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub values: BTreeMap<String, Value>,
-    /// BLAKE3 of the resolved scenario.
-    pub scenario_hash: String,
-    /// BLAKE3 of the twin's manifest.
-    pub version_hash: String,
-    /// How it ended.
-    pub status: Status,
-    /// The faults, by time.
-    pub faults: Vec<FaultLine>,
-    /// What was not judged, and why.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub not_judged: Vec<String>,
-    /// The scores.
-    pub scores: BTreeMap<String, ScoreLine>,
-    /// Steps driven.
-    pub steps: u64,
-    /// Distance driven, in metres.
-    pub distance_m: f64,
-    /// BLAKE3 of all frame hashes; empty if nothing was driven.
-    pub frames_hash: String,
-    /// The file of its record, below `episodes`; empty if nothing was driven.
-    pub record: String,
-    /// The MCAP file of its record, below `episodes`, or why there is none; `None` if none was asked for. Not in
-    /// `result.json`: whether an export is ready at the end of a run depends on the clock.
-    #[serde(skip)]
-    pub mcap: Option<Result<String, String>>,
-    /// Technical failures, of every attempt.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub errors: Vec<TechnicalEntry>,
-}
-
-/// A technical failure of an attempt.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct TechnicalEntry {
-    /// `server_error`, `agent_error`, `agent_timeout` or `agent_lost`.
-    pub kind: String,
-    /// What happened.
-    pub message: String,
-}
-
-/// How an episode ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Status {
-    /// Without a fault.
-    Passed,
-    /// With a fault of driving.
-    Failed,
-    /// Off the trained area before any fault.
-    OffModel,
-    /// Without what a verdict needs.
-    NotJudged,
-    /// Not driven, for technical reasons.
-    Technical,
-}
-
-/// The exit code of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ExitCode {
-    /// As wanted.
-    Passed = 0,
-    /// An episode failed by driving, or the pass rate is too low.
-    Driving = 1,
-    /// The command line, the suite or a scenario is wrong.
-    Usage = 2,
-    /// An episode was not driven, or more than a tenth were off the model.
-    Technical = 3,
-    /// With `--verify`: an episode does not repeat.
-    NotVerified = 4,
-}
-
 impl SuiteResult {
     /// The format of `result.json`.
     pub const FORMAT: &str = "wildcity.suite-result/1";
 
-    pub(crate) fn new(
-        suite: String,
-        agent: String,
-        latest: bool,
-        at_least: Option<f64>,
-        episodes: Vec<EpisodeEntry>,
-    ) -> Self {
+    /// The name of its file.
+    pub const FILE: &str = "result.json";
+
+    /// The result of some episodes, which are in order of their names.
+    pub(crate) fn new(head: RunHead, mut episodes: Vec<EpisodeEntry>) -> Self {
+        mark_duplicates(&mut episodes);
         let mut counts = Counts { episodes: episodes.len() as u64, ..Counts::default() };
         let mut by_scenario: BTreeMap<String, Vec<&EpisodeEntry>> = BTreeMap::new();
         for episode in &episodes {
@@ -188,40 +129,57 @@ impl SuiteResult {
                 Status::Technical => &mut counts.technical,
             };
             *count += 1;
+            counts.duplicates += u64::from(episode.duplicate_of.is_some());
             by_scenario.entry(episode.scenario.clone()).or_default().push(episode);
         }
-        let rate = |episodes: &[&EpisodeEntry]| {
-            let judged = [Status::Passed, Status::Failed];
-            let runs = episodes.iter().filter(|episode| judged.contains(&episode.status)).count();
-            let passed = episodes.iter().filter(|episode| episode.status == Status::Passed).count();
-            Rate::new(passed as u64, runs as u64)
-        };
         Self {
-            format: Self::FORMAT,
-            suite,
-            agent,
-            latest,
-            at_least,
+            format: Self::FORMAT.to_owned(),
+            suite: head.suite,
+            agent: head.agent,
+            latest: head.latest,
+            dt_us: head.dt_us,
+            at_least: head.at_least,
             counts,
-            pass_rate: rate(&episodes.iter().collect::<Vec<_>>()),
+            pass_rate: Rate::of(episodes.iter()),
             means: means(&by_scenario),
-            scenarios: by_scenario.iter().map(|(name, of)| (name.clone(), rate(of))).collect(),
+            scenarios: by_scenario
+                .iter()
+                .map(|(name, of)| (name.clone(), Rate::of(of.iter().copied())))
+                .collect(),
             episodes,
         }
     }
 
-    /// The exit code: technical failures before driving ones, since a result with holes says little of driving.
-    pub fn exit_code(&self) -> ExitCode {
-        let off_model = self.counts.off_model as f64;
-        let too_often_off = off_model > limits::OFF_MODEL_SHARE * self.counts.episodes as f64;
-        if self.counts.technical > 0 || too_often_off {
-            return ExitCode::Technical;
-        }
-        let is_good = match self.at_least {
-            Some(rate) => self.pass_rate.interval[0] >= rate,
-            None => self.counts.failed == 0 && self.counts.not_judged == 0,
+    /// Reads the result of a run: its `result.json`, or the directory that has it.
+    ///
+    /// # Errors
+    /// The file cannot be read, or is no result of a run; names it, and the place of the first mistake.
+    pub fn read(run: &Path) -> Result<Self, SuiteError> {
+        let path = match run.is_dir() {
+            true => run.join(Self::FILE),
+            false => run.to_owned(),
         };
-        if is_good { ExitCode::Passed } else { ExitCode::Driving }
+        let bytes = read(&path, limits::RESULT_BYTES)?;
+        let wrong = |reason: String| SuiteError::NoResult { path: path.clone(), reason };
+        let Head { format } = serde_json::from_slice(&bytes)
+            .map_err(|error| wrong(format!("no JSON object with a format: {error}")))?;
+        if format != Self::FORMAT {
+            return Err(wrong(format!("its format is {format:?}, not {:?}", Self::FORMAT)));
+        }
+        let mut reader = serde_json::Deserializer::from_slice(&bytes);
+        serde_path_to_error::deserialize(&mut reader)
+            .map_err(|error| wrong(format!("{}: {}", error.path(), error.inner())))
+    }
+
+    /// The warning about duplicates; `None` if there are none.
+    pub fn duplicates_text(&self) -> Option<String> {
+        let Counts { duplicates, episodes, .. } = self.counts;
+        (duplicates > 0).then(|| {
+            format!(
+                "{duplicates} of {episodes} episodes were driven as another one of their scenario was, and are in no rate \
+                 and no mean: a seed changes nothing but jitter"
+            )
+        })
     }
 
     /// The file `result.json`.
@@ -236,7 +194,8 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
     let mut per_scenario: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     for episodes in by_scenario.values() {
         let mut values: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
-        for (name, score) in episodes.iter().flat_map(|episode| &episode.scores) {
+        let distinct = episodes.iter().filter(|episode| episode.duplicate_of.is_none());
+        for (name, score) in distinct.flat_map(|episode| &episode.scores) {
             if let Some(value) = score.value {
                 values.entry(name).or_default().push(value);
             }
@@ -259,101 +218,42 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
     entries.collect()
 }
 
+/// Says which episodes were driven as an earlier one of their scenario was. Two seeds of a scenario without jitter are:
+/// counted twice, they would narrow the intervals without saying anything.
+fn mark_duplicates(episodes: &mut [EpisodeEntry]) {
+    let mut first: BTreeMap<(String, Status, String), String> = BTreeMap::new();
+    for episode in episodes.iter_mut().filter(|episode| !episode.drive_hash.is_empty()) {
+        let drive = (episode.scenario.clone(), episode.status, episode.drive_hash.clone());
+        match first.get(&drive) {
+            Some(name) => episode.duplicate_of = Some(name.clone()),
+            None => {
+                first.insert(drive, episode.name.clone());
+            }
+        }
+    }
+}
+
 impl Rate {
+    /// The pass rate of the episodes that were judged, without duplicates.
+    fn of<'a>(episodes: impl Iterator<Item = &'a EpisodeEntry>) -> Self {
+        let distinct = episodes.filter(|episode| episode.duplicate_of.is_none());
+        let judged = distinct.filter(|episode| episode.status.is_judged());
+        let passes: Vec<bool> = judged.map(|episode| episode.status == Status::Passed).collect();
+        let passed = passes.iter().filter(|passed| **passed).count();
+        Self::new(passed as u64, passes.len() as u64)
+    }
+
+    /// In words: `4 of 4 (95 %: 51.0 to 100.0 %)`; of no runs, that there are none.
+    pub fn text(&self) -> String {
+        let [low, high] = self.interval.map(|end| 100.0 * end);
+        match self.runs {
+            0 => "no episode was judged".to_owned(),
+            runs => format!("{} of {runs} (95 %: {low:.1} to {high:.1} %)", self.passed),
+        }
+    }
+
     fn new(passed: u64, runs: u64) -> Self {
         let rate = (runs > 0).then(|| passed as f64 / runs as f64);
         Self { passed, runs, rate, interval: wilson(passed, runs) }
-    }
-}
-
-impl EpisodeEntry {
-    pub(crate) fn new(case: &Case, finished: Option<Finished>, errors: Vec<Technical>) -> Self {
-        let errors = errors
-            .into_iter()
-            .map(|error| TechnicalEntry { kind: error.kind.to_owned(), message: error.message });
-        let mut entry = Self {
-            name: case.name.clone(),
-            scenario: case.scenario.clone(),
-            seed: case.seed,
-            values: case.values.clone(),
-            scenario_hash: case.line.hash.clone(),
-            version_hash: case.version_hash.clone(),
-            status: Status::Technical,
-            faults: Vec::new(),
-            not_judged: Vec::new(),
-            scores: BTreeMap::new(),
-            steps: 0,
-            distance_m: 0.0,
-            frames_hash: String::new(),
-            record: String::new(),
-            mcap: None,
-            errors: errors.collect(),
-        };
-        if let Some(Finished { record, end, result, frames_hash }) = finished {
-            entry.status = match result.verdict.as_str() {
-                "passed" => Status::Passed,
-                "failed" => Status::Failed,
-                "off_model" => Status::OffModel,
-                _ => Status::NotJudged,
-            };
-            entry.faults = result.faults;
-            entry.not_judged = result.not_judged;
-            entry.scores = result.scores;
-            entry.steps = end.steps;
-            entry.distance_m = end.distance_m;
-            entry.frames_hash = frames_hash;
-            entry.record = record;
-        }
-        entry
-    }
-}
-
-impl EpisodeEntry {
-    /// Says where the MCAP file of the record is, or why there is none.
-    pub(crate) fn add_mcap(&mut self, episodes: &Path, engine: &Engine) {
-        if self.record.is_empty() {
-            return;
-        }
-        let mcap = mcap_of(Path::new(&self.record));
-        self.mcap = Some(match engine.export_failure(&EpisodeFile::name_of(&mcap)) {
-            Some(reason) => Err(reason),
-            None if episodes.join(&mcap).is_file() => Ok(mcap.display().to_string()),
-            None => Err("it was not ready at the end of the run".to_owned()),
-        });
-    }
-
-    /// Why there is no MCAP file although one was asked for.
-    pub fn mcap_error(&self) -> Option<&str> {
-        self.mcap.as_ref()?.as_ref().err().map(String::as_str)
-    }
-
-    /// The faults in words, by time: `contact.pedestrian with walker at 4.615 s`.
-    pub(crate) fn fault_texts(&self) -> Vec<String> {
-        self.faults.iter().map(|fault| self.fault_text(fault)).collect()
-    }
-
-    fn fault_text(&self, fault: &FaultLine) -> String {
-        let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
-        let text = format!("{}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6);
-        let part = |name: &str| self.scores.get(own::NAME)?.parts.get(name).copied().flatten();
-        match (&*fault.fault, part("progress"), part("least_progress")) {
-            ("progress", Some(progress), Some(least)) => {
-                format!("{text}: {progress:.3} of the recorded drive, and {least} is the least")
-            }
-            _ => text,
-        }
-    }
-}
-
-impl Status {
-    /// The name in `result.json`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Passed => "passed",
-            Self::Failed => "failed",
-            Self::OffModel => "off_model",
-            Self::NotJudged => "not_judged",
-            Self::Technical => "technical",
-        }
     }
 }

@@ -14,12 +14,13 @@ use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
 use crate::case::Case;
-use crate::dial_in::{self, Dialled};
+use crate::dial_in::{self, Dialled, NotDriven};
 use crate::driver::BuiltIn;
+use crate::entry::EpisodeEntry;
 use crate::error::SuiteError;
 use crate::finish::finish;
 use crate::limits;
-use crate::result::{EpisodeEntry, SuiteResult};
+use crate::result::{RunHead, SuiteResult};
 use crate::technical::Technical;
 
 /// What drives.
@@ -34,6 +35,16 @@ pub enum AgentChoice {
         /// The command line, for the shell.
         line: String,
     },
+}
+
+impl AgentChoice {
+    /// Its name in results.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::BuiltIn(agent) => agent.name(),
+            Self::Command { name, .. } => name,
+        }
+    }
 }
 
 /// How a suite is run.
@@ -102,16 +113,21 @@ impl std::fmt::Debug for RunSettings {
 /// `jobs`.
 ///
 /// # Errors
-/// The directory has episodes of another run, or the engine or the server cannot be started.
+/// The directory has episodes of another run, the engine or the server cannot be started, or the shell finds no such
+/// command as the agent's.
 pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult, SuiteError> {
     check_empty(&settings.episodes)?;
     let host = match &settings.agent {
         AgentChoice::BuiltIn(_) => Host::Engine(engine(&settings)?),
         AgentChoice::Command { .. } => server(&settings).await?,
     };
-    let agent_name = match &settings.agent {
-        AgentChoice::BuiltIn(agent) => agent.name().to_owned(),
-        AgentChoice::Command { name, .. } => name.clone(),
+    let head = RunHead {
+        suite: settings.suite,
+        agent: settings.agent.name().to_owned(),
+        latest: settings.latest,
+        // That of the suite, alike for all of its cases.
+        dt_us: cases.first().and_then(|case| case.options.dt_us),
+        at_least: settings.at_least,
     };
     let permits = Arc::new(Semaphore::new(settings.jobs.clamp(1, limits::JOBS)));
     let shared = Arc::new(Shared {
@@ -130,13 +146,21 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
             // The semaphore is never closed.
             let _permit = permits.acquire_owned().await;
             let entry = shared.episode(&case).await;
-            (shared.progress)(&entry);
-            entry
+            entry.inspect(|entry| (shared.progress)(entry))
         });
     }
     let mut entries = Vec::new();
-    while let Some(entry) = tasks.join_next().await {
-        entries.push(entry.map_err(|error| SuiteError::Task(error.to_string()))?);
+    let mut failed = None;
+    while let Some(ended) = tasks.join_next().await {
+        let entry = ended.map_err(|error| SuiteError::Task(error.to_string()));
+        match entry.flatten() {
+            Ok(entry) => entries.push(entry),
+            // What is cancelled then is not why the run failed.
+            Err(error) => {
+                failed.get_or_insert(error);
+                tasks.abort_all();
+            }
+        }
     }
     if let Some(mut shared) = Arc::into_inner(shared) {
         let engine = shared.host.engine();
@@ -148,7 +172,10 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         }
     }
     entries.sort_by(|a, b| a.name.cmp(&b.name));
-    Ok(SuiteResult::new(settings.suite, agent_name, settings.latest, settings.at_least, entries))
+    match failed {
+        Some(error) => Err(error),
+        None => Ok(SuiteResult::new(head, entries)),
+    }
 }
 
 /// Refuses a directory with records: their names would differ from those of a fresh run.
@@ -211,16 +238,25 @@ impl Host {
 
 impl Shared {
     /// Drives a case, technical failures once more, and judges its record.
-    async fn episode(&self, case: &Case) -> EpisodeEntry {
+    ///
+    /// # Errors
+    /// The agent is a command that the shell does not find.
+    async fn episode(&self, case: &Case) -> Result<EpisodeEntry, SuiteError> {
         let mut errors = Vec::new();
         for attempt in 1..=u64::from(self.retries) + 1 {
             let driven = self.attempt(case, attempt).await;
             let finished = match driven {
                 Ok(record) => finish(case, record).await,
-                Err(technical) => Err(technical),
+                Err(NotDriven::Technical(technical)) => Err(technical),
+                Err(NotDriven::NoCommand(reason)) => {
+                    return Err(SuiteError::NoAgent {
+                        agent: self.agent.name().to_owned(),
+                        reason,
+                    });
+                }
             };
             match finished {
-                Ok(finished) => return EpisodeEntry::new(case, Some(finished), errors),
+                Ok(finished) => return Ok(EpisodeEntry::new(case, Some(finished), errors)),
                 Err(technical) => {
                     tracing::warn!(
                         episode = case.name,
@@ -232,11 +268,11 @@ impl Shared {
                 }
             }
         }
-        EpisodeEntry::new(case, None, errors)
+        Ok(EpisodeEntry::new(case, None, errors))
     }
 
     /// Drives a case. Returns the file of its record.
-    async fn attempt(&self, case: &Case, attempt: u64) -> Result<PathBuf, Technical> {
+    async fn attempt(&self, case: &Case, attempt: u64) -> Result<PathBuf, NotDriven> {
         // Each attempt has a session of its own: the server keeps one that was lost for a while.
         let session = match attempt {
             1 => case.name.clone(),
@@ -252,7 +288,7 @@ impl Shared {
                 let dialled = Dialled { name, command: line, url, session: &session, timeout };
                 dial_in::drive(&dialled, case, &record).await?;
             }
-            _ => return Err(Technical::server("the host does not fit the agent")),
+            _ => return Err(Technical::server("the host does not fit the agent").into()),
         }
         Ok(record)
     }

@@ -7,10 +7,18 @@ pub(crate) struct Technical {
     pub(crate) kind: &'static str,
     /// What happened.
     pub(crate) message: String,
+    /// The last lines that the agent wrote to its standard error; none of a built-in one.
+    pub(crate) stderr: String,
 }
 
 impl Technical {
+    /// A failure of some kind.
+    pub(crate) fn new(kind: &'static str, message: impl Into<String>) -> Self {
+        Self { kind, message: message.into(), stderr: String::new() }
+    }
+
+    /// A failure of this program.
     pub(crate) fn server(message: impl Into<String>) -> Self {
-        Self { kind: "server_error", message: message.into() }
+        Self::new("server_error", message)
     }
 }

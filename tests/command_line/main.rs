@@ -66,6 +66,7 @@ mod route;
 mod scenario;
 mod served;
 mod sky;
+mod suites;
 mod traces;
 mod twin;
 

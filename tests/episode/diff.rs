@@ -50,3 +50,50 @@ fn lengths_and_setups_differ() {
     let found = diff(&whole.read(), &written::read(&lines)).unwrap();
     assert_eq!((found.what, found.how.as_str()), (What::Setup, "seed 7 against 8"));
 }
+
+#[test]
+fn a_setup_that_differs_is_named_with_both_values() {
+    let whole = Made::default();
+    let found = |change: &dyn Fn(&mut [serde_json::Value])| {
+        let mut lines = whole.lines();
+        change(&mut lines);
+        let found = diff(&whole.read(), &written::read(&lines)).unwrap();
+        assert_eq!(found.what, What::Setup);
+        found.how
+    };
+    let scenario = |change: &dyn Fn(&mut serde_json::Value)| {
+        found(&|lines| {
+            change(&mut lines[1]);
+            lines[1]["hash"] = json!("f".repeat(64));
+        })
+    };
+    let twin = whole.lines()[0]["twin"].as_str().unwrap().to_owned();
+    assert_eq!(
+        found(&|lines| lines[0]["twin"] = json!("other")),
+        format!("twin {twin} against other")
+    );
+    let version = found(&|lines| lines[0]["version_hash"] = json!("f".repeat(64)));
+    assert!(version.starts_with(&format!("version of twin {twin} ")), "{version}");
+    assert!(version.ends_with("(ffffffff)"), "{version}");
+    assert_eq!(
+        found(&|lines| lines[0]["dt_us"] = json!(50_000)),
+        "length of a step 0.1 s against 0.05 s"
+    );
+    let dynamics = found(&|lines| lines[0]["dynamics"]["speed_m_s"] = json!(77.0));
+    assert!(
+        dynamics.starts_with("dynamics: speed_m_s ") && dynamics.ends_with(" against 77.0"),
+        "{dynamics}"
+    );
+    let start = found(&|lines| lines[0]["start"]["xyz"][1] = json!(3.5));
+    assert!(start.starts_with("start: xyz[1] ") && start.ends_with(" against 3.5"), "{start}");
+    let name = whole.lines()[1]["name"].as_str().unwrap().to_owned();
+    assert_eq!(
+        scenario(&|line| line["name"] = json!("cut-in")),
+        format!("scenario {name} against cut-in")
+    );
+    let ended = scenario(&|line| line["scenario"]["end"] = json!({ "contact": "any" }));
+    assert!(ended.starts_with(&format!("scenario {name}: end")), "{ended}");
+    assert!(ended.contains(" against ") && ended.contains("any"), "{ended}");
+    // A hash that nothing explains.
+    assert!(scenario(&|_| {}).starts_with(&format!("scenario {name}: hash ")));
+}

@@ -6,7 +6,7 @@ use wildcity_scene::ActorClass;
 use wildcity_score::own::{Fault, Judgement, verdict};
 use wildcity_score::{
     DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
-    Track, TrackSample, range_of, score,
+    Track, TrackSample, lower_is_better, range_of, score,
 };
 use wildcity_sim::contact::{CollisionType, Contact, Footprint};
 
@@ -357,6 +357,24 @@ fn every_score_has_a_range_and_stays_in_it() {
     assert_eq!(range_of("bench2drive.driving@7ec25d1"), [0.0, 100.0]);
     assert_eq!(range_of("alpasim.open_loop_collision@3032e0c"), [0.0, 1.0]);
     assert_eq!(range_of("alpasim.min_ade_5s@3032e0c"), [0.0, f64::INFINITY]);
+}
+
+#[test]
+fn deviations_and_mistakes_are_better_when_they_are_lower() {
+    let names: Vec<&str> = score(&drive(10.0)).iter().map(|score| score.name).collect();
+    let lower: Vec<&str> = names.into_iter().filter(|name| lower_is_better(name)).collect();
+    let bases: Vec<&str> = lower.iter().map(|name| name.split_once('@').unwrap().0).collect();
+    let wanted = [
+        "alpasim.offroad",
+        "alpasim.wrong_lane",
+        "alpasim.plan_deviation",
+        "alpasim.open_loop_collision",
+        "alpasim.min_ade_0.5s",
+        "alpasim.min_ade_1s",
+        "alpasim.min_ade_2.5s",
+        "alpasim.min_ade_5s",
+    ];
+    assert_eq!(bases, wanted);
 }
 
 #[test]

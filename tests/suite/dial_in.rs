@@ -4,7 +4,7 @@ use std::env;
 
 use serde_json::Value;
 use wildcity_client::{Client, Open, Pose};
-use wildcity_suite::{AgentChoice, ExitCode, Status};
+use wildcity_suite::{AgentChoice, Ending, ExitCode, Status, SuiteError, junit, page};
 
 use crate::street::Bench;
 
@@ -22,6 +22,7 @@ fn the_agent() {
     let Ok(open) = env::var("WILDCITY_OPEN") else { return };
     let manner = env::var("AGENT_MANNER").unwrap();
     if manner == "fails" {
+        (1..=30).for_each(|line| eprintln!("line {line}"));
         std::process::exit(3);
     }
     if manner == "idle" {
@@ -81,6 +82,55 @@ async fn technical_failures_are_tried_again_and_both_kept() {
         assert_eq!(episode.status, Status::Technical, "{manner}");
         let kinds: Vec<&str> = episode.errors.iter().map(|error| &*error.kind).collect();
         assert_eq!(kinds, [kind; 2], "{manner}: {:?}", episode.errors);
-        assert_eq!(result.exit_code(), ExitCode::Technical);
+        assert_eq!(Ending::of(&result, None).code, ExitCode::Technical);
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_agent_that_drives_nothing_is_quoted() {
+    let bench = Bench::new();
+    bench.suite();
+    for (manner, status) in [("fails", "exit status: 3"), ("idle", "exit status: 0")] {
+        let cases = bench.cases(&bench.path("rails.json")).unwrap();
+        let settings = bench.settings(command(manner), 1, manner);
+        let begin = std::time::Instant::now();
+        let result = wildcity_suite::run(settings, cases).await.unwrap();
+        let error = &result.episodes[0].errors[0];
+        assert!(error.message.contains(status), "{}", error.message);
+        assert!(error.message.contains("drove nothing: it must connect"), "{}", error.message);
+        // Nothing is waited for that cannot come: the record of an agent that never reset its session.
+        assert!(begin.elapsed() < wildcity_suite::limits::CLOSE_WAIT, "{:?}", begin.elapsed());
+        if manner == "fails" {
+            assert!(error.stderr.ends_with("line 29\nline 30"), "{}", error.stderr);
+            assert!(!error.stderr.contains("line 18\n"), "the last twelve: {}", error.stderr);
+            let ending = Ending::of(&result, None);
+            assert!(junit(&result, &ending).contains("line 30"));
+            assert!(page(&result, &ending, &[], &bench.path(manner)).contains("line 30"));
+            assert!(!result.to_json().contains("line 30"), "texts of agents may have times");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_command_that_is_not_there_ends_the_run_at_once() {
+    let bench = Bench::new();
+    bench.suite();
+    for line in ["idmm", "cd / && idmm", "/"] {
+        let agent = AgentChoice::Command { name: line.to_owned(), line: line.to_owned() };
+        let cases = bench.cases(&bench.path("suite.json")).unwrap();
+        let out = format!("out{}", line.len());
+        let error = wildcity_suite::run(bench.settings(agent, 2, &out), cases).await.unwrap_err();
+        assert!(matches!(error, SuiteError::NoAgent { .. }), "{error}");
+        let error = error.to_string();
+        let names = ["log, stand or idm", "egodriver:HOST:PORT", line];
+        assert!(names.iter().all(|name| error.contains(name)), "{error}");
+    }
+    // A command that drove, and did not find something then, is another matter.
+    let binary = env::current_exe().unwrap();
+    let test = "dial_in::the_agent --exact --nocapture";
+    let line = format!("AGENT_MANNER=follows {} {test}; no-such-clean-up", binary.display());
+    let agent = AgentChoice::Command { name: "late".to_owned(), line };
+    let cases = bench.cases(&bench.path("rails.json")).unwrap();
+    let result = wildcity_suite::run(bench.settings(agent, 1, "late"), cases).await.unwrap();
+    assert_eq!(result.episodes[0].errors[0].kind, "agent_error");
 }

@@ -50,6 +50,17 @@ fn mistakes_name_the_file_and_the_place() {
         (suite(&|value| value["seed"] = json!(4)), "unknown field `seed`"),
         (suite(&|value| value["format"] = json!("wildcity.suite/9")), "write \"wildcity.suite/1\""),
         (suite(&|value| value["at_least"] = json!(90)), "a rate is from 0 to 1"),
+        (
+            suite(&|value| value["cameras"] = json!(["front", "roof"])),
+            "cameras[1]: \"roof\" is no camera of twin \"street\", which has front, left",
+        ),
+        (suite(&|value| value["cameras"] = json!([])), "cameras: is empty"),
+        (
+            suite(&|value| value["cameras"] = json!(["left", "left"])),
+            "cameras[1]: \"left\" is there",
+        ),
+        (suite(&|value| value["size"] = json!([0, 24])), "size: [0, 24]"),
+        (suite(&|value| value["dt_us"] = json!(0)), "dt_us: 0"),
     ] {
         assert!(change.contains("changed.json") && change.contains(wanted), "{change}");
     }

@@ -1,5 +1,6 @@
-//! Suites: their files, runs with built-in agents and with commands, results and reports.
+//! Suites: their files, runs with built-in agents and with commands, results, reports and comparisons.
 
+mod compare;
 mod dial_in;
 mod files;
 mod overhead;

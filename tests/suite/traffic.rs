@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 use wildcity_episode::{EpisodeFile, Event, result};
 use wildcity_suite::{
-    AgentChoice, BuiltIn, CaseOptions, SuiteFile, SuiteResult, cases, page, pictures, run,
+    AgentChoice, BuiltIn, CaseOptions, Ending, SuiteFile, SuiteResult, cases, page, pictures, run,
 };
 
 use crate::street::{Bench, cpu, scenario};
@@ -34,7 +34,7 @@ async fn a_driver_that_ignores_the_pedestrian_fails_for_contact() {
     assert_eq!(episode.faults[0].actor.as_deref(), Some("walker"));
     let shown = pictures(&failed, &bench.path("log"), &bench.catalog(), &cpu());
     assert_eq!(shown.len(), 1);
-    let html = page(&failed, &shown, &bench.path("log"));
+    let html = page(&failed, &Ending::of(&failed, None), &shown, &bench.path("log"));
     assert!(html.contains("contact.pedestrian with walker") && html.contains("image/jpeg"));
 
     // The same scenario without its actors is passed: it is the scenario's own test.

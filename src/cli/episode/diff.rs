@@ -3,14 +3,15 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use wildcity_episode::diff;
+use wildcity_episode::{What, diff};
 
 use crate::cli::directories::Episodes;
 use crate::cli::exit::Exit;
 
 /// Compare two episodes: the first step at which command, ego, actor or image differ.
 ///
-/// The exit code is 0 if they are alike, 1 if they differ.
+/// The exit code is 0 if they are alike, 1 if they differ, 2 if one of them cannot be read. Give records (.jsonl), not
+/// their MCAP exports. For two runs of a suite, `wildcity episode compare` says which of their episodes changed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Diff {
@@ -36,7 +37,12 @@ impl Diff {
         let a = super::read(&self.a, &self.episodes)?;
         let b = super::read(&self.b, &self.episodes)?;
         if let Some(difference) = diff(&a, &b) {
-            let text = format!("the episodes differ at {difference}");
+            let text = match difference.what {
+                What::Setup => {
+                    format!("the episodes were not set up alike: {}", difference.how)
+                }
+                _ => format!("the episodes differ at {difference}"),
+            };
             return Err(Exit::finding(1, text).into());
         }
         let steps = a.driven().last().map_or(0, |frame| frame.step);

@@ -61,7 +61,7 @@ const NOTED_ERROR_PX: f64 = 0.1;
 
 impl Export {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let path = super::file_of(&self.episode, &self.episodes)?;
+        let path = super::record_of(&self.episode, &self.episodes)?;
         let is_record = self
             .mcap
             .canonicalize()

@@ -6,7 +6,14 @@ use wildcity_episode::{EpisodeFile, list};
 
 use crate::cli::directories::Episodes;
 
+use super::bad_input;
+use super::folder::{records, runs_in};
+
 /// List the recorded episodes, newest first.
+///
+/// --episodes may be the folder of a run, with the records in its folder `episodes`. A record is named
+/// SCENARIO-SEED-NUMBER, with a sweep SCENARIO-COMBINATION-SEED-NUMBER; the second attempt after a technical failure has
+/// .2 behind the seed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct List {
@@ -21,13 +28,26 @@ pub(super) struct List {
 const EXAMPLES: &str = "\
 Examples:
   wildcity episode list
-  wildcity episode list --most 5 --episodes run/episodes";
+  wildcity episode list --most 5 --episodes run";
 
 impl List {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let dir = self.episodes.dir()?;
-        let listed = list(&dir)?;
+        let dir = records(&self.episodes)?;
+        let listed = list(&dir)
+            .map_err(|error| bad_input(format!("cannot read {}: {error}", dir.display())))?;
         let mut out = io::stdout().lock();
+        if listed.is_empty() {
+            writeln!(out, "no episodes in {}", dir.display())?;
+            for records in runs_in(&dir) {
+                writeln!(out, "look in     {}", records.display())?;
+            }
+            return Ok(());
+        }
+        writeln!(
+            out,
+            "{:<32} {:<20} {:>12}  {:<14} scenario, verdict",
+            "record", "twin", "", "end"
+        )?;
         for one in listed.iter().take(self.most) {
             let text = match EpisodeFile::read(&one.path) {
                 Ok(episode) => line(&episode),
@@ -35,8 +55,8 @@ impl List {
             };
             writeln!(out, "{:<32} {text}", one.name)?;
         }
-        if listed.is_empty() {
-            writeln!(out, "no episodes in {}", dir.display())?;
+        if listed.len() > self.most {
+            writeln!(out, "and {} more (--most {})", listed.len() - self.most, listed.len())?;
         }
         Ok(())
     }

@@ -1,23 +1,34 @@
 //! `wildcity episode`: suites of scenarios, and recorded episodes.
 
+mod compare;
 mod diff;
 mod export;
+mod folder;
 mod kept;
 mod list;
 mod run;
+mod run_agent;
 mod score;
 mod show;
 mod video;
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
-
-use wildcity_episode::EpisodeFile;
+use wildcity_episode::{EpisodeFile, ReadError};
+use wildcity_suite::ExitCode;
 
 use super::directories::Episodes;
+use super::exit::Exit;
+use folder::file_of;
 
-/// Drive suites of scenarios; list, score, compare and export recorded episodes.
+/// Drive suites of scenarios; compare runs; list, score, compare and export recorded episodes.
+///
+/// Exit codes of all of these commands: 0 if all is well; 1 if it is not: an episode failed (run), a run is worse (compare),
+/// two episodes differ (diff), an episode cannot be scored, rendered or written; 2 for a mistake in the command line, and
+/// for a file or folder that is missing or cannot be read. `run` also has 3 and 4, which its help explains.
+///
+/// A record is named SCENARIO-SEED-1, with a sweep SCENARIO-COMBINATION-SEED-1. SCENARIO-SEED.2-1 is the second attempt,
+/// after a technical failure of the first.
 #[derive(Debug, clap::Args)]
 pub(super) struct Episode {
     #[command(subcommand)]
@@ -27,6 +38,7 @@ pub(super) struct Episode {
 #[derive(Debug, clap::Subcommand)]
 enum Command {
     Run(Box<run::Run>),
+    Compare(compare::Compare),
     List(list::List),
     Show(show::Show),
     Score(score::Score),
@@ -39,6 +51,7 @@ impl Episode {
     pub(super) fn run(self) -> anyhow::Result<()> {
         match self.command {
             Command::Run(command) => command.run(),
+            Command::Compare(command) => command.run(),
             Command::List(command) => command.run(),
             Command::Show(command) => command.run(),
             Command::Score(command) => command.run(),
@@ -49,20 +62,36 @@ impl Episode {
     }
 }
 
-/// The file of an episode: a path, or a name `SESSION-NUMBER` in the directory of episodes.
-fn file_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
-    let is_name = episode.extension().is_none() && episode.components().count() == 1;
-    if !is_name || episode.is_file() {
-        return Ok(episode.to_owned());
-    }
-    let name = episode.to_string_lossy();
-    Ok(episodes.dir()?.join(format!("{name}.jsonl")))
+/// Reads an episode.
+///
+/// # Errors
+/// There is no such file, or it is no record; exit code 2.
+fn read(episode: &Path, episodes: &Episodes) -> anyhow::Result<EpisodeFile> {
+    EpisodeFile::read(&file_of(episode, episodes)?).map_err(unreadable)
 }
 
-/// Reads an episode.
-fn read(episode: &Path, episodes: &Episodes) -> anyhow::Result<EpisodeFile> {
+/// The file of an episode, of which the first line was read.
+///
+/// # Errors
+/// As of [`read`].
+fn record_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
     let path = file_of(episode, episodes)?;
-    EpisodeFile::read(&path).with_context(
-        || "give the path of an episode's file, or its name as `wildcity episode list` prints it",
-    )
+    EpisodeFile::header(&path).map_err(unreadable)?;
+    Ok(path)
+}
+
+fn unreadable(error: ReadError) -> anyhow::Error {
+    bad_input(format!(
+        "{error}; give the path of an episode's file, or its name as `wildcity episode list` prints it"
+    ))
+}
+
+/// The end of a command for a mistake in what it was given: exit code 2.
+fn bad_input(message: impl std::fmt::Display) -> anyhow::Error {
+    exit(ExitCode::Usage, message)
+}
+
+/// The end of a command that could not do what it should.
+fn exit(code: ExitCode, message: impl std::fmt::Display) -> anyhow::Error {
+    Exit::error(code as u8, format!("{message:#}")).into()
 }

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    AgentChoice, BuiltIn, CaseOptions, ExitCode, RunSettings, SuiteFile, SuiteResult, cases, junit,
-    page, pictures,
+    CaseOptions, CompareError, Comparison, Ending, ExitCode, Rule, RunSettings, SuiteError,
+    SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases, junit, page, pictures, verify,
 };
 use wildcity_twin::store::Catalog;
 
@@ -17,12 +17,22 @@ use crate::cli::directories::Twins;
 use crate::cli::exit::Exit;
 use crate::cli::{output, progress};
 
+use super::run_agent::{choice, wait_for_driver};
+use super::{bad_input, exit};
+
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
 /// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if no
-/// episode failed by driving (with --at-least, if the pass rate is as wanted), 1 if that is not so, 2 if the command
-/// line, the suite or a scenario is wrong, 3 if an episode was not driven for technical reasons or more than a tenth of
+/// episode failed by driving, 1 if one did, 2 if the command line, the suite, a scenario or the run of --against is wrong or
+/// the agent is a command that is not there, 3 if an episode was not driven for technical reasons or more than a tenth of
 /// them left the trained area, 4 if an episode does not repeat (--verify).
+///
+/// With --at-least episodes may fail: 0 and 1 say whether the pass rate is as wanted. With --against they say whether the
+/// run is worse than one before, as `wildcity episode compare` does; comparison.json and comparison.html are written too.
+/// With both, both must be so. junit.xml has every failure in any case, and the exit code as a property.
+///
+/// An episode that was driven as another one of its scenario was is a duplicate, and is in no rate and no mean: two seeds
+/// of a scenario without jitter are the same episode.
 ///
 /// An agent that is a command is started by the shell, once for each episode. It finds in its environment
 /// WILDCITY_URL, WILDCITY_OPEN (the fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and
@@ -61,6 +71,14 @@ pub(super) struct Run {
     #[arg(long, value_name = "RATE")]
     at_least: Option<f64>,
 
+    /// Compare with a run before: its result.json, or its folder.
+    #[arg(long, value_name = "RUN")]
+    against: Option<PathBuf>,
+
+    /// By how much pass_rate, or the mean of a score, may be worse than before; see `wildcity episode compare --help`
+    #[arg(long, value_name = "NAME=AMOUNT", requires = "against")]
+    worse_by: Vec<Tolerance>,
+
     /// Export the record of each episode as MCAP, beside it: for Foxglove, Rerun and others.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
@@ -88,25 +106,35 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity episode run scenes/suites/street/suite.json
   wildcity episode run suite.json --agent 'python drive.py' --jobs 4 --at-least 0.9
+  wildcity episode run suite.json --agent 'python drive.py' --against main/result.json
   wildcity episode run suite.json --agent egodriver:127.0.0.1:7102
   wildcity episode run pedestrian.json --agent stand --verify
   wildcity episode run suite.json --agent log --bare        (each scenario tests itself)";
 
 impl Run {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let (suite, scenarios) = SuiteFile::read(&self.suite).map_err(usage)?;
+        // What is wrong is said before anything is driven.
+        let (suite, scenarios) = SuiteFile::read(&self.suite).map_err(bad_input)?;
         let at_least = self.at_least.or(suite.at_least);
         if at_least.is_some_and(|rate| !(0.0..=1.0).contains(&rate)) {
-            return Err(usage("--at-least is a rate from 0 to 1"));
+            return Err(bad_input("--at-least is a rate from 0 to 1"));
         }
         let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
-        let agent = choice(agent)?;
+        let agent = choice(&agent)?;
         let catalog = self.twins.catalog()?;
         let options = CaseOptions { latest: self.latest, bare: self.bare };
-        let cases = cases(&suite, &scenarios, &catalog, options).map_err(usage)?;
-        output::create_dir(&self.out).map_err(usage)?;
+        let cases = cases(&suite, &scenarios, &catalog, options).map_err(bad_input)?;
+        let before = self.against.as_deref().map(SuiteResult::read).transpose();
+        let before = before.map_err(bad_input)?;
+        let rule: Rule = self.worse_by.iter().cloned().collect();
+        if let Some(before) = &before {
+            Comparison::check(before, &cases, &rule).map_err(bad_input)?;
+        }
+        output::create_dir(&self.out).map_err(bad_input)?;
+        wait_for_driver(&agent)?;
+
+        // Drive.
         let backend: Arc<dyn Backend> = Arc::from(self.backend.backend()?);
-        let episodes = self.out.join("episodes");
         let bar = progress::count("driving");
         bar.set_length(cases.len() as u64);
         let counted = bar.clone();
@@ -123,126 +151,111 @@ impl Run {
             cache: self.twins.cache(),
             scenarios: self.suite.parent().unwrap_or(Path::new(".")).to_owned(),
             backend: backend.clone(),
-            episodes: episodes.clone(),
+            episodes: self.episodes(),
             mcap: self.mcap,
             progress: Box::new(move |_| counted.inc(1)),
         };
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-        let result =
-            runtime.block_on(wildcity_suite::run(settings, cases)).map_err(
-                |error| match error {
-                    error @ wildcity_suite::SuiteError::NotEmpty { .. } => usage(error),
-                    error => exit(ExitCode::Technical, error),
-                },
-            )?;
+        let driven = runtime.block_on(wildcity_suite::run(settings, cases));
+        let result = driven.map_err(|error| match error {
+            error @ (SuiteError::NotEmpty { .. } | SuiteError::NoAgent { .. }) => bad_input(error),
+            error => exit(ExitCode::Technical, error),
+        })?;
         bar.finish_and_clear();
-        self.write(&result, &episodes, &catalog, &*backend)?;
-        self.verified(&result, &episodes, &catalog, &*backend)?;
-        match result.exit_code() {
+
+        // Report.
+        let compared = before.map(|before| Comparison::new(&before, &result, &rule));
+        let ending = self.ending(&result, compared.as_ref(), &catalog, &*backend);
+        let comparison = compared.and_then(Result::ok);
+        self.write_files(&result, &ending, comparison.as_ref(), &catalog, &*backend)?;
+        self.print(&result, &ending, comparison.as_ref())?;
+        match ending.code {
             ExitCode::Passed => Ok(()),
-            ExitCode::Driving => {
-                Err(Exit::finding(ExitCode::Driving as u8, ending(&result)).into())
-            }
-            code => Err(exit(code, ending(&result))),
+            ExitCode::Driving => Err(Exit::finding(ending.code as u8, ending.why).into()),
+            code => Err(exit(code, ending.why)),
         }
     }
 
-    /// Writes the three files, and a summary to standard output.
-    fn write(
+    /// The folder of the records.
+    fn episodes(&self) -> PathBuf {
+        self.out.join("episodes")
+    }
+
+    /// The exit code. With --verify, all episodes are rendered again first.
+    fn ending(
         &self,
         result: &SuiteResult,
-        episodes: &Path,
+        compared: Option<&Result<Comparison, CompareError>>,
+        catalog: &Catalog,
+        backend: &dyn Backend,
+    ) -> Ending {
+        let wrong = match self.verify {
+            true => verify(result, &self.episodes(), catalog, backend),
+            false => Vec::new(),
+        };
+        match wrong.is_empty() {
+            true => Ending::of(result, compared),
+            false => Ending::not_verified(&wrong),
+        }
+    }
+
+    fn write_files(
+        &self,
+        result: &SuiteResult,
+        ending: &Ending,
+        comparison: Option<&Comparison>,
         catalog: &Catalog,
         backend: &dyn Backend,
     ) -> anyhow::Result<()> {
-        let pictures = pictures(result, episodes, catalog, backend);
-        let html = page(result, &pictures, episodes);
-        for (name, text) in
-            [("result.json", result.to_json()), ("junit.xml", junit(result)), ("report.html", html)]
-        {
-            output::write(&self.out.join(name), text.as_bytes())?;
+        let pictures = pictures(result, &self.episodes(), catalog, backend);
+        self.write(SuiteResult::FILE, &result.to_json())?;
+        self.write("junit.xml", &junit(result, ending))?;
+        self.write("report.html", &page(result, ending, &pictures, &self.episodes()))?;
+        if let Some(comparison) = comparison {
+            self.write("comparison.json", &comparison.to_json())?;
+            self.write("comparison.html", &comparison.to_page())?;
         }
+        Ok(())
+    }
+
+    fn write(&self, name: &str, text: &str) -> anyhow::Result<()> {
+        output::write(&self.out.join(name), text.as_bytes())
+    }
+
+    /// A summary on standard output; main prints why the exit code is not 0.
+    fn print(
+        &self,
+        result: &SuiteResult,
+        ending: &Ending,
+        comparison: Option<&Comparison>,
+    ) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
         for episode in &result.episodes {
-            let why: Vec<&str> = episode.faults.iter().map(|fault| &*fault.fault).collect();
-            let error =
-                episode.errors.last().map(|error| format!("{}: {}", error.kind, error.message));
-            let why = why.join(", ") + &error.unwrap_or_default();
-            writeln!(out, "{:<12} {:<32} {why}", episode.status.name(), episode.name)?;
+            let mut why: Vec<String> =
+                episode.faults.iter().map(|fault| fault.fault.clone()).collect();
+            why.extend(episode.errors.last().map(TechnicalEntry::text));
+            why.extend(episode.duplicate_text());
+            let status = episode.status.name();
+            let line = format!("{status:<12} {:<32} {}", episode.name, why.join(", "));
+            writeln!(out, "{}", line.trim_end())?;
             if let Some(reason) = episode.mcap_error() {
                 eprintln!("warning: no MCAP file of {}: {reason}", episode.name);
             }
         }
-        let rate = &result.pass_rate;
-        let [low, high] = rate.interval.map(|end| 100.0 * end);
-        writeln!(
-            out,
-            "passed      {} of {} (95 %: {low:.1} to {high:.1} %)",
-            rate.passed, rate.runs
-        )?;
+        writeln!(out, "passed      {}", result.pass_rate.text())?;
+        if let Some(text) = result.duplicates_text() {
+            writeln!(out, "warning     {text}")?;
+        }
+        if let Some(comparison) = comparison {
+            write!(out, "\n{}\n", comparison.to_text())?;
+        }
+        if self.verify && ending.code != ExitCode::NotVerified {
+            writeln!(out, "verified    all episodes repeat")?;
+        }
         writeln!(out, "report      {}", self.out.join("report.html").display())?;
+        if ending.code == ExitCode::Passed {
+            writeln!(out, "ended       {}", ending.why)?;
+        }
         Ok(())
     }
-
-    fn verified(
-        &self,
-        result: &SuiteResult,
-        episodes: &Path,
-        catalog: &Catalog,
-        backend: &dyn Backend,
-    ) -> anyhow::Result<()> {
-        if !self.verify {
-            return Ok(());
-        }
-        let wrong = wildcity_suite::verify(result, episodes, catalog, backend);
-        if wrong.is_empty() {
-            writeln!(io::stdout().lock(), "verified    all episodes repeat")?;
-            return Ok(());
-        }
-        Err(exit(ExitCode::NotVerified, format!("not repeated: {}", wrong.join("; "))))
-    }
-}
-
-/// An agent by what the command line or the suite says.
-fn choice(agent: String) -> anyhow::Result<AgentChoice> {
-    if let Some(built_in) = BuiltIn::named(&agent) {
-        return Ok(AgentChoice::BuiltIn(built_in));
-    }
-    let line = match agent.strip_prefix("egodriver:") {
-        // This program is the bridge. The address is an argument of its own for the shell.
-        Some(address) => {
-            let is_address = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
-            if address.is_empty() || !address.chars().all(is_address) {
-                return Err(usage(format!("{agent:?} is no agent: expected egodriver:HOST:PORT")));
-            }
-            let program = std::env::current_exe().map_err(usage)?;
-            format!("'{}' drive --egodriver '{address}'", program.display())
-        }
-        None => agent.clone(),
-    };
-    Ok(AgentChoice::Command { name: agent, line })
-}
-
-/// Why a run did not end as wanted.
-fn ending(result: &SuiteResult) -> String {
-    let counts = &result.counts;
-    let text = format!(
-        "of {} episodes {} failed, {} were not judged, {} were not driven, {} left the trained area",
-        counts.episodes, counts.failed, counts.not_judged, counts.technical, counts.off_model
-    );
-    let low = result.pass_rate.interval[0];
-    match result.at_least.filter(|least| low < *least) {
-        Some(least) => {
-            format!("{text}; the pass rate is at least {low:.3}, and {least} was wanted")
-        }
-        None => text,
-    }
-}
-
-fn exit(code: ExitCode, message: impl std::fmt::Display) -> anyhow::Error {
-    Exit::error(code as u8, format!("{message:#}")).into()
-}
-
-fn usage(message: impl std::fmt::Display) -> anyhow::Error {
-    exit(ExitCode::Usage, message)
 }

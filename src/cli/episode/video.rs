@@ -15,7 +15,8 @@ use super::kept::{camera_of, keep_cameras};
 /// Write the frames of an episode as numbered pictures, for a video.
 ///
 /// The episode is driven and rendered again, and compared with its record. No video is encoded here, since this program
-/// has no encoder; the printed ffmpeg command makes one of the pictures, at the speed of the simulation.
+/// has no encoder; the printed ffmpeg command makes one of the pictures, at the speed of the simulation, which most players
+/// show: pictures of an odd width or height get a black column or row for it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Video {
@@ -48,8 +49,8 @@ Examples:
 
 impl Video {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let path = super::file_of(&self.episode, &self.episodes)?;
-        let mut recording = RecordedEpisode::read(&path)?;
+        let path = super::record_of(&self.episode, &self.episodes)?;
+        let mut recording = RecordedEpisode::read(&path).map_err(super::bad_input)?;
         let camera = match &self.camera {
             Some(name) => camera_of(&recording, name)?,
             None => 0,
@@ -79,16 +80,22 @@ impl Video {
         if let Some(difference) = &report.difference {
             writeln!(out, "differs     {difference}")?;
         }
+        let size = &header.rig.cameras[camera].camera;
+        let is_odd = size.width_px % 2 == 1 || size.height_px % 2 == 1;
         writeln!(
             out,
-            "video       none: wildcity has no encoder. With ffmpeg:\n            ffmpeg -framerate {} -i {} -pix_fmt \
+            "video       none: wildcity has no encoder. With ffmpeg:\n            ffmpeg -framerate {} -i '{}' {}-pix_fmt \
              yuv420p episode.mp4",
             1e6 / header.dt_us as f64,
-            self.out.join("%06d.png").display()
+            self.out.join("%06d.png").display(),
+            if is_odd { PAD } else { "" }
         )?;
         Ok(())
     }
 }
+
+/// Most players know yuv420p alone, which has one colour for 2 x 2 pixels: an odd size gets a black row or column.
+const PAD: &str = "-vf 'pad=ceil(iw/2)*2:ceil(ih/2)*2' ";
 
 fn write_png(path: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {
     let size = &image.camera.camera;

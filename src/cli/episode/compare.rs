@@ -1,0 +1,74 @@
+//! `wildcity episode compare`.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+
+use wildcity_suite::{Comparison, SuiteResult, Tolerance};
+
+use crate::cli::exit::Exit;
+use crate::cli::output;
+
+use super::bad_input;
+
+/// Compare two runs of a suite: is the driver worse than before?
+///
+/// Episodes are pairs by scenario, values of the sweep and seed. Prints the verdicts that changed, then the mean
+/// difference of each score over the pairs with its 95 % interval. Pairs in another version of the twin or of the scenario
+/// are not compared, and scores of two versions are not.
+///
+/// The exit code is 1 if the run is worse: by itself, if any episode that passed before does not pass now, be it that it
+/// failed or that it has no verdict. For a driver that does not drive alike twice, --worse-by pass_rate=0.05 looks at the
+/// pass rate over all pairs instead. Scores count only if --worse-by names them. It is 0 if the run is not worse, and 2
+/// if a file cannot be read or the runs cannot be compared.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+pub(super) struct Compare {
+    /// The run before: its result.json, or its folder.
+    #[arg(value_name = "BEFORE")]
+    before: PathBuf,
+
+    /// The later run.
+    #[arg(value_name = "AFTER")]
+    after: PathBuf,
+
+    /// By how much pass_rate, or the mean of a score, may be worse; may be given several times. pass_rate=0 asks for the
+    /// pass rate alone, and not for each episode.
+    #[arg(long, value_name = "NAME=AMOUNT")]
+    worse_by: Vec<Tolerance>,
+
+    /// Write the comparison as JSON.
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+
+    /// Write the comparison as a web page.
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity episode compare main/result.json run/result.json
+  wildcity episode compare main run --worse-by pass_rate=0.05 --html comparison.html
+  wildcity episode compare main run --worse-by bench2drive.driving=2 --worse-by alpasim.min_ade_5s=0.1";
+
+impl Compare {
+    pub(super) fn run(self) -> anyhow::Result<()> {
+        let before = SuiteResult::read(&self.before).map_err(bad_input)?;
+        let after = SuiteResult::read(&self.after).map_err(bad_input)?;
+        let rule = self.worse_by.into_iter().collect();
+        let comparison = Comparison::new(&before, &after, &rule).map_err(bad_input)?;
+        for (path, text) in [(self.json, comparison.to_json()), (self.html, comparison.to_page())] {
+            if let Some(path) = path {
+                output::write(&path, text.as_bytes())?;
+            }
+        }
+        let conclusion = comparison.conclusion();
+        let mut out = io::stdout().lock();
+        write!(out, "{}", comparison.to_text())?;
+        if comparison.worse {
+            return Err(Exit::finding(1, conclusion).into());
+        }
+        writeln!(out, "{conclusion}")?;
+        Ok(())
+    }
+}

@@ -1,0 +1,335 @@
+//! Two runs, compared: which episodes and scores got worse, and whether that makes the later run a worse one.
+//!
+//! Episodes are pairs by scenario, values of the sweep and seed. A pair is compared if both were driven in the same
+//! version of the twin and in the same resolved scenario: otherwise a difference says nothing of the driver.
+//!
+//! | module | what it does |
+//! |---|---|
+//! | `pair` | finds the pairs, and what changed in each |
+//! | `scores` | the mean difference of each score over the pairs |
+//! | `rule` | what counts as worse |
+//! | `text`, `page` | the comparison for people |
+
+mod page;
+mod pair;
+mod rule;
+mod scores;
+mod text;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
+
+use wildcity_score::own;
+
+use crate::case::Case;
+use crate::entry::{EpisodeEntry, Status};
+use crate::result::SuiteResult;
+
+pub use pair::{Change, ComparedEpisode, Side};
+pub use rule::{PASS_RATE, Rule, Tolerance};
+pub use scores::{Direction, ScoreChange};
+
+use pair::Key;
+
+/// A run and the run before it, compared. The same two results give the same bytes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Comparison {
+    /// `wildcity.suite-comparison/1`.
+    pub format: &'static str,
+    /// Whether the later run is worse, by the rule.
+    pub worse: bool,
+    /// Why it is; empty if it is not.
+    pub reasons: Vec<String>,
+    /// What counts as worse.
+    pub rule: Rule,
+    /// Suite and agent of the run before.
+    pub before: RunName,
+    /// Suite and agent of the later run.
+    pub after: RunName,
+    /// How many pairs changed how.
+    pub counts: ChangeCounts,
+    /// Passes of the pairs that the run before has judged.
+    pub pass_rate: PairedRate,
+    /// The scores that both runs have.
+    pub scores: BTreeMap<String, ScoreChange>,
+    /// Scores that only one run has, or each in another version, in words: they are not compared.
+    pub scores_not_compared: Vec<String>,
+    /// All episodes of both runs, by name.
+    pub episodes: Vec<ComparedEpisode>,
+}
+
+/// Which run it was.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct RunName {
+    /// Name of the suite.
+    pub suite: String,
+    /// The agent.
+    pub agent: String,
+}
+
+/// How many episodes changed how; [`Change`] says what each means.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[expect(missing_docs, reason = "the names are those of Change")]
+pub struct ChangeCounts {
+    pub worse: u64,
+    pub better: u64,
+    pub same: u64,
+    pub unknown: u64,
+    pub changed: u64,
+    pub only_before: u64,
+    pub only_after: u64,
+    /// Pairs that repeat another: they are counted above, and are in no rate and no mean.
+    pub duplicates: u64,
+}
+
+/// How many of the same episodes passed before and pass now. What passed before and has no verdict now does not pass.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct PairedRate {
+    /// Pairs that the run before has judged, without duplicates.
+    pub pairs: u64,
+    /// Of these, passed before.
+    pub before: u64,
+    /// Of these, passed now.
+    pub after: u64,
+}
+
+/// Why two runs cannot be compared.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum CompareError {
+    /// No episode of one run can be held against one of the other.
+    #[error("the runs cannot be compared: {reason}")]
+    NothingToCompare {
+        /// Why not.
+        reason: String,
+    },
+    /// The steps are of different length.
+    #[error(
+        "the runs cannot be compared: steps took {before_us} µs before and take {after_us} µs now; run both suites with \
+         one dt_us"
+    )]
+    StepLength {
+        /// Before, in microseconds.
+        before_us: i64,
+        /// Now, in microseconds.
+        after_us: i64,
+    },
+    /// The verdicts are by different rules.
+    #[error(
+        "the runs cannot be compared: verdicts were by {before} before and are by {after} now; run the driver of before \
+         with this build"
+    )]
+    VerdictVersion {
+        /// Name and version before.
+        before: String,
+        /// Name and version now.
+        after: String,
+    },
+    /// The rule names a score that the runs do not have.
+    #[error("--worse-by {name}: no such score; there is {}", known.join(", "))]
+    UnknownScore {
+        /// The name.
+        name: String,
+        /// The names that there are, with [`PASS_RATE`].
+        known: Vec<String>,
+    },
+    /// The rule names a score that no pair has.
+    #[error("--worse-by {name}: no pair of episodes has a value of it in both runs")]
+    NoValue {
+        /// The name.
+        name: String,
+    },
+    /// A result has an episode twice.
+    #[error("a result has two episodes of scenario {scenario:?} with seed {seed}: {names}")]
+    Twice {
+        /// The scenario.
+        scenario: String,
+        /// The seed.
+        seed: u64,
+        /// The names of both.
+        names: String,
+    },
+}
+
+impl Comparison {
+    /// The format of the file.
+    pub const FORMAT: &str = "wildcity.suite-comparison/1";
+
+    /// Compares a run with the run before it.
+    ///
+    /// # Errors
+    /// [`CompareError`]: no episode can be compared, or the rule names a score that cannot.
+    pub fn new(
+        before: &SuiteResult,
+        after: &SuiteResult,
+        rule: &Rule,
+    ) -> Result<Self, CompareError> {
+        check_steps(before.dt_us, after.dt_us)?;
+        check_verdicts(before, after)?;
+        // Find the pairs, and those of them that are compared.
+        let pairs = pair::pairs(before, after)?;
+        let mut distinct = BTreeSet::new();
+        let mut compared = Vec::new();
+        let mut episodes = Vec::new();
+        for pair in &pairs {
+            let mut episode = pair.episode();
+            if let Some((before, after)) = pair.comparable() {
+                let drives = (before.drive_name(), after.drive_name());
+                episode.duplicate = !distinct.insert(drives);
+                if !episode.duplicate {
+                    compared.push((before, after));
+                }
+            }
+            episodes.push(episode);
+        }
+        if compared.is_empty() {
+            return Err(CompareError::NothingToCompare { reason: why_nothing(&episodes) });
+        }
+        // Hold them against the rule.
+        let pass_rate = PairedRate::of(&compared);
+        let scores = scores::changes(&compared);
+        let rule = rule.resolved(&scores.keys().map(String::as_str).collect::<Vec<_>>())?;
+        let reasons = rule.reasons(&episodes, pass_rate, &scores)?;
+        Ok(Self {
+            format: Self::FORMAT,
+            worse: !reasons.is_empty(),
+            reasons,
+            rule,
+            before: RunName::of(before),
+            after: RunName::of(after),
+            counts: counts(&episodes),
+            pass_rate,
+            scores,
+            scores_not_compared: scores::not_compared(&[before, after].map(scores::names)),
+            episodes,
+        })
+    }
+
+    /// Checks, before anything is driven, that a run of these cases can be compared with a run before.
+    ///
+    /// # Errors
+    /// [`CompareError`], as of [`Comparison::new`].
+    pub fn check(before: &SuiteResult, cases: &[Case], rule: &Rule) -> Result<(), CompareError> {
+        let dt_us = cases.first().and_then(|case| case.options.dt_us);
+        check_steps(before.dt_us, dt_us)?;
+        let names = scores::names(before);
+        rule.resolved(&names.iter().copied().collect::<Vec<_>>())?;
+        let by_key = pair::by_key(before)?;
+        let is_there = |case: &&Case| by_key.contains_key(&Key::of_case(case));
+        let there: Vec<&Case> = cases.iter().filter(is_there).collect();
+        let is_alike = |case: &&&Case| {
+            let entry = by_key[&Key::of_case(case)];
+            entry.version_hash == case.version_hash && entry.scenario_hash == case.line.hash
+        };
+        match there.iter().find(is_alike) {
+            Some(_) => Ok(()),
+            None => Err(CompareError::NothingToCompare {
+                reason: match there.len() {
+                    0 => "no episode of the suite was driven before".to_owned(),
+                    count => format!(
+                        "{count} episodes were driven before, all in other versions of the twins or of the scenarios"
+                    ),
+                },
+            }),
+        }
+    }
+
+    /// Whether it is worse, and why, in one line.
+    pub fn conclusion(&self) -> String {
+        match self.worse {
+            true => format!("worse than before: {}", self.reasons.join("; ")),
+            false => format!("not worse than before: {}", self.rule.kept(self.pass_rate)),
+        }
+    }
+
+    /// The comparison as JSON.
+    pub fn to_json(&self) -> String {
+        // Numbers, texts and maps with text keys: writing them into memory cannot fail.
+        serde_json::to_string_pretty(self).unwrap_or_default() + "\n"
+    }
+
+    /// The comparison as text for a terminal.
+    pub fn to_text(&self) -> String {
+        text::text(self)
+    }
+
+    /// The comparison as a page that loads nothing else.
+    pub fn to_page(&self) -> String {
+        page::page(self)
+    }
+}
+
+impl RunName {
+    fn of(run: &SuiteResult) -> Self {
+        Self { suite: run.suite.clone(), agent: run.agent.clone() }
+    }
+}
+
+impl PairedRate {
+    /// The rate of the pairs that are compared.
+    fn of(compared: &[(&EpisodeEntry, &EpisodeEntry)]) -> Self {
+        let judged = compared.iter().filter(|(before, _)| before.status.is_judged());
+        let passes = |entry: &EpisodeEntry| u64::from(entry.status == Status::Passed);
+        let none = Self { pairs: 0, before: 0, after: 0 };
+        judged.fold(none, |rate, (before, after)| Self {
+            pairs: rate.pairs + 1,
+            before: rate.before + passes(before),
+            after: rate.after + passes(after),
+        })
+    }
+}
+
+fn check_steps(before_us: Option<i64>, after_us: Option<i64>) -> Result<(), CompareError> {
+    match (before_us, after_us) {
+        (Some(before_us), Some(after_us)) if before_us != after_us => {
+            Err(CompareError::StepLength { before_us, after_us })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Refuses verdicts of two versions: a flip could be one of the rules.
+fn check_verdicts(before: &SuiteResult, after: &SuiteResult) -> Result<(), CompareError> {
+    let versions = |run: &SuiteResult| -> Vec<String> {
+        let names = scores::names(run).into_iter();
+        let of_verdict = |name: &&str| scores::base(name) == scores::base(own::NAME);
+        names.filter(of_verdict).map(str::to_owned).collect()
+    };
+    let before = versions(before);
+    let after = versions(after);
+    if before == after || before.is_empty() || after.is_empty() {
+        return Ok(());
+    }
+    Err(CompareError::VerdictVersion { before: before.join(", "), after: after.join(", ") })
+}
+
+fn counts(episodes: &[ComparedEpisode]) -> ChangeCounts {
+    let mut counts = ChangeCounts::default();
+    for episode in episodes {
+        let count = match episode.change {
+            Change::Worse => &mut counts.worse,
+            Change::Better => &mut counts.better,
+            Change::Same => &mut counts.same,
+            Change::Unknown => &mut counts.unknown,
+            Change::Changed => &mut counts.changed,
+            Change::OnlyBefore => &mut counts.only_before,
+            Change::OnlyAfter => &mut counts.only_after,
+        };
+        *count += 1;
+        counts.duplicates += u64::from(episode.duplicate);
+    }
+    counts
+}
+
+/// Why no pair is compared.
+fn why_nothing(episodes: &[ComparedEpisode]) -> String {
+    let changed = episodes.iter().find(|episode| episode.change == Change::Changed);
+    match changed {
+        Some(episode) => format!(
+            "every pair differs in its twin or scenario; of {}, {}",
+            episode.name,
+            episode.differs.as_deref().unwrap_or_default()
+        ),
+        None => "no episode is in both runs".to_owned(),
+    }
+}

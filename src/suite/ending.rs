@@ -1,0 +1,80 @@
+//! How a run ended: its exit code, and why.
+
+use crate::compare::{CompareError, Comparison};
+use crate::limits;
+use crate::result::SuiteResult;
+
+/// The exit code of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ExitCode {
+    /// As wanted.
+    Passed = 0,
+    /// An episode failed by driving, the pass rate is too low, or the run is worse than the one before.
+    Driving = 1,
+    /// The command line, the suite, a scenario or the run before is wrong.
+    Usage = 2,
+    /// An episode was not driven, or more than a tenth were off the model.
+    Technical = 3,
+    /// With `--verify`: an episode does not repeat.
+    NotVerified = 4,
+}
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ending {
+    /// Its exit code.
+    pub code: ExitCode,
+    /// Why, in words.
+    pub why: String,
+}
+
+impl Ending {
+    /// The ending of a run, perhaps compared with the one before: technical failures before driving ones, since a result
+    /// with holes says little of driving.
+    ///
+    /// Without a wanted pass rate and without a run before, every episode must pass.
+    pub fn of(result: &SuiteResult, against: Option<&Result<Comparison, CompareError>>) -> Self {
+        let counts = &result.counts;
+        let off_model = counts.off_model as f64;
+        let too_often_off = off_model > limits::OFF_MODEL_SHARE * counts.episodes as f64;
+        let all_passed = counts.failed == 0 && counts.not_judged == 0;
+        let low = result.pass_rate.interval[0];
+        let rate_is_low = result.at_least.is_some_and(|least| low < least);
+        let is_worse = matches!(against, Some(Ok(comparison)) if comparison.worse);
+        let is_not_compared = matches!(against, Some(Err(_)));
+        let must_all_pass = result.at_least.is_none() && against.is_none();
+        let code = match counts.technical > 0 || too_often_off {
+            true => ExitCode::Technical,
+            false if is_not_compared => ExitCode::Usage,
+            false if rate_is_low || is_worse || (must_all_pass && !all_passed) => ExitCode::Driving,
+            false => ExitCode::Passed,
+        };
+        let mut why = vec![counted(result)];
+        why.extend(result.at_least.map(|least| match rate_is_low {
+            true => format!("the pass rate is at least {low:.3}, and {least} was wanted"),
+            false => format!("the pass rate is at least {low:.3}, as wanted ({least})"),
+        }));
+        why.extend(against.map(|compared| match compared {
+            Ok(comparison) => comparison.conclusion(),
+            Err(error) => error.to_string(),
+        }));
+        Self { code, why: why.join("; ") }
+    }
+
+    /// The ending of a run of which some episodes do not repeat, one text for each.
+    pub fn not_verified(wrong: &[String]) -> Self {
+        Self { code: ExitCode::NotVerified, why: format!("not repeated: {}", wrong.join("; ")) }
+    }
+}
+
+/// How many episodes did not pass, and how.
+fn counted(result: &SuiteResult) -> String {
+    let counts = &result.counts;
+    if counts.passed == counts.episodes {
+        return format!("all {} episodes passed", counts.episodes);
+    }
+    format!(
+        "of {} episodes {} failed, {} were not judged, {} were not driven, {} left the trained area",
+        counts.episodes, counts.failed, counts.not_judged, counts.technical, counts.off_model
+    )
+}

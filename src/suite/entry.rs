@@ -1,0 +1,216 @@
+//! One episode of a result.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
+use wildcity_score::own;
+use wildcity_session::Engine;
+
+use crate::case::Case;
+use crate::finish::Finished;
+use crate::technical::Technical;
+
+/// One episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct EpisodeEntry {
+    /// Its name.
+    pub name: String,
+    /// Name of the scenario.
+    pub scenario: String,
+    /// The seed.
+    pub seed: u64,
+    /// The values of the sweep.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub values: BTreeMap<String, Value>,
+    /// BLAKE3 of the resolved scenario.
+    pub scenario_hash: String,
+    /// BLAKE3 of the twin's manifest.
+    pub version_hash: String,
+    /// How it ended.
+    pub status: Status,
+    /// The faults, by time.
+    pub faults: Vec<FaultLine>,
+    /// What was not judged, and why.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub not_judged: Vec<String>,
+    /// The scores.
+    pub scores: BTreeMap<String, ScoreLine>,
+    /// Steps driven.
+    pub steps: u64,
+    /// Distance driven, in metres.
+    pub distance_m: f64,
+    /// BLAKE3 of all frame hashes; empty if nothing was driven.
+    pub frames_hash: String,
+    /// The first episode of the scenario that was driven alike: same poses, actors, images and status. A duplicate says
+    /// nothing new, and is in no rate and no mean.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub duplicate_of: Option<String>,
+    /// BLAKE3 of poses, actors and images, in hex; empty if nothing was driven. Not in `result.json`.
+    #[serde(skip)]
+    pub(crate) drive_hash: String,
+    /// The file of its record, below `episodes`; empty if nothing was driven.
+    pub record: String,
+    /// The MCAP file of its record, below `episodes`, or why there is none; `None` if none was asked for. Not in
+    /// `result.json`: whether an export is ready at the end of a run depends on the clock.
+    #[serde(skip)]
+    pub mcap: Option<Result<String, String>>,
+    /// Technical failures, of every attempt.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub errors: Vec<TechnicalEntry>,
+}
+
+/// A technical failure of an attempt.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TechnicalEntry {
+    /// `server_error`, `agent_error`, `agent_timeout` or `agent_lost`.
+    pub kind: String,
+    /// What happened.
+    pub message: String,
+    /// The last lines that the agent wrote to its standard error. Not in `result.json`: they may have times.
+    #[serde(skip)]
+    pub stderr: String,
+}
+
+/// How an episode ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Status {
+    /// Without a fault.
+    Passed,
+    /// With a fault of driving.
+    Failed,
+    /// Off the trained area before any fault.
+    OffModel,
+    /// Without what a verdict needs.
+    NotJudged,
+    /// Not driven, for technical reasons.
+    Technical,
+}
+
+impl EpisodeEntry {
+    pub(crate) fn new(case: &Case, finished: Option<Finished>, errors: Vec<Technical>) -> Self {
+        let errors = errors.into_iter().map(|error| TechnicalEntry {
+            kind: error.kind.to_owned(),
+            message: error.message,
+            stderr: error.stderr,
+        });
+        let mut entry = Self {
+            name: case.name.clone(),
+            scenario: case.scenario.clone(),
+            seed: case.seed,
+            values: case.values.clone(),
+            scenario_hash: case.line.hash.clone(),
+            version_hash: case.version_hash.clone(),
+            status: Status::Technical,
+            faults: Vec::new(),
+            not_judged: Vec::new(),
+            scores: BTreeMap::new(),
+            steps: 0,
+            distance_m: 0.0,
+            frames_hash: String::new(),
+            duplicate_of: None,
+            drive_hash: String::new(),
+            record: String::new(),
+            mcap: None,
+            errors: errors.collect(),
+        };
+        if let Some(Finished { record, end, result, frames_hash, drive_hash }) = finished {
+            entry.status = match result.verdict.as_str() {
+                "passed" => Status::Passed,
+                "failed" => Status::Failed,
+                "off_model" => Status::OffModel,
+                _ => Status::NotJudged,
+            };
+            entry.faults = result.faults;
+            entry.not_judged = result.not_judged;
+            entry.scores = result.scores;
+            entry.steps = end.steps;
+            entry.distance_m = end.distance_m;
+            entry.frames_hash = frames_hash;
+            entry.drive_hash = drive_hash;
+            entry.record = record;
+        }
+        entry
+    }
+}
+
+impl EpisodeEntry {
+    /// Says where the MCAP file of the record is, or why there is none.
+    pub(crate) fn add_mcap(&mut self, episodes: &Path, engine: &Engine) {
+        if self.record.is_empty() {
+            return;
+        }
+        let mcap = mcap_of(Path::new(&self.record));
+        self.mcap = Some(match engine.export_failure(&EpisodeFile::name_of(&mcap)) {
+            Some(reason) => Err(reason),
+            None if episodes.join(&mcap).is_file() => Ok(mcap.display().to_string()),
+            None => Err("it was not ready at the end of the run".to_owned()),
+        });
+    }
+
+    /// Why there is no MCAP file although one was asked for.
+    pub fn mcap_error(&self) -> Option<&str> {
+        self.mcap.as_ref()?.as_ref().err().map(String::as_str)
+    }
+
+    /// The faults in words, by time: `contact.pedestrian with walker at 4.615 s`.
+    pub(crate) fn fault_texts(&self) -> Vec<String> {
+        self.faults.iter().map(|fault| self.fault_text(fault)).collect()
+    }
+
+    /// The name of the first episode that was driven alike, which may be its own.
+    pub(crate) fn drive_name(&self) -> &str {
+        self.duplicate_of.as_deref().unwrap_or(&self.name)
+    }
+
+    /// For a duplicate, that it is one.
+    pub fn duplicate_text(&self) -> Option<String> {
+        let first = self.duplicate_of.as_ref()?;
+        Some(format!("driven as {first} was, and not counted"))
+    }
+
+    fn fault_text(&self, fault: &FaultLine) -> String {
+        let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
+        let text = format!("{}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6);
+        let part = |name: &str| self.scores.get(own::NAME)?.parts.get(name).copied().flatten();
+        match (&*fault.fault, part("progress"), part("least_progress")) {
+            ("progress", Some(progress), Some(least)) => {
+                format!("{text}: {progress:.3} of the recorded drive, and {least} is the least")
+            }
+            _ => text,
+        }
+    }
+}
+
+impl TechnicalEntry {
+    /// Kind, message, and what the agent said.
+    pub fn text(&self) -> String {
+        let said = match self.stderr.is_empty() {
+            true => String::new(),
+            false => format!("\n{}", self.stderr),
+        };
+        format!("{}: {}{said}", self.kind, self.message)
+    }
+}
+
+impl Status {
+    /// Whether it is in pass rates.
+    pub(crate) fn is_judged(self) -> bool {
+        matches!(self, Self::Passed | Self::Failed)
+    }
+
+    /// The name in `result.json`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Passed => "passed",
+            Self::Failed => "failed",
+            Self::OffModel => "off_model",
+            Self::NotJudged => "not_judged",
+            Self::Technical => "technical",
+        }
+    }
+}

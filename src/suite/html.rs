@@ -1,0 +1,36 @@
+//! What the pages share: each is one file that loads nothing else.
+
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+
+const STYLE: &str = "\
+body{font:15px/1.45 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#111}
+h1{font-size:1.6em}h2{margin-top:2em;font-size:1.2em}
+table{border-collapse:collapse;font-size:13px}td,th{padding:2px 8px;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
+pre{margin:0;white-space:pre-wrap;overflow-wrap:anywhere}
+.passed,.better{color:#00703c}.failed,.worse{color:#b00020;font-weight:600}.technical{color:#b05a00}
+.off_model,.not_judged,.unknown,.changed{color:#777}
+figure{margin:0 0 1.5em 0}img{max-width:420px}svg{border:1px solid #eee;margin-right:6px}";
+
+/// A page with a title.
+pub(crate) fn document(title: &str, body: &Markup) -> String {
+    let markup = html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                title { (title) }
+                style { (PreEscaped(STYLE)) }
+            }
+            body {
+                h1 { (title) }
+                (body)
+            }
+        }
+    };
+    markup.into_string() + "\n"
+}
+
+/// A share of 1 in percent.
+pub(crate) fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
+}
