@@ -68,6 +68,7 @@ mod served;
 mod sky;
 mod traces;
 mod twin;
+mod views;
 
 use std::process::Command;
 
