@@ -373,6 +373,10 @@ pub struct ImageRepair {
     /// Why the model failed. Only with the status `failed`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<RepairFailure>,
+    /// The recorded images that the model saw beside it, at most 8: those that gave most pixels first. Only with the
+    /// status `repaired`, and if the model needs some.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub references: Vec<String>,
 }
 
 /// What became of an image.

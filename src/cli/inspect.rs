@@ -97,6 +97,9 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
             sky.bytes
         )?;
     }
+    if let Some(views) = &manifest.views {
+        writeln!(out, "views       {} recorded images, {} bytes", views.images, views.image_bytes)?;
+    }
     if let Some(rig) = &manifest.rig {
         let names: Vec<_> = rig.cameras.iter().map(|camera| camera.name.as_str()).collect();
         writeln!(out, "rig         {}: {}", rig.name, names.join(", "))?;

@@ -35,6 +35,7 @@ mod placement;
 mod profile_options;
 mod progress;
 mod push;
+mod real_images;
 mod render;
 mod repair;
 mod repair_options;

@@ -24,6 +24,10 @@ pub(super) struct RepairOptions {
     /// Threads of each repair model on the processor. The bytes do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
     repair_threads: u16,
+
+    /// Memory for recorded images that repair models compare with, in MiB. The least recently used are read again.
+    #[arg(long, value_name = "MIB", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..))]
+    views_mib: u32,
 }
 
 /// The manifests, by their paths.
@@ -57,7 +61,8 @@ impl RepairOptions {
         let Some(Manifests(paths)) = &self.repair else { return Ok(Arc::default()) };
         let library = runtime_library(self.onnxruntime.as_ref());
         let threads = usize::from(self.repair_threads);
-        let options = LoadOptions { threads, ..LoadOptions::new(library) };
+        let reference_bytes = u64::from(self.views_mib) << 20;
+        let options = LoadOptions { threads, reference_bytes, ..LoadOptions::new(library) };
         Models::read(paths, options).map(Arc::new)
     }
 }

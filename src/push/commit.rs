@@ -59,6 +59,7 @@ pub(crate) fn commit(
                 geo: old.and_then(|old| old.geo.clone()),
                 provenance,
             };
+            commit.set_views(old.and_then(|old| old.views.clone()));
             commit.replace(request.base, settings)?
         }
     };

@@ -134,6 +134,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::FieldMismatch { .. }
         | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
+        | StoreError::ViewSize { .. }
         | StoreError::ActorExists { .. }
         | StoreError::Overlap { .. } => true,
         StoreError::Io { .. }

@@ -7,7 +7,8 @@
 //! bytes, with the cpu provider at any number of threads.
 //!
 //! Only `onnx.rs` names the runtime. The library is opened when the first model is loaded; without a model
-//! there is no thread, buffer or library. The package knows neither the renderer nor sessions.
+//! there is no thread, buffer or library. The package knows neither the renderer nor sessions; of a scene, it knows
+//! cameras and poses.
 //!
 //! | file | what it does |
 //! |---|---|
@@ -22,6 +23,7 @@
 //! | `model` | all of it in order |
 //! | `models` | the models that a program offers by name, each loaded when it is first asked for |
 //! | `select` | which views of a step are repaired, by trust |
+//! | [`reference`] | recorded images brought into a view by its depth |
 
 mod error;
 mod files;
@@ -36,6 +38,7 @@ mod models;
 mod onnx;
 mod planes;
 mod probe;
+pub mod reference;
 mod resample;
 mod roles;
 mod runner;

@@ -14,6 +14,7 @@ use crate::merge;
 use crate::onnx::{self, Settings, Worker};
 use crate::planes::{Planes, Rect};
 use crate::probe::{Probed, probe};
+use crate::reference::DEFAULT_BYTES;
 use crate::roles;
 use crate::runner::Runner;
 use crate::signature;
@@ -30,6 +31,8 @@ pub struct LoadOptions {
     pub threads: usize,
     /// Time to build the session.
     pub load_timeout: Duration,
+    /// Bytes of recorded images that [`crate::Models`] keeps in memory.
+    pub reference_bytes: u64,
 }
 
 impl Default for LoadOptions {
@@ -47,6 +50,7 @@ impl LoadOptions {
             provider: None,
             threads: 1,
             load_timeout: LOAD_TIMEOUT,
+            reference_bytes: DEFAULT_BYTES,
         }
     }
 }

@@ -8,12 +8,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 use crate::error::RepairError;
 use crate::files;
 use crate::model::{LoadOptions, Model};
+use crate::reference::ReferenceCache;
 
 /// The models of some manifests.
 #[derive(Debug, Default)]
 pub struct Models {
     options: LoadOptions,
     entries: BTreeMap<String, Entry>,
+    references: ReferenceCache,
 }
 
 #[derive(Debug)]
@@ -49,12 +51,18 @@ impl Models {
             files::check_library(&path)
                 .map_err(|message| RepairError::Runtime { path, message })?;
         }
-        Ok(Models { options, entries })
+        let references = ReferenceCache::new(options.reference_bytes);
+        Ok(Models { options, entries, references })
     }
 
     /// The names, sorted.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.entries.keys().map(String::as_str)
+    }
+
+    /// The images that the models' sessions compare with, in memory.
+    pub fn references(&self) -> &ReferenceCache {
+        &self.references
     }
 
     /// The model of a name. Loads it if it is not loaded yet, or was withdrawn; callers of the same model wait

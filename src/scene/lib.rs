@@ -29,6 +29,7 @@ pub mod sky;
 pub mod srgb;
 pub mod trajectory;
 pub mod validate;
+pub mod views;
 
 pub use actor::{ActorBox, ActorClass};
 pub use chunk::{Chunk, Scene};

@@ -39,6 +39,9 @@ pub struct Manifest {
     /// The twin's sky, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sky: Option<SkyRef>,
+    /// Recorded images of the drives, if the twin has some.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub views: Option<ViewsRef>,
     /// Where the world lies on the earth, if that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub geo: Option<GeoAnchor>,
@@ -117,6 +120,20 @@ pub struct SkyRef {
     pub sky_from_world: [[f64; 3]; 3],
 }
 
+/// The recorded images of a version.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ViewsRef {
+    /// BLAKE3 of the object with the table, 64 lower-case hex digits.
+    pub object: String,
+    /// Size of the table, in bytes.
+    pub bytes: u64,
+    /// Number of images.
+    pub images: u64,
+    /// Their total size, in bytes.
+    pub image_bytes: u64,
+}
+
 /// Where a version comes from. It holds no time, so that the same import gives the same identity.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -149,7 +166,8 @@ impl Manifest {
     /// Size of all objects without the manifest itself, in bytes.
     pub fn stored_bytes(&self) -> u64 {
         let sky = self.sky.as_ref().map_or(0, |sky| sky.bytes);
-        self.table.bytes + sky + self.chunks.iter().map(|chunk| chunk.bytes).sum::<u64>()
+        let views = self.views.as_ref().map_or(0, |views| views.bytes + views.image_bytes);
+        self.table.bytes + sky + views + self.chunks.iter().map(|chunk| chunk.bytes).sum::<u64>()
     }
 
     /// Union of the bounds of all chunks, in world metres; empty without chunks.

@@ -1,5 +1,6 @@
 //! Recorded trajectories: timed poses of the rig along a drive.
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose;
@@ -102,6 +103,29 @@ impl Trajectory {
         self.keyframes.windows(2).map(|pair| segment_m(&pair[0], &pair[1])).sum()
     }
 
+    /// The place of the polyline through the keyframes that is nearest to a point, in metres; the first of equally near
+    /// ones.
+    pub fn nearest(&self, point_m: DVec3) -> NearestPlace {
+        let position_m = |at: usize| self.keyframes[at].world_from_rig.position_m;
+        let mut start_m = 0.0;
+        let mut nearest =
+            NearestPlace { station_m: 0.0, distance_m: position_m(0).distance(point_m) };
+        for (from, pair) in self.keyframes.windows(2).enumerate() {
+            let along_m = position_m(from + 1) - position_m(from);
+            let length_m = segment_m(&pair[0], &pair[1]);
+            if length_m > 0.0 {
+                let share = (point_m - position_m(from)).dot(along_m) / along_m.length_squared();
+                let share = share.clamp(0.0, 1.0);
+                let distance_m = (position_m(from) + share * along_m).distance(point_m);
+                if distance_m < nearest.distance_m {
+                    nearest = NearestPlace { station_m: start_m + share * length_m, distance_m };
+                }
+            }
+            start_m += length_m;
+        }
+        nearest
+    }
+
     /// The pose at a distance along the trajectory, in metres from its start, clamped to its ends.
     pub fn at_station(&self, station_m: f64) -> Pose {
         let mut start_m = 0.0;
@@ -117,6 +141,15 @@ impl Trajectory {
     }
 }
 
+/// The place of a trajectory that is nearest to a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NearestPlace {
+    /// From the trajectory's start, in metres.
+    pub station_m: f64,
+    /// From the point, in metres.
+    pub distance_m: f64,
+}
+
 fn segment_m(from: &Keyframe, to: &Keyframe) -> f64 {
     from.world_from_rig.position_m.distance(to.world_from_rig.position_m)
 }
@@ -124,7 +157,7 @@ fn segment_m(from: &Keyframe, to: &Keyframe) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DQuat, DVec3};
+    use glam::DQuat;
 
     fn straight() -> Trajectory {
         let keyframe = |i: i64| Keyframe {
@@ -144,6 +177,19 @@ mod tests {
         assert_eq!(log.at_station(0.75).position_m, DVec3::new(0.75, 0.0, 0.0));
         assert_eq!(log.at_station(-3.0).position_m, DVec3::ZERO);
         assert_eq!(log.at_station(9.0).position_m, DVec3::new(2.0, 0.0, 0.0));
+    }
+
+    #[test]
+    fn the_nearest_place_is_on_a_segment() {
+        let log = straight();
+        let nearest = log.nearest(DVec3::new(0.75, 3.0, 4.0));
+        assert_eq!(nearest, NearestPlace { station_m: 0.75, distance_m: 5.0 });
+        let behind = log.nearest(DVec3::new(-2.0, 0.0, 0.0));
+        assert_eq!(behind, NearestPlace { station_m: 0.0, distance_m: 2.0 });
+        let ahead = log.nearest(DVec3::new(5.0, 0.0, 0.0));
+        assert_eq!(ahead, NearestPlace { station_m: 2.0, distance_m: 3.0 });
+        let one = Trajectory { keyframes: log.keyframes[..1].to_vec(), ..log };
+        assert_eq!(one.nearest(DVec3::Y), NearestPlace { station_m: 0.0, distance_m: 1.0 });
     }
 
     #[test]

@@ -17,6 +17,7 @@ use wildcity_sim::{Command, Ego, Ground};
 
 use crate::error::SessionError;
 use crate::limits::{self, HISTORY_POSES, HISTORY_STEP_US};
+use crate::repair::status::RepairState;
 use crate::sensors::EpisodeSensors;
 use crate::sensors::motion::MotionSample;
 
@@ -47,6 +48,9 @@ pub struct Episode {
     /// By camera, whether its images are being repaired; empty if none is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     repairing: Vec<bool>,
+    /// By camera, the recorded image that its repair model compares with; empty if there is none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    references: Vec<Option<String>>,
     /// What its sensors keep, if the session asked for effects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     sensors: Option<Box<EpisodeSensors>>,
@@ -129,6 +133,7 @@ impl Episode {
             least_trust: None,
             failed: false,
             repairing: Vec::new(),
+            references: Vec::new(),
             sensors: None,
         }
     }
@@ -377,15 +382,17 @@ impl Episode {
         }
     }
 
-    /// By camera, whether its images are being repaired; empty if none is.
-    pub(crate) fn repairing(&self) -> &[bool] {
-        &self.repairing
+    /// What the repair keeps from one observation to the next.
+    pub(crate) fn repair_state(&self) -> RepairState {
+        RepairState { is_on: self.repairing.clone(), references: self.references.clone() }
     }
 
-    /// Takes over which cameras are being repaired after an observation; `None` changes nothing.
-    pub(crate) fn set_repairing(&mut self, repairing: Option<Vec<bool>>) {
-        let Some(repairing) = repairing else { return };
-        self.repairing = if repairing.contains(&true) { repairing } else { Vec::new() };
+    /// Takes over what the repair keeps after an observation; `None` changes nothing.
+    pub(crate) fn set_repair_state(&mut self, state: Option<RepairState>) {
+        let Some(RepairState { is_on, references }) = state else { return };
+        self.repairing = if is_on.contains(&true) { is_on } else { Vec::new() };
+        let has_one = references.iter().any(Option::is_some);
+        self.references = if has_one { references } else { Vec::new() };
     }
 
     /// The ego history now.

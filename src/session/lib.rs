@@ -71,6 +71,7 @@ pub use record::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
     ReplayedImage, WrongValue,
 };
+pub use repair::references::ReferenceSource;
 pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
 pub use scenario::{

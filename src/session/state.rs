@@ -16,6 +16,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::RandomStart;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
+use crate::repair::references::ReferenceViews;
 use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
@@ -57,6 +58,8 @@ pub(crate) struct PinnedVersion {
     pub(crate) coverage: Option<Arc<TrainingCoverage>>,
     /// Its solid Gaussians beside the scenario's route; only if a contact with them ends an episode.
     pub(crate) solids: Option<Arc<Solids>>,
+    /// Images beside the views; only if the session's repair model needs some.
+    pub(crate) references: Option<Arc<ReferenceViews>>,
 }
 
 /// What a step changes: all that the coming observations depend on, beside the settings and the version. A
@@ -77,12 +80,17 @@ impl PinnedVersion {
         coverage: Option<Arc<TrainingCoverage>>,
     ) -> Self {
         let profile_hash = profile_hash(&profile);
-        Self { resident, profile, profile_hash, coverage, solids: None }
+        Self { resident, profile, profile_hash, coverage, solids: None, references: None }
     }
 
     /// The same, with solid Gaussians.
     pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>) -> Self {
         Self { solids, ..self }
+    }
+
+    /// The same, with images beside the views.
+    pub(crate) fn with_references(self, references: Option<Arc<ReferenceViews>>) -> Self {
+        Self { references, ..self }
     }
 
     /// Whether it is the same version of the same twin.

@@ -78,6 +78,12 @@ pub const TABLE_BYTES: u64 = 256 << 20;
 /// stored.
 pub const CLAMPED_SHARE: f64 = 1e-4;
 
+/// Largest recorded image, in bytes: a PNG of 4 K in full noise.
+pub const VIEW_IMAGE_BYTES: u64 = 64 << 20;
+
+/// Largest table of recorded images, in bytes: 400,000 images of 500 bytes, 130 km of six cameras every 2 m.
+pub const VIEWS_TABLE_BYTES: u64 = 200 << 20;
+
 /// Largest record of a twin's log, in bytes. One has about 150.
 pub const LOG_RECORD_BYTES: u64 = 4 << 10;
 

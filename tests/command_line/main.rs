@@ -69,6 +69,7 @@ mod sky;
 mod suites;
 mod traces;
 mod twin;
+mod views;
 
 use std::process::Command;
 

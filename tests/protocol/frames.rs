@@ -351,11 +351,17 @@ pub(crate) const WHEEL_SPEED: [f32; 2] = [4.5, 5.25];
 fn repair(index: u64, hash: &str) -> ImageRepair {
     let before = blake3::hash(b"as rendered").to_hex().to_string();
     match index {
-        0 => ImageRepair { status: RepairStatus::Repaired, rendered_hash: before, failure: None },
+        0 => ImageRepair {
+            status: RepairStatus::Repaired,
+            rendered_hash: before,
+            failure: None,
+            references: vec!["log@12.00/front".into(), "log@10.00/left".into()],
+        },
         _ => ImageRepair {
             status: RepairStatus::Failed,
             rendered_hash: hash.to_owned(),
             failure: Some(RepairFailure::TimedOut),
+            references: Vec::new(),
         },
     }
 }

@@ -452,6 +452,7 @@ fn answers() -> Vec<(&'static str, Answer)> {
             at_least: 0.125,
             per_step: 4,
             on_failure: OnFailure::Error,
+            references: Some(ReferenceSource::Rendered),
         }),
         ..opened.clone()
     };

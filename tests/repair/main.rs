@@ -20,3 +20,4 @@ mod select;
 mod support;
 mod trained;
 mod views;
+mod warp;

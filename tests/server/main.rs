@@ -33,6 +33,7 @@ mod page;
 mod plans;
 mod profile;
 mod record;
+mod references;
 mod refused;
 mod repair;
 mod repair_failures;

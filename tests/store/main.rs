@@ -19,3 +19,4 @@ mod garbage;
 mod remote;
 mod round_trip;
 mod skies;
+mod views;

@@ -214,3 +214,20 @@ pub(crate) fn difix() -> Vec<u8> {
     }
     .onnx()
 }
+
+/// `warped` where `valid` is 1, else `image`. These are its inputs.
+pub(crate) fn warped_where_valid() -> Vec<u8> {
+    let map = |name: &str, channels: u64| port(name, F32, &[Some(1), Some(channels), None, None]);
+    Graph {
+        nodes: vec![
+            node("Mul", &["warped", "valid"], &["seen"], &[]),
+            node("Sub", &["one", "valid"], &["unseen"], &[]),
+            node("Mul", &["image", "unseen"], &["rest"], &[]),
+            node("Add", &["seen", "rest"], &["repaired"], &[]),
+        ],
+        constants: vec![floats("one", &[], &[1.0])],
+        inputs: vec![map("image", 3), map("warped", 3), map("valid", 1)],
+        outputs: vec![port("repaired", F32, &[Some(1), None, None, None])],
+    }
+    .onnx()
+}

@@ -262,6 +262,20 @@ pub struct OpenedRepair {
     pub per_step: u64,
     /// What happens when the model fails.
     pub on_failure: OnFailure,
+    /// What the model compares images with. Only if it needs recorded images.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub references: Option<ReferenceSource>,
+}
+
+/// What a repair model compares images with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum ReferenceSource {
+    /// Recorded images of the twin.
+    Recorded,
+    /// The twin has none: images of the twin itself, drawn on its recorded drive.
+    Rendered,
 }
 
 /// The scenario of a session.

@@ -13,8 +13,8 @@ mod request;
 mod sensors;
 
 pub use answer::{
-    Answer, Limits, Opened, OpenedRepair, OpenedScenario, Outcome, ResumedSession, ServerInfo,
-    Summary, TrajectoryInfo, TwinInfo,
+    Answer, Limits, Opened, OpenedRepair, OpenedScenario, Outcome, ReferenceSource, ResumedSession,
+    ServerInfo, Summary, TrajectoryInfo, TwinInfo,
 };
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose, DriveSection};

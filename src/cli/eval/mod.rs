@@ -1,8 +1,5 @@
 //! `wildcity eval`.
 
-mod images;
-mod picture;
-
 use std::io::{self, Write};
 use std::path::PathBuf;
 
@@ -17,9 +14,9 @@ use wildcity_scene::geometry::camera::FieldMask;
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::profile_options::{LoadedProfile, ProfileOptions};
+use super::real_images::{ImageList, RealImage, picture};
 use super::scene_source::Source;
 use super::{output, placement, progress};
-use images::{HeldOutImage, ImageList};
 
 /// Compare a twin or a scene file with real images that it was not trained on.
 ///
@@ -123,7 +120,7 @@ struct Rendered {
 impl Eval {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
-        let images: Vec<&HeldOutImage> = list.every(self.every as usize);
+        let images: Vec<&RealImage> = list.every(self.every as usize);
         let changes = self.profile.load()?;
         let (source, own_profile) = Source::open(&self.scene, &self.twins)?;
         let alignment = self.alignment(&source, &list)?;
@@ -157,11 +154,7 @@ impl Eval {
     }
 
     /// Renders one image and compares it with the real one.
-    fn evaluate(
-        &self,
-        renderer: &Renderer,
-        image: &HeldOutImage,
-    ) -> anyhow::Result<EvaluatedImage> {
+    fn evaluate(&self, renderer: &Renderer, image: &RealImage) -> anyhow::Result<EvaluatedImage> {
         let profile = renderer.profile(image.near)?;
         let (truth, camera) = picture::real(&image.file, &image.camera, profile.background)?;
         let size_px = [camera.width_px, camera.height_px];

@@ -7,9 +7,10 @@ use std::time::Instant;
 
 use anyhow::Context;
 use image::{ImageFormat, RgbImage};
-use wildcity_repair::{Halo, Image, LoadOptions, Model, Provider};
+use wildcity_repair::{Halo, Image, InputRole, LoadOptions, Model, Provider};
 
 use super::sample::Sample;
+use super::warp_time;
 use crate::cli::output;
 use crate::cli::repair_options::runtime_library;
 
@@ -87,6 +88,11 @@ impl Check {
                     writeln!(out, "{size:<12} {seconds:>8.3} s {:>12}", peak.text())?;
                 }
                 Err(error) => writeln!(out, "{size:<12} {error}")?,
+            }
+            if model.needs(InputRole::ReferenceWarped) {
+                let [straight, bent] = warp_time::seconds(width, height);
+                let beside = "to warp five references; with a bent lens";
+                writeln!(out, "{:<12} {straight:>8.3} s {beside} {bent:.3} s", "")?;
             }
         }
         let Some(dir) = &self.out else { return Ok(()) };

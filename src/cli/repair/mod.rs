@@ -2,6 +2,7 @@
 
 mod check;
 mod sample;
+mod warp_time;
 
 /// Check ONNX models that repair images.
 ///

@@ -12,6 +12,7 @@ mod list;
 mod log;
 mod rollback;
 mod sky;
+mod views;
 
 /// List, generate, check and clean up twins, and manage their versions.
 #[derive(Debug, clap::Args)]
@@ -35,6 +36,7 @@ enum Subcommand {
     Gc(gc::Gc),
     Fsck(fsck::Fsck),
     Sky(sky::Sky),
+    Views(Box<views::Views>),
     Geo(geo::Geo),
     Align(align::Align),
     Drive(drive::Drive),
@@ -51,6 +53,7 @@ impl Twin {
             Subcommand::Gc(gc) => gc.run(),
             Subcommand::Fsck(fsck) => fsck.run(),
             Subcommand::Sky(sky) => sky.run(),
+            Subcommand::Views(views) => views.run(),
             Subcommand::Geo(geo) => geo.run(),
             Subcommand::Align(align) => align.run(),
             Subcommand::Drive(drive) => drive.run(),

@@ -19,7 +19,8 @@ use wildcity_scene::Rig;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_session::{
     DamagedSummary, Encoding, Engine, EpisodeSummary, EpisodeTraffic, OnFailure, Outcome,
-    PixelMaps, Session, SessionRepair, TrajectorySummary, TwinSummaries, TwinSummary,
+    PixelMaps, ReferenceSource, Session, SessionRepair, TrajectorySummary, TwinSummaries,
+    TwinSummary,
 };
 use wildcity_sim::{Dynamics, EgoModel};
 use wildcity_twin::store::Version;
@@ -119,14 +120,14 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
             .map(trajectory_info)
             .collect(),
         reserved_bytes: session.reserved_bytes(),
-        repair: session.repair().map(opened_repair),
+        repair: session.repair().map(|repair| opened_repair(repair, session)),
         sensors: session.sensors().map(sensors_to),
         scenario: session.traffic().map(opened_scenario),
         trajectory: trajectory.transpose()?,
     })
 }
 
-fn opened_repair(repair: &SessionRepair) -> message::OpenedRepair {
+fn opened_repair(repair: &SessionRepair, session: &Session) -> message::OpenedRepair {
     let model = &repair.model;
     let Selection { below, above, at_least, per_step } = repair.selection;
     message::OpenedRepair {
@@ -143,6 +144,10 @@ fn opened_repair(repair: &SessionRepair) -> message::OpenedRepair {
             OnFailure::Unrepaired => message::OnFailure::Unrepaired,
             OnFailure::Error => message::OnFailure::Error,
         },
+        references: session.references().map(|source| match source {
+            ReferenceSource::Recorded => message::ReferenceSource::Recorded,
+            ReferenceSource::Rendered => message::ReferenceSource::Rendered,
+        }),
     }
 }
 

@@ -336,6 +336,7 @@ fn of_store(error: &StoreError) -> WireFault {
         | StoreError::FieldMismatch { .. }
         | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
+        | StoreError::ViewSize { .. }
         | StoreError::NothingToCut { .. } => plain(Code::PushRefused),
         StoreError::Io { cause, .. } if is_full(cause) => plain(Code::StorageFull),
         StoreError::NotSynced { .. }

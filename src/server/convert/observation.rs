@@ -149,14 +149,14 @@ fn metadata(
     let drawn = |(drawn, name): (&wildcity_session::ImageInfo, &String)| Image {
         pose: drawn.pose as u64,
         trust: drawn.trust.map(trust),
-        repair: drawn.repair.map(repair),
+        repair: drawn.repair.as_ref().map(repair),
         sensor: drawn.sensor.map(image_sensor),
         ..image(drawn.camera, format!("{name}/rgb"), drawn.time_us, &drawn.hash)
     };
     let past = |past: &PastImageInfo| Image {
         back: past.back as u64,
         trust: past.trust.map(trust),
-        repair: past.repair.map(repair),
+        repair: past.repair.as_ref().map(repair),
         sensor: past.sensor.map(image_sensor),
         ..image(past.camera, past_tensor(session, past), past.time_us, &past.hash)
     };
@@ -300,11 +300,11 @@ fn actors(traffic: &EpisodeTraffic) -> Vec<Actor> {
         .collect()
 }
 
-fn repair(repair: wildcity_session::ImageRepair) -> wire::ImageRepair {
+fn repair(repair: &wildcity_session::ImageRepair) -> wire::ImageRepair {
     use wire::{RepairFailure, RepairStatus};
 
-    let wildcity_session::ImageRepair { status, rendered_hash } = repair;
-    let (status, failure) = match status {
+    let wildcity_session::ImageRepair { status, rendered_hash, references } = repair;
+    let (status, failure) = match *status {
         wildcity_session::RepairStatus::Kept => (RepairStatus::Kept, None),
         wildcity_session::RepairStatus::Repaired => (RepairStatus::Repaired, None),
         wildcity_session::RepairStatus::Failed(failure) => {
@@ -317,7 +317,12 @@ fn repair(repair: wildcity_session::ImageRepair) -> wire::ImageRepair {
             (RepairStatus::Failed, Some(failure))
         }
     };
-    wire::ImageRepair { status, rendered_hash: rendered_hash.to_hex().to_string(), failure }
+    wire::ImageRepair {
+        status,
+        rendered_hash: rendered_hash.to_hex().to_string(),
+        failure,
+        references: references.clone(),
+    }
 }
 
 fn trust(trust: wildcity_session::Trust) -> Trust {

@@ -15,6 +15,7 @@ use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
 use crate::options::PixelMaps;
+use crate::repair::drawn::TOLD;
 use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
@@ -34,6 +35,10 @@ const HEADER_IMAGE_BYTES: usize = 3584;
 
 /// Room in the header per image for what is told of its repair: three texts, one of them a hash.
 const REPAIR_IMAGE_BYTES: usize = 256;
+
+/// Room in the header per image for the names of references: each has the names of a drive and of a camera, of 64 bytes,
+/// and a number.
+const REFERENCES_IMAGE_BYTES: usize = TOLD * 160;
 
 /// Room in the header per image for what is told of its camera's effects: five reasons, three numbers and a hash.
 const SENSOR_IMAGE_BYTES: usize = 512;
@@ -159,6 +164,26 @@ impl ObservationLayout {
     /// Reserves room in the headers for what is told of repaired images. Comes before [`Self::reserve_header`].
     pub(crate) fn reserve_repair(&mut self) {
         self.image_bytes += REPAIR_IMAGE_BYTES;
+    }
+
+    /// Reserves room in the headers for the names of the images that a repair model compares with. Comes before
+    /// [`Self::reserve_header`].
+    ///
+    /// # Errors
+    /// The largest header would be longer than clients accept.
+    pub(crate) fn reserve_references(&mut self) -> Result<(), SessionError> {
+        self.image_bytes += REFERENCES_IMAGE_BYTES;
+        let images = self.schedule.frames() * self.cameras.len();
+        let most = limits::OBSERVATION_HEADER_BYTES as usize;
+        let needed = HEADER_BASE_BYTES + images * self.image_bytes;
+        if needed <= most {
+            return Ok(());
+        }
+        let must = format!(
+            "set for {images} images, whose header would have {needed} bytes; at most {most} are accepted: request fewer \
+             images"
+        );
+        Err(SessionError::OutOfRange { field: "repair", must })
     }
 
     /// Adds effects of the sensors.

@@ -43,7 +43,7 @@ pub struct ResidencyStats {
 }
 
 /// One image of an [`Observation`].
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ImageInfo {
     /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,
@@ -62,7 +62,7 @@ pub struct ImageInfo {
 }
 
 /// One earlier image of an [`Observation`].
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct PastImageInfo {
     /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,

@@ -6,17 +6,25 @@
 
 use std::sync::Arc;
 
-use wildcity_render::View;
-use wildcity_repair::{Model, Models, RepairError};
-use wildcity_scene::Manifest;
+use wildcity_render::{Backend, View};
+use wildcity_repair::reference::Reference;
+use wildcity_repair::{InputRole, Model, Models, RepairError};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{Manifest, RenderProfile};
+use wildcity_twin::residency::Resident;
+use wildcity_twin::store::Catalog;
 
-use super::format::EpisodeHeader;
+use super::format::{EpisodeHeader, profile_hash};
 use super::repairs::RecordedRepair;
 use super::replay_report::{ProvenanceChange, ReplayError};
 use crate::observe::trust::TrainingCoverage;
-use crate::repair::session_repair::{self, RenderedImage};
+use crate::repair::drawn::{self, Beside, CameraRays, Sight};
+use crate::repair::references::{ReferenceView, ReferenceViews};
+use crate::repair::rendered_image::RenderedImage;
+use crate::repair::session_repair;
+use crate::repair::status::RepairState;
+use crate::viewpoint::viewpoints;
 
 /// The repair of an episode that is replayed.
 pub(super) struct RepairReplay<'a> {
@@ -24,8 +32,32 @@ pub(super) struct RepairReplay<'a> {
     /// The recorded model.
     model: Option<Arc<Model>>,
     coverage: TrainingCoverage,
-    /// By camera, whether it is in repair after the frames so far.
-    repairing: Vec<bool>,
+    /// By camera, after the frames so far.
+    state: RepairState,
+    rays: CameraRays,
+    /// The images that the model compares with, of the present version; if it needs some.
+    references: Option<ReferenceViews>,
+    models: &'a Models,
+    catalog: &'a Catalog,
+}
+
+/// An image to repair again.
+pub(super) struct ImageToRepair<'a> {
+    pub(super) camera: usize,
+    pub(super) mounted: &'a RigCamera,
+    pub(super) rendered: &'a RenderedImage,
+    pub(super) view: &'a View,
+    pub(super) world_from_rig: &'a Pose,
+    /// The ego is not at the pose: there is no history.
+    pub(super) is_observe: bool,
+}
+
+/// What references are drawn with.
+#[derive(Clone, Copy)]
+pub(super) struct Drawing<'a> {
+    pub(super) resident: &'a Arc<Resident>,
+    pub(super) profile: &'a RenderProfile,
+    pub(super) backend: &'a dyn Backend,
 }
 
 impl<'a> RepairReplay<'a> {
@@ -36,8 +68,8 @@ impl<'a> RepairReplay<'a> {
     /// The model cannot be loaded, or the twin has no recorded drive any more.
     pub(super) fn new(
         header: &'a EpisodeHeader,
-        manifest: &Manifest,
-        models: &Models,
+        resident: &Resident,
+        (models, catalog): (&'a Models, &'a Catalog),
         changes: &mut Vec<ProvenanceChange>,
     ) -> Result<Option<Self>, ReplayError> {
         let Some(recorded) = &header.repair else { return Ok(None) };
@@ -58,15 +90,41 @@ impl<'a> RepairReplay<'a> {
                 model = Some(loaded);
             }
         }
-        let coverage = coverage_of(manifest)?;
-        let mut repairing = header.first_state().repairing().to_vec();
-        repairing.resize(header.rig.cameras.len(), false);
-        Ok(Some(Self { recorded, model, coverage, repairing }))
+        let coverage = coverage_of(&resident.version.manifest)?;
+        let cameras = &header.rig.cameras;
+        let state = header.first_state().repair_state().for_cameras(cameras.len());
+        let rays = CameraRays::new(cameras.len());
+        let references = None;
+        let mut replay =
+            Self { recorded, model, coverage, state, rays, references, models, catalog };
+        replay.read_references(resident, cameras)?;
+        Ok(Some(replay))
     }
 
     /// Goes over to another version of the twin.
-    pub(super) fn switch_version(&mut self, manifest: &Manifest) -> Result<(), ReplayError> {
-        self.coverage = coverage_of(manifest)?;
+    pub(super) fn switch_version(
+        &mut self,
+        resident: &Resident,
+        cameras: &[RigCamera],
+    ) -> Result<(), ReplayError> {
+        self.coverage = coverage_of(&resident.version.manifest)?;
+        self.read_references(resident, cameras)
+    }
+
+    fn read_references(
+        &mut self,
+        resident: &Resident,
+        cameras: &[RigCamera],
+    ) -> Result<(), ReplayError> {
+        let needs = |model: &Arc<Model>| {
+            session_repair::needs_warped(model) || model.needs(InputRole::Reference)
+        };
+        if self.model.as_ref().is_some_and(needs) {
+            let version = resident.version.clone();
+            let table = self.catalog.views(&version);
+            let table = table.map_err(|cause| ReplayError::Reference(cause.to_string()))?;
+            self.references = ReferenceViews::of(version, table, cameras);
+        }
         Ok(())
     }
 
@@ -74,8 +132,9 @@ impl<'a> RepairReplay<'a> {
     pub(super) fn buffers(&self, camera: &RigCamera) -> RenderedImage {
         let pixels = camera.camera.pixels();
         let needs = |role| self.model.as_ref().is_some_and(|model| model.needs(role));
-        let normals = needs(wildcity_repair::InputRole::Normals);
-        let depth = normals || needs(wildcity_repair::InputRole::Depth);
+        let normals = needs(InputRole::Normals);
+        let warped = self.model.as_deref().is_some_and(session_repair::needs_warped);
+        let depth = normals || warped || needs(InputRole::Depth);
         let map =
             |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
         RenderedImage {
@@ -105,25 +164,92 @@ impl<'a> RepairReplay<'a> {
         }
         let before: Vec<bool> = match is_observe {
             true => Vec::new(),
-            false => selected.iter().map(|&camera| self.repairing[camera]).collect(),
+            false => selected.iter().map(|&camera| self.state.is_on[camera]).collect(),
         };
         let decision = self.recorded.selection.decide(&before, &trusts);
         if !is_observe {
             for (&camera, is_on) in selected.iter().zip(decision.is_on) {
-                self.repairing[camera] = is_on;
+                self.state.is_on[camera] = is_on;
             }
         }
         (0..selected.len()).map(|view| decision.cameras.contains(&view)).collect()
     }
 
     /// The repaired pixels; none without the recorded model.
+    ///
+    /// # Errors
+    /// The model fails, or a reference cannot be read or drawn.
     pub(super) fn repaired(
-        &self,
-        camera: &RigCamera,
-        image: &RenderedImage,
+        &mut self,
+        image: &ImageToRepair<'_>,
+        drawing: Drawing<'_>,
     ) -> Result<Option<Vec<u8>>, RepairError> {
-        let model = self.model.as_deref();
-        model.map(|model| session_repair::repair(model, camera, image)).transpose()
+        let Some(model) = self.model.clone() else { return Ok(None) };
+        let beside = self
+            .beside(&model, image, drawing)
+            .map_err(|message| RepairError::Input { field: "reference".to_owned(), message })?;
+        let repaired = session_repair::repair(&model, image.mounted, image.rendered, &beside)?;
+        if !image.is_observe {
+            self.state.references[image.camera] = beside.nearest;
+        }
+        Ok(Some(repaired))
+    }
+
+    /// What the model gets beside an image.
+    fn beside(
+        &self,
+        model: &Model,
+        image: &ImageToRepair<'_>,
+        drawing: Drawing<'_>,
+    ) -> Result<Beside, String> {
+        let ImageToRepair { camera, mounted, rendered, view, world_from_rig, is_observe } = *image;
+        let mut beside = Beside::default();
+        let Some(references) = &self.references else { return Ok(beside) };
+        if model.needs(InputRole::Reference) {
+            let kept = match is_observe {
+                true => None,
+                false => self.state.references[camera].as_deref(),
+            };
+            let pose = &view.world_from_camera;
+            let nearest = references.nearest(&mounted.name, pose, world_from_rig, kept);
+            if let Some(nearest) = &nearest {
+                let reference = self.reference(references, nearest, drawing)?;
+                beside.set_reference(&nearest.name, &reference, &mounted.camera);
+            }
+        }
+        if session_repair::needs_warped(model) {
+            let rays = self.rays.of(camera, mounted);
+            let sight = Sight { camera: mounted, rays, view, image: rendered };
+            let mut around = Vec::new();
+            for view in sight.overlapping(references.around(world_from_rig)) {
+                let reference = self.reference(references, &view, drawing)?;
+                around.push((view.name, reference));
+            }
+            sight.warped(&around, &mut beside);
+        }
+        Ok(beside)
+    }
+
+    /// A reference: from memory, or read and drawn.
+    fn reference(
+        &self,
+        references: &ReferenceViews,
+        view: &ReferenceView,
+        Drawing { resident, profile, backend }: Drawing<'_>,
+    ) -> Result<Arc<Reference>, String> {
+        let key = view.key(&resident.version.hash, &profile_hash(profile));
+        if let Some(known) = self.models.references().get(&key) {
+            return Ok(known);
+        }
+        let read = drawn::read(self.catalog, &resident.version, view);
+        let image = read.map_err(|error| error.to_string())?;
+        let scene = resident.scene(&viewpoints(&[view.view()]), profile);
+        let scene = scene.map_err(|error| error.to_string())?;
+        let projection = references.projection(&view.camera);
+        let drawn = drawn::draw(view, image, projection, &scene, profile, backend);
+        let reference = Arc::new(drawn.map_err(|error| error.to_string())?);
+        self.models.references().insert(key, reference.clone());
+        Ok(reference)
     }
 }
 

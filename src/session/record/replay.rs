@@ -10,12 +10,13 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_sim::Ground;
 use wildcity_sim::map::LaneSurface;
 use wildcity_twin::residency::{Cache, Resident};
+use wildcity_twin::store::Catalog;
 
 use super::actor_replay::ActorReplay;
 use super::ego_replay::EgoReplay;
 use super::format::{BUILD, FrameRecord, FrameRequest, RecordedVersion, profile_hash};
 use super::recorded_episode::RecordedEpisode;
-use super::repair_replay::RepairReplay;
+use super::repair_replay::{Drawing, ImageToRepair, RepairReplay};
 use super::repairs::RecordedImageRepair;
 use super::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
@@ -23,7 +24,7 @@ use super::replay_report::{
 };
 use super::sensor_replay::SensorReplay;
 use super::values;
-use crate::repair::session_repair::RenderedImage;
+use crate::repair::rendered_image::RenderedImage;
 use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::viewpoints;
 
@@ -60,7 +61,8 @@ impl RecordedEpisode {
     ) -> Result<ReplayReport, ReplayError> {
         let open = |version: u64| cache.open(&self.header.twin, Some(version));
         let actors = ActorReplay::new(self, cache)?;
-        let mut replay = Replay::new(self, open(self.header.version)?, actors, backend, models)?;
+        let repairs = (models, cache.catalog());
+        let mut replay = Replay::new(self, open(self.header.version)?, actors, backend, repairs)?;
         let mut switches = self.versions.iter().peekable();
         for (index, frame) in self.frames.iter().enumerate() {
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
@@ -119,7 +121,7 @@ impl<'a> Replay<'a> {
         resident: Arc<Resident>,
         actors: ActorReplay<'a>,
         backend: &'a dyn Backend,
-        models: &Models,
+        repairs: (&'a Models, &'a Catalog),
     ) -> Result<Self, ReplayError> {
         let header = &episode.header;
         let mut changes = Vec::new();
@@ -130,8 +132,7 @@ impl<'a> Replay<'a> {
             RecordedHashes { version: &header.version_hash, profile: &header.profile_hash };
         add_scene_changes(&mut changes, &recorded, &resident, &header.profile);
 
-        let manifest = &resident.version.manifest;
-        let repair = RepairReplay::new(header, manifest, models, &mut changes)?;
+        let repair = RepairReplay::new(header, &resident, repairs, &mut changes)?;
         let cameras = &header.rig.cameras;
         let buffers = |camera: &RigCamera| match &repair {
             Some(repair) => repair.buffers(camera),
@@ -170,7 +171,7 @@ impl<'a> Replay<'a> {
         to: &'a RecordedVersion,
     ) -> Result<(), ReplayError> {
         if let Some(repair) = &mut self.repair {
-            repair.switch_version(&resident.version.manifest)?;
+            repair.switch_version(&resident, self.cameras)?;
         }
         self.resident = resident;
         self.profile = &to.profile;
@@ -220,7 +221,7 @@ impl<'a> Replay<'a> {
             let views = self.render_pose(frame, pose, &selected)?;
             self.check_decision(frame, index, &selected, &views, [pose, next_image]);
             self.check_delivery(frame, index, &selected, pose);
-            for &camera in &selected {
+            for (view, &camera) in views.iter().zip(&selected) {
                 let recorded = &frame.images[next_image];
                 let repair = frame.repairs.get(next_image).and_then(Option::as_ref);
                 next_image += 1;
@@ -241,8 +242,21 @@ impl<'a> Replay<'a> {
                 let rendered_pixels = sensed.as_deref().unwrap_or(&rendered.rgb8);
                 let mut pairs = vec![(recorded_rendered, hash_of(rendered_pixels))];
                 let mut repaired = None;
-                if let (true, Some(model)) = (is_repaired, &self.repair) {
-                    repaired = model.repaired(mounted, rendered).map_err(|cause| {
+                if let (true, Some(repair)) = (is_repaired, &mut self.repair) {
+                    let image = ImageToRepair {
+                        camera,
+                        mounted,
+                        rendered,
+                        view,
+                        world_from_rig: &frame.poses[pose],
+                        is_observe: frame.request == FrameRequest::Observe,
+                    };
+                    let drawing = Drawing {
+                        resident: &self.resident,
+                        profile: self.profile,
+                        backend: self.backend,
+                    };
+                    repaired = repair.repaired(&image, drawing).map_err(|cause| {
                         let camera = mounted.name.clone();
                         ReplayError::Repair { step: frame.step, camera, cause: Box::new(cause) }
                     })?;

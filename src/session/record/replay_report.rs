@@ -181,6 +181,9 @@ pub enum ReplayError {
     /// The images were repaired by their trust, which needs a recorded drive.
     #[error("images were repaired by their trust, and the twin has no recorded drive any more")]
     NoDrive,
+    /// The table of recorded images cannot be read, and the model compares with them.
+    #[error("the recorded images of the twin cannot be read: {0}")]
+    Reference(String),
     /// The caller's function failed on an image.
     #[error("step {step}, camera {camera:?}: {reason:#}")]
     Visit {

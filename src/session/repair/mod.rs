@@ -7,6 +7,11 @@
 //!
 //! The overlay of a camera is in the rendered image, so the model sees it. Afterwards it is put back: a
 //! repaired image has the rendered pixels where the overlay is opaque, and a mixture where it is in part.
+//!
+//! A model may see recorded images beside the rendered one. `references` says which, `drawn` reads or draws them.
 
+pub(crate) mod drawn;
+pub(crate) mod references;
+pub(crate) mod rendered_image;
 pub(crate) mod session_repair;
 pub(crate) mod status;

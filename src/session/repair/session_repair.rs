@@ -3,12 +3,17 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use wildcity_repair::reference::Rays;
 use wildcity_repair::{Image, InputRole, Model, Models, RepairError, Selection, View};
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::RigCamera;
 
 use crate::error::SessionError;
 use crate::options::{OnFailure, RepairOptions};
+
+use super::drawn::{Beside, CameraRays};
+use super::references::ReferenceViews;
+use super::rendered_image::RenderedImage;
 
 /// The repair of a session: the model, and when it is used.
 #[derive(Debug)]
@@ -21,21 +26,8 @@ pub struct SessionRepair {
     pub on_failure: OnFailure,
     /// Whether observations tell the trust, by which the images are selected.
     pub(crate) tells_trust: bool,
-}
-
-/// An image as it was rendered, and what the model may need beside it. Maps that it does not need are empty.
-#[derive(Debug, Default)]
-pub(crate) struct RenderedImage {
-    /// `[height, width, 3]`.
-    pub(crate) rgb8: Vec<u8>,
-    /// `[height, width]`, in metres.
-    pub(crate) depth_m: Vec<f32>,
-    /// `[height, width]`.
-    pub(crate) opacity: Vec<f32>,
-    /// `[height, width, 3]`.
-    pub(crate) normals: Vec<f32>,
-    /// The trust by which it was selected.
-    pub(crate) trust: f64,
+    /// Of the cameras, for references.
+    rays: CameraRays,
 }
 
 impl SessionRepair {
@@ -58,17 +50,6 @@ impl SessionRepair {
             RepairError::Unknown { name, known } => SessionError::UnknownRepair { name, known },
             other => unavailable(other.to_string()),
         })?;
-        for input in &model.manifest().inputs {
-            let is_reference = matches!(
-                input.role,
-                InputRole::Reference | InputRole::ReferenceWarped | InputRole::ReferenceValid
-            );
-            if is_reference {
-                let role = input.role.name();
-                let must = "and twins have no recorded images yet; choose a model without it";
-                return Err(unavailable(format!("it needs the input {role:?}, {must}")));
-            }
-        }
         let scale = model.manifest().outputs[0].scale;
         if scale != 1 {
             return Err(unavailable(format!(
@@ -87,12 +68,61 @@ impl SessionRepair {
             );
             return Err(SessionError::OutOfRange { field: "deadline_ms", must });
         }
-        Ok(Self { model, selection, on_failure: options.on_failure, tells_trust })
+        let rays = CameraRays::new(cameras.len());
+        Ok(Self { model, selection, on_failure: options.on_failure, tells_trust, rays })
     }
 
     /// Whether the model needs depth; normals are computed from it.
     pub(crate) fn needs_depth(&self) -> bool {
-        self.model.needs(InputRole::Depth) || self.needs_normals()
+        self.model.needs(InputRole::Depth) || self.needs_normals() || self.needs_warped()
+    }
+
+    /// Whether the model needs images brought into the view.
+    pub(crate) fn needs_warped(&self) -> bool {
+        needs_warped(&self.model)
+    }
+
+    /// Whether the model needs an image of the same camera nearby.
+    pub(crate) fn needs_reference(&self) -> bool {
+        self.model.needs(InputRole::Reference)
+    }
+
+    /// Whether the model needs images beside the rendered one.
+    pub(crate) fn needs_images(&self) -> bool {
+        self.needs_warped() || self.needs_reference()
+    }
+
+    /// The rays of a camera, by its index.
+    pub(crate) fn rays(&self, index: usize, camera: &RigCamera) -> &Rays {
+        self.rays.of(index, camera)
+    }
+
+    /// Checks that each camera has an image for the role `reference`, if the model needs one.
+    ///
+    /// # Errors
+    /// [`SessionError::RepairUnavailable`].
+    pub(crate) fn check_references(
+        &self,
+        views: Option<&ReferenceViews>,
+        cameras: &[RigCamera],
+    ) -> Result<(), SessionError> {
+        let refused = |reason: String| {
+            let name = self.model.manifest().name.clone();
+            Err(SessionError::RepairUnavailable { name, reason })
+        };
+        let Some(views) = views else {
+            return refused(
+                "it needs images of a recorded drive, and the twin has none".to_owned(),
+            );
+        };
+        let is_missing = |camera: &&RigCamera| !views.has_camera(&camera.name);
+        match cameras.iter().find(is_missing).filter(|_| self.needs_reference()) {
+            None => Ok(()),
+            Some(RigCamera { name, .. }) => refused(format!(
+                "it needs a recorded image of each camera, and the twin has none of {name:?}; `wildcity twin views` \
+                 adds images, outputs.cameras leaves cameras out"
+            )),
+        }
     }
 
     /// Whether the model needs normals.
@@ -105,9 +135,15 @@ impl SessionRepair {
         &self,
         camera: &RigCamera,
         rendered: &RenderedImage,
+        beside: &Beside,
     ) -> Result<Vec<u8>, RepairError> {
-        repair(&self.model, camera, rendered)
+        repair(&self.model, camera, rendered, beside)
     }
+}
+
+/// Whether a model needs images brought into the view.
+pub(crate) fn needs_warped(model: &Model) -> bool {
+    model.needs(InputRole::ReferenceWarped) || model.needs(InputRole::ReferenceValid)
 }
 
 /// The repaired pixels of a camera's image: black outside of the lens' field, with the camera's overlay.
@@ -115,6 +151,7 @@ pub(crate) fn repair(
     model: &Model,
     camera: &RigCamera,
     rendered: &RenderedImage,
+    beside: &Beside,
 ) -> Result<Vec<u8>, RepairError> {
     let RenderedImage { rgb8, depth_m, opacity, normals, trust } = rendered;
     let width = camera.camera.width_px as usize;
@@ -136,6 +173,9 @@ pub(crate) fn repair(
         normals: given(InputRole::Normals, &normals[..]),
         mask: (!mask.is_empty()).then_some(&mask[..]),
         trust: Some(*trust as f32),
+        reference: beside.reference.as_ref(),
+        reference_warped: beside.warped.as_ref().map(|(image, _)| image),
+        reference_valid: beside.warped.as_ref().map(|(_, valid)| &valid[..]),
         ..View::new(&image)
     };
     let mut repaired = model.repair(&view)?.image.rgb8;

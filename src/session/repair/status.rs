@@ -5,12 +5,40 @@ use serde::{Deserialize, Serialize};
 use wildcity_repair::RepairError;
 
 /// What became of an image, in a session that asked for repair.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ImageRepair {
     /// What became of it.
     pub status: RepairStatus,
     /// BLAKE3 of the pixels before the repair; the hash of the image unless it was repaired.
     pub rendered_hash: blake3::Hash,
+    /// The images that the model saw beside it, at most 8, those that gave most pixels first.
+    pub references: Vec<String>,
+}
+
+impl ImageRepair {
+    /// Of an image that was not selected.
+    pub(crate) fn kept(hash: blake3::Hash) -> Self {
+        Self { status: RepairStatus::Kept, rendered_hash: hash, references: Vec::new() }
+    }
+}
+
+/// What the repair of an episode's images keeps from one observation to the next, by camera.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct RepairState {
+    /// Whether the camera is in repair; empty if none is.
+    pub(crate) is_on: Vec<bool>,
+    /// Name of its image of the role `reference`; empty if none has one.
+    pub(crate) references: Vec<Option<String>>,
+}
+
+impl RepairState {
+    /// The same for so many cameras, or for fewer.
+    #[must_use]
+    pub(crate) fn for_cameras(mut self, cameras: usize) -> Self {
+        self.is_on.resize(cameras, false);
+        self.references.resize(cameras, None);
+        self
+    }
 }
 
 /// What became of an image.

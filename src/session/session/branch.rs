@@ -89,7 +89,7 @@ impl Session {
         self.end_recording(Outcome::Completed).await;
 
         episode.add_trusts(rendered.trusts());
-        episode.set_repairing(rendered.repairing);
+        episode.set_repair_state(rendered.repair_state);
         self.begin(file, origin.clone());
         // After a switch of version, the frames of the present are as the original has them.
         let frame_history = state.frame_history.clone().or(&rendered.frame_history);

@@ -12,6 +12,7 @@ mod branch;
 mod open;
 mod prefetching;
 mod recording;
+mod reference_images;
 mod requests;
 
 use std::sync::Arc;
@@ -33,6 +34,7 @@ use crate::options::PixelMaps;
 use crate::prefetch::latest_task::LatestTask;
 use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
+use crate::repair::references::ReferenceSource;
 use crate::repair::session_repair::SessionRepair;
 use crate::scenario::EpisodeTraffic;
 use crate::sensors::settings::Sensors;
@@ -137,6 +139,11 @@ impl Session {
     /// The repair of its images, if it asked for it.
     pub fn repair(&self) -> Option<&SessionRepair> {
         self.settings.repair.as_deref()
+    }
+
+    /// Where the images that its repair model compares with come from; `None` if it needs none.
+    pub fn references(&self) -> Option<ReferenceSource> {
+        self.version.references.as_ref().map(|references| references.source())
     }
 
     /// Effects of its sensors, if it asked for them.

@@ -23,6 +23,7 @@ use crate::observe::trust::TrainingCoverage;
 use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions, Start};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
+use crate::repair::references::ReferenceViews;
 use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario, solids_of};
 use crate::sensors::settings::Sensors;
@@ -128,6 +129,9 @@ impl Session {
         if repair.is_some() {
             layout.reserve_repair();
         }
+        if repair.as_ref().is_some_and(|repair| repair.needs_images()) {
+            layout.reserve_references()?;
+        }
         if let Some(sensors) = options.sensors.and_then(Sensors::used) {
             layout.add_sensors(sensors, dt_us)?;
         }
@@ -185,7 +189,15 @@ impl Session {
             tells_actors,
             repair,
         };
-        let version = PinnedVersion::new(resident, profile, coverage).with_solids(solids);
+        let references = match &settings.repair {
+            Some(repair) => {
+                references_of(&engine, &resident, repair, settings.layout.clone()).await?
+            }
+            None => None,
+        };
+        let version = PinnedVersion::new(resident, profile, coverage)
+            .with_solids(solids)
+            .with_references(references);
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
@@ -263,9 +275,18 @@ impl Session {
                 run_blocking(find).await??
             }
         };
+        let references = match &self.settings.repair {
+            Some(repair) => {
+                let layout = self.settings.layout.clone();
+                references_of(&self.engine, &resident, repair, layout).await?
+            }
+            None => None,
+        };
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
         self.reservation.exchange(resident.clone(), bytes)?;
-        self.version = PinnedVersion::new(resident, profile, coverage).with_solids(solids.clone());
+        self.version = PinnedVersion::new(resident, profile, coverage)
+            .with_solids(solids.clone())
+            .with_references(references);
         if let Some(traffic) = self.state.traffic.take() {
             self.state.traffic = Some(traffic.with_solids(solids, self.state.episode.ego()));
         }
@@ -397,6 +418,29 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
         ) => drives.iter().find(|drive| drive.name == *trajectory),
         Some(Start::Pose(_) | Start::Random(_)) | None => drives.first(),
     }
+}
+
+/// The images that a repair model compares with; `None` if it needs none. Reads their table.
+async fn references_of(
+    engine: &Arc<Engine>,
+    resident: &Arc<Resident>,
+    repair: &Arc<SessionRepair>,
+    layout: Arc<ObservationLayout>,
+) -> Result<Option<Arc<ReferenceViews>>, SessionError> {
+    if !repair.needs_images() {
+        return Ok(None);
+    }
+    let engine = engine.clone();
+    let resident = resident.clone();
+    let repair = repair.clone();
+    let read = move || {
+        let version = resident.version.clone();
+        let table = engine.catalog().views(&version)?;
+        let views = ReferenceViews::of(version, table, layout.cameras());
+        repair.check_references(views.as_ref(), layout.cameras())?;
+        Ok::<_, SessionError>(views.map(Arc::new))
+    };
+    run_blocking(read).await?
 }
 
 /// Where a version of the twin was recorded and trained. `field` of the request needs it.

@@ -98,7 +98,7 @@ impl Session {
         self.record(record, traffic.as_ref()).instrument(debug_span!("record")).await?;
 
         next.add_trusts(rendered.trusts());
-        next.set_repairing(rendered.repairing);
+        next.set_repair_state(rendered.repair_state);
         let frame_history = rendered.frame_history;
         self.state = EpisodeState { episode: next, frame_history, traffic };
         self.look_ahead();
@@ -222,7 +222,7 @@ impl Session {
         self.end_recording(Outcome::Completed).await;
 
         next.add_trusts(rendered.trusts());
-        next.set_repairing(rendered.repairing);
+        next.set_repair_state(rendered.repair_state);
         self.begin(file, None);
         let frame_history = rendered.frame_history;
         self.state = EpisodeState { episode: next, frame_history, traffic };
@@ -266,8 +266,8 @@ impl Session {
             &captures,
         )?
         .with_repair(self.settings.repair.clone().map(|repair| {
-            let repairing = history.is_some().then(|| episode.repairing());
-            ObservationRepair::new(repair, layout.cameras().len(), repairing)
+            let state = history.is_some().then(|| episode.repair_state());
+            ObservationRepair::new(repair, layout.cameras().len(), state)
         }));
         for capture in captures {
             if capture.cameras.is_empty() {
@@ -299,6 +299,9 @@ impl Session {
             builder = rendered?;
             builder.add_queue_time(queued);
             if builder.has_candidates() {
+                if let Some(references) = &version.references {
+                    builder = self.find_references(version, references, builder, deadline).await?;
+                }
                 let repaired = run_blocking(move || builder.repair().map(|()| builder));
                 let repaired = repaired.instrument(debug_span!("repair"));
                 let in_time = timeout_at(deadline, repaired).await;

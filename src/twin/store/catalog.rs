@@ -357,7 +357,8 @@ impl Catalog {
         }
         let objects = manifest.chunks.iter().map(|chunk| &chunk.object);
         let sky = manifest.sky.iter().map(|sky| &sky.object);
-        let named = objects.chain(sky).chain([&manifest.table.object]);
+        let views = manifest.views.iter().map(|views| &views.object);
+        let named = objects.chain(sky).chain(views).chain([&manifest.table.object]);
         if let Some(object) = { named }.find(|name| !is_hash(name)) {
             return Err(damaged(format!("{object:?} is not a hash")));
         }

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::ingest::IngestError;
 use crate::limits;
-use wildcity_scene::manifest::{ChunkEntry, ObjectRef};
+use wildcity_scene::manifest::{ChunkEntry, ObjectRef, ViewsRef};
 use wildcity_scene::record::Clamped;
 use wildcity_scene::validate::{self, Field};
 use wildcity_scene::{Gaussians, Manifest};
@@ -33,6 +33,10 @@ pub struct Commit {
     /// The cells that were put, by (cell y, cell x).
     chunks: BTreeMap<[i32; 2], ChunkEntry>,
     clamped: Clamped,
+    /// Objects of recorded images that were put.
+    images: BTreeSet<String>,
+    /// The recorded images of the version, if they differ from those of the base.
+    views: Option<Option<ViewsRef>>,
 }
 
 /// What one [`Commit::put`] stored.
@@ -75,6 +79,8 @@ impl Catalog {
             sh_degree: None,
             chunks: BTreeMap::new(),
             clamped: Clamped::default(),
+            images: BTreeSet::new(),
+            views: None,
         })
     }
 
@@ -201,8 +207,33 @@ impl Commit {
             if let Some(sky) = &manifest.sky {
                 uncached.objects.check_present(&commit.name, &sky.object, sky.bytes)?;
             }
+            if let Some(views) = &manifest.views {
+                uncached.objects.check_present(&commit.name, &views.object, views.bytes)?;
+            }
+            for view in uncached.views_of(&manifest)? {
+                let image = &view.image;
+                uncached.objects.check_present(&commit.name, &image.object, image.bytes)?;
+            }
             Ok(HashedManifest { manifest, hash })
         })
+    }
+
+    /// The catalog that it will be published in.
+    pub(super) fn catalog(&self) -> &Catalog {
+        &self.catalog
+    }
+
+    /// Writes an object of recorded images.
+    pub(super) fn put_object(&mut self, bytes: &[u8]) -> Result<ObjectRef, StoreError> {
+        let stored = self.staging.put(Box::new(|out| out.write_all(bytes)))?;
+        self.images.insert(stored.hash.clone());
+        Ok(ObjectRef { object: stored.hash, bytes: stored.bytes })
+    }
+
+    /// Sets the recorded images of the version: those of [`Commit::put_views`], those of another version of the twin,
+    /// or none. Otherwise [`Commit::change`] keeps those of its base, and [`Commit::replace`] has none.
+    pub fn set_views(&mut self, views: Option<ViewsRef>) {
+        self.views = Some(views);
     }
 
     /// A manifest with the cells that were put, and no others. Its table is not written yet.
@@ -219,6 +250,7 @@ impl Commit {
             rig,
             trajectories,
             sky: sky.map(|sky| sky.put(&mut *self.staging)).transpose()?,
+            views: self.views.clone().flatten(),
             geo,
             provenance,
         })
@@ -237,6 +269,7 @@ impl Commit {
         if let Some(sky) = sky {
             manifest.sky = sky.map(|sky| sky.put(&mut *self.staging)).transpose()?;
         }
+        manifest.views = self.views.clone().unwrap_or(manifest.views);
         manifest.profile = profile.unwrap_or(manifest.profile);
         manifest.rig = rig.or(manifest.rig);
         manifest.trajectories = trajectories.unwrap_or(manifest.trajectories);
@@ -306,7 +339,8 @@ impl Commit {
             let own = self.chunks.values().map(|chunk| chunk.object.as_str());
             let sky = manifest.sky.iter().map(|sky| sky.object.as_str());
             let named = [manifest.table.object.as_str(), hash.as_str()];
-            let objects = own.chain(sky).chain(named).collect();
+            let images = self.images.iter().map(String::as_str);
+            let objects = own.chain(sky).chain(images).chain(named).collect();
 
             // With the same content as the latest version, that version is the result.
             if let Some(number) = latest

@@ -78,6 +78,7 @@ impl Diff {
             ("rig", before.rig != after.rig),
             ("trajectories", before.trajectories != after.trajectories),
             ("sky", before.sky != after.sky),
+            ("views", before.views != after.views),
             ("geo", before.geo != after.geo),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));

@@ -10,7 +10,7 @@ use super::log::CommitKind;
 use super::pack::StorageOptions;
 use super::settings::{VersionChange, VersionSettings};
 use super::sky::NewSky;
-use super::{Catalog, StoreError, Version};
+use super::{Catalog, StoreError, Version, views};
 
 /// What an edit changes.
 #[derive(Clone, Debug)]
@@ -74,6 +74,10 @@ impl Catalog {
             geo: None,
             provenance,
         };
+        if manifest.views.is_some() {
+            let views = commit.put_views(&views::aligned(&self.views(base)?, &alignment))?;
+            commit.set_views(Some(views));
+        }
         commit.replace(Some(base.number), settings)
     }
 }

@@ -303,6 +303,19 @@ pub enum StoreError {
         /// The largest size that is read.
         limit: u64,
     },
+    /// A recorded image or the table of them is too large.
+    #[error(
+        "the {what} of recorded images would take {bytes} bytes; at most {limit} are read: store fewer or smaller \
+         images"
+    )]
+    ViewSize {
+        /// `image` or `table`.
+        what: &'static str,
+        /// Its size.
+        bytes: u64,
+        /// The largest size that is read.
+        limit: u64,
+    },
 }
 
 impl StoreError {

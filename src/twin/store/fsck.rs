@@ -165,6 +165,7 @@ impl Catalog {
         // By hash, because versions share most objects.
         let mut named = BTreeSet::new();
         let mut chunks = BTreeMap::new();
+        let mut images = BTreeSet::new();
         for &number in numbers {
             let hash = uncached.record(name, number)?.manifest;
             if !named.insert(hash.clone()) {
@@ -179,6 +180,25 @@ impl Catalog {
                         && let Err(error) = uncached.objects.read_start(name, &object, 0)
                     {
                         damaged.push(DamagedObject { object, error });
+                    }
+                    match uncached.view_objects(&manifest) {
+                        Ok(objects) => {
+                            for object in objects.into_iter().filter(|one| !named.contains(one)) {
+                                let read = uncached.objects.read_start(name, &object, 0);
+                                if let Err(error) = read {
+                                    damaged.push(DamagedObject { object: object.clone(), error });
+                                }
+                                images.insert(object);
+                            }
+                            named.append(&mut images);
+                        }
+                        Err(error) => {
+                            let views = manifest.views.iter().map(|views| views.object.clone());
+                            let object = views.collect::<String>();
+                            if named.insert(object.clone()) {
+                                damaged.push(DamagedObject { object, error });
+                            }
+                        }
                     }
                     // Without the table, chunks are still compared with their own hashes.
                     if let Err(error) = uncached.fill(&mut manifest) {

@@ -199,9 +199,10 @@ impl Catalog {
     /// Hashes of a manifest and all objects that it names.
     pub(super) fn named_by(&self, name: &str, hash: &str) -> Result<BTreeSet<String>, StoreError> {
         let manifest = self.manifest(name, hash)?;
+        let views = self.view_objects(&manifest)?;
         let chunks = manifest.chunks.into_iter().map(|chunk| chunk.object);
         let sky = manifest.sky.into_iter().map(|sky| sky.object);
-        Ok(chunks.chain(sky).chain([manifest.table.object, hash.to_owned()]).collect())
+        Ok(chunks.chain(sky).chain(views).chain([manifest.table.object, hash.to_owned()]).collect())
     }
 
     /// A side file's JSON, or the default if it does not exist.

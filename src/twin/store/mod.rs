@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! <twins>/<name>/log/0000000001         the hash of version 1's manifest, when it was committed, and from what
-//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables, chunks, and skies, named by their BLAKE3
+//! <twins>/<name>/objects/3f/3f9c...     manifests, their tables, chunks, skies, and recorded images, named by their BLAKE3
 //! <twins>/<name>/leases/...             versions in use, and until when
 //! <twins>/<name>/gc/candidates          objects that no kept version needs, and since when
 //! <twins>/<name>/gc/collected           versions that were removed
@@ -71,6 +71,7 @@ mod recover;
 mod remote;
 mod settings;
 mod sky;
+mod views;
 
 pub use actors::{ActorList, AddedActor, DamagedActor, SameName, StoredActor, StoredLevel};
 pub use catalog::{Catalog, DamagedTwin, DiskCacheSettings, TwinList, TwinListing, Version};

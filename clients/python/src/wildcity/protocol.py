@@ -448,7 +448,10 @@ class Welcome:
 
 @dataclass(frozen=True)
 class OpenedRepair:
-    """The repair of a session's images. `repair_hash` is BLAKE3 of what decides the bytes beside the image."""
+    """The repair of a session's images. `repair_hash` is BLAKE3 of what decides the bytes beside the image.
+
+    `references`: whether a model that compares with images of the drive gets recorded or rendered ones.
+    """
 
     model: str
     version: str
@@ -460,6 +463,7 @@ class OpenedRepair:
     at_least: float
     per_step: int
     on_failure: Literal["unrepaired", "error"]
+    references: Literal["recorded", "rendered"] | None = None
 
 
 @dataclass(frozen=True)
@@ -628,12 +632,14 @@ class ImageRepair:
     """What became of an image in a session that asked for repair.
 
     `kept`: not selected. `repaired`: by the model. `failed`: the model failed, because of `failure`. `rendered_hash`
-    is BLAKE3 of the pixels before the repair, which is the image's `hash` unless it was repaired.
+    is BLAKE3 of the pixels before the repair, which is the image's `hash` unless it was repaired. `references` names
+    the recorded images that the model saw beside it, at most 8.
     """
 
     status: Literal["kept", "repaired", "failed"]
     rendered_hash: str
     failure: Literal["timed_out", "not_finite", "withdrawn", "other"] | None = None
+    references: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ use crate::observe::observation::{
 };
 use crate::observe::trust::Trust;
 use crate::options::PixelMaps;
-use crate::repair::status::ImageRepair;
+use crate::repair::status::{ImageRepair, RepairState};
 use crate::sensors::delivery::Delivery;
 use crate::sensors::settings::CameraSensor;
 use crate::sensors::{ImageSensor, SensorReason};
@@ -30,9 +30,8 @@ pub(crate) struct RenderedObservation {
     pub(crate) hashes: Vec<blake3::Hash>,
     /// What became of each rendered image; empty unless the session asked for repair.
     pub(crate) repairs: Vec<ImageRepair>,
-    /// By camera, whether it is in repair after this observation. None without repair, and for poses that the
-    /// ego is not at.
-    pub(crate) repairing: Option<Vec<bool>>,
+    /// What the repair keeps after this observation. None without repair, and for poses that the ego is not at.
+    pub(crate) repair_state: Option<RepairState>,
     trusts: Vec<Option<Trust>>,
 }
 
@@ -83,8 +82,8 @@ impl ObservationBuilder {
             frame_history,
             captures: self.captures,
             hashes: self.encoded.iter().map(|image| image.hash).collect(),
-            repairs: self.encoded.iter().filter_map(|image| image.repair).collect(),
-            repairing: self.repair.and_then(ObservationRepair::into_repairing),
+            repairs: self.encoded.iter().filter_map(|image| image.repair.clone()).collect(),
+            repair_state: self.repair.and_then(ObservationRepair::into_state),
             trusts: self.encoded.iter().map(|image| image.trust).collect(),
         })
     }
@@ -97,7 +96,8 @@ impl ObservationBuilder {
         for capture in &self.captures {
             for &camera in &capture.cameras {
                 if capture.shown {
-                    let EncodedImage { hash, trust, repair, .. } = self.encoded[encoded];
+                    let EncodedImage { hash, trust, ref repair, .. } = self.encoded[encoded];
+                    let repair = repair.clone();
                     let (time_us, sensor) = self.delivered(capture, camera, encoded);
                     shown.push(ShownImage {
                         info: ImageInfo { camera, pose, time_us, hash, trust, repair, sensor },
@@ -217,7 +217,8 @@ impl ObservationBuilder {
             for &camera in &capture.cameras {
                 if self.layout.is_shown_later(capture, camera) {
                     let (time_us, sensor) = self.delivered(capture, camera, index);
-                    let EncodedImage { hash, trust, repair, .. } = self.encoded[index];
+                    let EncodedImage { hash, trust, ref repair, .. } = self.encoded[index];
+                    let repair = repair.clone();
                     let bytes = mem::take(&mut self.encoded[index].file);
                     let due_us = capture.due_us;
                     let frame =
@@ -235,8 +236,10 @@ impl ObservationBuilder {
             let files: Vec<&[u8]> = earlier.iter().map(|one| &one.frame.bytes[..]).collect();
             self.buffer.append(&self.budget, &files)?;
             for (index, one) in earlier.iter().enumerate() {
-                let PastFrame { camera, time_us, hash, trust, repair, sensor, ref bytes, .. } =
-                    *one.frame;
+                let PastFrame {
+                    camera, time_us, hash, trust, sensor, ref repair, ref bytes, ..
+                } = *one.frame;
+                let repair = repair.clone();
                 let shape = layout.colour_shape(camera, bytes.len());
                 tensors.push(TensorKind::PastRgb(index), DType::U8, shape);
                 let back = one.back;

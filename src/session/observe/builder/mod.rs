@@ -22,10 +22,10 @@ use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
 use crate::options::PixelMaps;
 use crate::repair::session_repair::SessionRepair;
-use crate::repair::status::{ImageRepair, RepairStatus};
+use crate::repair::status::ImageRepair;
 use crate::sensors::pixels::PixelEffects;
 
-use self::repair::{Finished, ObservationRepair};
+use self::repair::{Finished, ObservationRepair, RenderedCapture};
 
 /// An observation that is being built: one capture after the other is rendered, then `finish` closes it.
 pub(crate) struct ObservationBuilder {
@@ -201,9 +201,7 @@ impl ObservationBuilder {
             if let Ok(image) = &mut image {
                 image.trust = trust.filter(|_| tells_trust);
                 let rendered_hash = image.effects.map_or(image.hash, |effects| effects.clean_hash);
-                image.repair = repair
-                    .is_some()
-                    .then_some(ImageRepair { status: RepairStatus::Kept, rendered_hash });
+                image.repair = repair.is_some().then(|| ImageRepair::kept(rendered_hash));
             }
             // Setting fails only if the backend finishes a view twice, which it does not.
             let _ = slots[index].set((image, repair));
@@ -231,7 +229,9 @@ impl ObservationBuilder {
             self.encoded.push(image);
         }
         if let (Some(repair), Some(gate)) = (&mut self.repair, &gate) {
-            repair.decide(capture, gate, repairs, &raw_at, first);
+            let rendered =
+                RenderedCapture { finished: repairs, views: frame.views, raw_at: &raw_at, first };
+            repair.decide(capture, gate, rendered);
         }
         Ok(())
     }

@@ -5,30 +5,39 @@
 //! and the candidates are repaired and encoded outside of the render queue: frames of other sessions are
 //! rendered meanwhile, and a model that hangs delays its own session alone.
 
+use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use wildcity_render::Target;
+use wildcity_render::{Target, View};
+use wildcity_repair::reference::Reference;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::rig::RigCamera;
 
 use super::{ObservationBuilder, encoded};
 use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 use crate::observe::layout::RigCapture;
 use crate::options::OnFailure;
-use crate::repair::session_repair::{RenderedImage, SessionRepair};
-use crate::repair::status::{ImageRepair, RepairFailure, RepairStatus};
+use crate::repair::drawn::{Beside, Sight};
+use crate::repair::references::{ReferenceView, ReferenceViews};
+use crate::repair::rendered_image::RenderedImage;
+use crate::repair::session_repair::SessionRepair;
+use crate::repair::status::{ImageRepair, RepairFailure, RepairState, RepairStatus};
 
 /// What the repair of an observation's images needs.
 pub(crate) struct ObservationRepair {
     pub(super) session: Arc<SessionRepair>,
-    /// By camera: whether it is in repair after the captures so far.
-    repairing: Vec<bool>,
+    /// By camera: after the captures so far.
+    state: RepairState,
     /// Whether that goes from one capture to the next. Not for poses that the ego is not at.
     has_history: bool,
     /// Of the last capture.
     candidates: Vec<Candidate>,
     /// The memory of the candidates.
     share: Option<BudgetShare>,
+    /// The references of the candidates, by their names.
+    references: HashMap<String, Arc<Reference>>,
 }
 
 /// An image that may be repaired.
@@ -41,6 +50,23 @@ struct Candidate {
     image: RenderedImage,
     /// Where its pixels are in the buffer, if the observation holds them there.
     raw_at: Option<usize>,
+    view: View,
+    world_from_rig: Pose,
+    /// Names of the references that are brought into it, in order.
+    around: Vec<String>,
+    /// Name of the reference of the same camera.
+    nearest: Option<String>,
+}
+
+/// A capture that is rendered.
+pub(super) struct RenderedCapture<'a> {
+    /// View by view.
+    pub(super) finished: Vec<Finished>,
+    pub(super) views: &'a [View],
+    /// Where the pixels of each view are in the buffer.
+    pub(super) raw_at: &'a [Option<usize>],
+    /// Where its images begin among the encoded ones.
+    pub(super) first: usize,
 }
 
 /// Which images of a capture may be repaired: shared by the threads that finish its views.
@@ -58,22 +84,21 @@ pub(super) struct Finished {
 }
 
 impl ObservationRepair {
-    /// `repairing` says by camera whether it was in repair after the observation before; none for poses that
-    /// the ego is not at.
+    /// `state` is that after the observation before; none for poses that the ego is not at.
     pub(crate) fn new(
         session: Arc<SessionRepair>,
         cameras: usize,
-        repairing: Option<&[bool]>,
+        state: Option<RepairState>,
     ) -> Self {
-        let has_history = repairing.is_some();
-        let mut repairing = repairing.unwrap_or_default().to_vec();
-        repairing.resize(cameras, false);
-        Self { session, repairing, has_history, candidates: Vec::new(), share: None }
+        let has_history = state.is_some();
+        let state = state.unwrap_or_default().for_cameras(cameras);
+        let references = HashMap::new();
+        Self { session, state, has_history, candidates: Vec::new(), share: None, references }
     }
 
-    /// By camera, whether it is in repair now; none for poses that the ego is not at.
-    pub(super) fn into_repairing(self) -> Option<Vec<bool>> {
-        self.has_history.then_some(self.repairing)
+    /// The state now; none for poses that the ego is not at.
+    pub(super) fn into_state(self) -> Option<RepairState> {
+        self.has_history.then_some(self.state)
     }
 
     /// The gate of a capture. Reserves memory for its candidates.
@@ -85,27 +110,28 @@ impl ObservationRepair {
     ) -> Result<Gate, SessionError> {
         let depth = u64::from(self.session.needs_depth());
         let normals = u64::from(self.session.needs_normals());
-        self.share = Some(budget.reserve(pixels * (3 + 4 * (1 + depth + 3 * normals)))?);
-        let was_on = capture.cameras.iter().map(|&camera| self.repairing[camera]).collect();
+        // Two more copies of the depth, and the references in the view.
+        let warped = u64::from(self.session.needs_warped());
+        let values = 1 + depth + 3 * normals + 4 * warped;
+        self.share = Some(budget.reserve(pixels * (3 + 4 * values))?);
+        let was_on = capture.cameras.iter().map(|&camera| self.state.is_on[camera]).collect();
         Ok(Gate { session: self.session.clone(), was_on })
     }
 
-    /// Decides which images of a capture are repaired. `raw_at` says where the pixels of each view are in the
-    /// buffer, and `first` where the capture's images begin among the encoded ones.
+    /// Decides which images of a capture are repaired.
     pub(super) fn decide(
         &mut self,
         capture: &RigCapture,
         gate: &Gate,
-        finished: Vec<Finished>,
-        raw_at: &[Option<usize>],
-        first: usize,
+        rendered: RenderedCapture<'_>,
     ) {
+        let RenderedCapture { finished, views, raw_at, first } = rendered;
         let trusts: Vec<f64> = finished.iter().map(|image| image.trust).collect();
         let decision = gate.session.selection.decide(&gate.was_on, &trusts);
         for (view, Finished { candidate, .. }) in finished.into_iter().enumerate() {
             let camera = capture.cameras[view];
             if self.has_history {
-                self.repairing[camera] = decision.is_on[view];
+                self.state.is_on[camera] = decision.is_on[view];
             }
             let Some(image) = candidate else { continue };
             self.candidates.push(Candidate {
@@ -114,11 +140,42 @@ impl ObservationRepair {
                 is_chosen: decision.cameras.contains(&view),
                 image,
                 raw_at: raw_at[view],
+                view: views[view],
+                world_from_rig: capture.world_from_rig,
+                around: Vec::new(),
+                nearest: None,
             });
         }
         if self.candidates.is_empty() {
             self.share = None;
         }
+    }
+}
+
+impl Candidate {
+    /// What the model gets beside the image.
+    fn beside(
+        &self,
+        session: &SessionRepair,
+        camera: &RigCamera,
+        references: &HashMap<String, Arc<Reference>>,
+    ) -> Beside {
+        let mut beside = Beside::default();
+        if session.needs_reference()
+            && let Some(name) = &self.nearest
+            && let Some(reference) = references.get(name)
+        {
+            beside.set_reference(name, reference, &camera.camera);
+        }
+        if session.needs_warped() {
+            let named = |name: &String| Some((name.clone(), references.get(name)?.clone()));
+            let around: Vec<(String, Arc<Reference>)> =
+                self.around.iter().filter_map(named).collect();
+            let rays = session.rays(self.camera, camera);
+            let sight = Sight { camera, rays, view: &self.view, image: &self.image };
+            sight.warped(&around, &mut beside);
+        }
+        beside
     }
 }
 
@@ -151,6 +208,52 @@ impl ObservationBuilder {
         self.repair.as_ref().is_some_and(|repair| !repair.candidates.is_empty())
     }
 
+    /// The references that the chosen images of the last capture need, each once. Takes some milliseconds an image.
+    pub(crate) fn wanted_references(&mut self, views: &ReferenceViews) -> Vec<ReferenceView> {
+        let Some(repair) = &mut self.repair else { return Vec::new() };
+        let session = repair.session.clone();
+        let mut wanted: Vec<ReferenceView> = Vec::new();
+        let mut want = |view: ReferenceView| {
+            if wanted.iter().all(|other| other.name != view.name) {
+                wanted.push(view);
+            }
+        };
+        for candidate in repair.candidates.iter_mut().filter(|candidate| candidate.is_chosen) {
+            let camera = &self.layout.cameras()[candidate.camera];
+            let world_from_rig = &candidate.world_from_rig;
+            if session.needs_warped() {
+                let Candidate { view, image, .. } = &*candidate;
+                let rays = session.rays(candidate.camera, camera);
+                let sight = Sight { camera, rays, view, image };
+                let around = sight.overlapping(views.around(world_from_rig));
+                candidate.around = around.iter().map(|view| view.name.clone()).collect();
+                around.into_iter().for_each(&mut want);
+            }
+            if session.needs_reference() {
+                let world_from_camera = &candidate.view.world_from_camera;
+                // A pose that the ego is not at has no history.
+                let kept = repair.state.references[candidate.camera].as_deref();
+                let kept = kept.filter(|_| repair.has_history);
+                let nearest = views.nearest(&camera.name, world_from_camera, world_from_rig, kept);
+                candidate.nearest = nearest.as_ref().map(|view| view.name.clone());
+                nearest.into_iter().for_each(&mut want);
+            }
+        }
+        wanted
+    }
+
+    /// Adds references by their names, and how long reading and drawing them took.
+    pub(crate) fn add_references(
+        &mut self,
+        references: HashMap<String, Arc<Reference>>,
+        took: Duration,
+    ) {
+        if let Some(repair) = &mut self.repair {
+            repair.references = references;
+        }
+        self.timings.repair += took;
+    }
+
     /// Repairs the chosen images of the last capture, and encodes all of its candidates. Blocks.
     ///
     /// # Errors
@@ -160,19 +263,25 @@ impl ObservationBuilder {
         let Some(repair) = &mut self.repair else { return Ok(()) };
         let session = repair.session.clone();
         let candidates = std::mem::take(&mut repair.candidates);
+        let references = std::mem::take(&mut repair.references);
         let capture = self.captures.last().cloned();
-        for Candidate { camera, index, is_chosen, image, raw_at } in candidates {
+        for candidate in candidates {
+            let Candidate { camera, index, is_chosen, ref image, raw_at, .. } = candidate;
             let mounted = &self.layout.cameras()[camera];
             let mut status = RepairStatus::Kept;
+            let mut names = Vec::new();
             let mut pixels = image.rgb8.clone();
             if is_chosen {
                 let started = Instant::now();
-                let repaired = session.repair(mounted, &image);
+                let beside = candidate.beside(&session, mounted, &references);
+                let repaired = session.repair(mounted, image, &beside);
                 self.timings.repair += started.elapsed();
                 match repaired {
                     Ok(repaired) => {
                         status = RepairStatus::Repaired;
+                        names = beside.names;
                         pixels = repaired;
+                        repair.state.references[camera].clone_from(&candidate.nearest);
                     }
                     Err(cause) if session.on_failure == OnFailure::Error => {
                         let camera = mounted.name.clone();
@@ -203,11 +312,9 @@ impl ObservationBuilder {
             rendered.hash = done.hash;
             rendered.file = done.file;
             rendered.effects = done.effects;
-            rendered.repair = Some(ImageRepair { status, rendered_hash });
+            rendered.repair = Some(ImageRepair { status, rendered_hash, references: names });
         }
-        if let Some(repair) = &mut self.repair {
-            repair.share = None;
-        }
+        repair.share = None;
         Ok(())
     }
 }

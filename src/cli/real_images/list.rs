@@ -1,4 +1,4 @@
-//! The held-out images: their files, masks and cameras.
+//! Lists of real images: their files, masks and cameras.
 
 use std::path::{Path, PathBuf};
 
@@ -11,23 +11,23 @@ use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::ingest::{self, cameras, capture};
 
 /// A real image and its camera.
-pub(super) struct HeldOutImage {
+pub(in crate::cli) struct RealImage {
     /// Its name in the list.
-    pub(super) name: String,
-    pub(super) file: PathBuf,
-    pub(super) mask: Option<PathBuf>,
-    pub(super) camera: Camera,
+    pub(in crate::cli) name: String,
+    pub(in crate::cli) file: PathBuf,
+    pub(in crate::cli) mask: Option<PathBuf>,
+    pub(in crate::cli) camera: Camera,
     /// In the axes and unit of the list.
-    pub(super) world_from_camera: Pose,
+    pub(in crate::cli) world_from_camera: Pose,
     /// The smallest z that it draws, if the list says one, in units of the scene.
-    pub(super) near: Option<f64>,
+    pub(in crate::cli) near: Option<f64>,
 }
 
 /// Real images, in the order of their names.
-pub(super) struct ImageList {
-    images: Vec<HeldOutImage>,
+pub(in crate::cli) struct ImageList {
+    images: Vec<RealImage>,
     /// Whether the poses are in the axes of the scene; else they are in those of a capture.
-    pub(super) is_in_scene_axes: bool,
+    pub(in crate::cli) is_in_scene_axes: bool,
 }
 
 /// An image of a list.
@@ -51,7 +51,7 @@ impl ImageList {
     ///
     /// # Errors
     /// The list cannot be read, or an image or a mask is missing.
-    pub(super) fn read(
+    pub(in crate::cli) fn read(
         source: &Path,
         image_dir: Option<&Path>,
         masks: Option<&Path>,
@@ -68,14 +68,14 @@ impl ImageList {
                 (None, Some(mask)) => Some(folder.join(mask)),
                 (None, None) => None,
             };
-            found.push(HeldOutImage { name, file, mask, camera, world_from_camera, near });
+            found.push(RealImage { name, file, mask, camera, world_from_camera, near });
         }
         found.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(Self { images: found, is_in_scene_axes })
     }
 
     /// Every `step`-th image, beginning with the first.
-    pub(super) fn every(&self, step: usize) -> Vec<&HeldOutImage> {
+    pub(in crate::cli) fn every(&self, step: usize) -> Vec<&RealImage> {
         self.images.iter().step_by(step).collect()
     }
 }

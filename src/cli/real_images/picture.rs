@@ -14,7 +14,7 @@ const SAME_SHAPE: f64 = 0.01;
 ///
 /// # Errors
 /// The file cannot be read, or has another shape than the camera.
-pub(super) fn real(
+pub(in crate::cli) fn real(
     file: &Path,
     camera: &Camera,
     background: [f64; 3],
@@ -39,7 +39,7 @@ pub(super) fn real(
 ///
 /// # Errors
 /// The file cannot be read, or has another size than the image.
-pub(super) fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
+pub(in crate::cli) fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
     let mask = read(file)?.into_luma8();
     let own_px = [mask.width(), mask.height()];
     ensure!(
@@ -55,7 +55,7 @@ pub(super) fn mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> 
 }
 
 /// A name as a path that stays within a folder.
-pub(super) fn inside(name: &str) -> PathBuf {
+pub(in crate::cli) fn inside(name: &str) -> PathBuf {
     Path::new(name).components().filter(|part| matches!(part, Component::Normal(_))).collect()
 }
 

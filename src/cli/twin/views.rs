@@ -1,0 +1,275 @@
+//! `wildcity twin views`.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, ensure};
+use image::RgbImage;
+use image::imageops::{self, FilterType};
+
+use wildcity_scene::align::Alignment;
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::manifest::ObjectRef;
+use wildcity_scene::rig::is_name;
+use wildcity_scene::trajectory::NearestPlace;
+use wildcity_scene::views::RecordedView;
+use wildcity_scene::{Manifest, Trajectory};
+use wildcity_twin::store::{Commit, CommitKind, StorageOptions, VersionChange};
+
+use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::real_images::{ImageList, RealImage, picture};
+use crate::cli::{placement, progress};
+
+use super::change;
+
+/// Give a twin the images of its recorded drive, or remove them: makes a new version with the same Gaussians.
+///
+/// A repair model can compare a rendered image with recorded ones (docs/repair.md). The images are stored as JPEG in
+/// the size that --side says, with their cameras. Each belongs to the place of the drive that is nearest to its camera.
+/// Open sessions keep the version that they have.
+#[derive(Debug, clap::Args)]
+#[command(after_long_help = EXAMPLES)]
+#[command(group = clap::ArgGroup::new("action").args(["images", "remove"]).required(true))]
+pub(in crate::cli) struct Views {
+    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    #[arg(value_name = "TWIN")]
+    twin: TwinVersion,
+
+    /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, as of `wildcity eval`.
+    #[arg(long, value_name = "FILE_OR_DIR")]
+    images: Option<PathBuf>,
+
+    /// Folder that the names of images are in, as of `wildcity eval`.
+    #[arg(long, value_name = "DIR", requires = "images")]
+    image_dir: Option<PathBuf>,
+
+    /// Directions of the poses' axes, as of `wildcity import` [default: as the twin was imported and aligned;
+    /// identity for a list]
+    #[arg(long, value_name = "AXES", allow_hyphen_values = true, requires = "images")]
+    axes: Option<String>,
+
+    /// Metres per unit of the poses, as of `wildcity import`; with --axes [default: 1]
+    #[arg(long, value_name = "M", requires = "axes")]
+    scale: Option<f64>,
+
+    /// Least distance of two images of a camera along the drive, in metres: 2 or 2m.
+    #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
+    every: f64,
+
+    /// Longest side of a stored image, in pixels. Larger images are scaled down: 0.4 GB per km of six cameras every 2 m.
+    #[arg(long, value_name = "PX", default_value_t = 720, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    side: u32,
+
+    /// Quality of the JPEGs.
+    #[arg(long, value_name = "Q", default_value_t = 90, value_parser = clap::value_parser!(u8).range(1..=100))]
+    quality: u8,
+
+    /// Remove the images.
+    #[arg(long)]
+    remove: bool,
+
+    #[command(flatten)]
+    twins: Twins,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  wildcity twin views street --images capture/transforms.json
+  wildcity twin views street --images capture --image-dir capture/images_2 --every 4m --side 480
+  wildcity twin views street --remove";
+
+/// An image of the list with its place on the drive.
+struct Placed<'a> {
+    image: &'a RealImage,
+    camera_name: String,
+    trajectory: &'a Trajectory,
+    place: NearestPlace,
+    alignment: &'a Alignment,
+}
+
+impl Views {
+    pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
+        let catalog = self.twins.catalog()?;
+        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        let manifest = &base.manifest;
+        let storage = StorageOptions { record: manifest.record, ..StorageOptions::default() };
+        let mut commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
+        match &self.images {
+            None => commit.set_views(None),
+            Some(images) => {
+                ensure!(
+                    !manifest.trajectories.is_empty(),
+                    "twin {} has no recorded drive that images could belong to: `wildcity twin drive` adds one",
+                    self.twin.name
+                );
+                let list = ImageList::read(images, self.image_dir.as_deref(), None)?;
+                let alignment = match &self.axes {
+                    Some(axes) => placement::imported(axes, self.scale.unwrap_or(1.0))?,
+                    None if list.is_in_scene_axes => Alignment::IDENTITY,
+                    None => placement::of_version(&catalog, &base)?,
+                };
+                let views = self.put(&mut commit, manifest, &list, &alignment)?;
+                let views = commit.put_views(&views)?;
+                commit.set_views(Some(views));
+            }
+        }
+        let change = VersionChange::none(manifest.provenance.clone());
+        let version = commit.change(base.number, change)?;
+        let what =
+            version.manifest.views.as_ref().map_or("no recorded images".to_owned(), |views| {
+                let mb = views.image_bytes as f64 * 1e-6;
+                format!("{} recorded images of {mb:.1} MB", views.images)
+            });
+        change::print(&version, &what)
+    }
+
+    /// Stores the images that are kept. Returns their table, camera by camera along the drives.
+    fn put(
+        &self,
+        commit: &mut Commit,
+        manifest: &Manifest,
+        list: &ImageList,
+        alignment: &Alignment,
+    ) -> anyhow::Result<Vec<RecordedView>> {
+        let images = list.every(1);
+        let names = camera_names(&images);
+        let mut placed: Vec<Placed<'_>> = Vec::with_capacity(images.len());
+        for (image, camera_name) in images.into_iter().zip(names) {
+            let at_m = alignment.pose(&image.world_from_camera).position_m;
+            let drives = manifest.trajectories.iter().map(|drive| (drive, drive.nearest(at_m)));
+            let nearest = drives.min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m));
+            let (trajectory, place) = nearest.context("the twin has no recorded drive")?;
+            placed.push(Placed { image, camera_name, trajectory, place, alignment });
+        }
+        let order = |one: &Placed<'_>| (one.trajectory.name.clone(), one.camera_name.clone());
+        placed.sort_by(|a, b| {
+            order(a).cmp(&order(b)).then(a.place.station_m.total_cmp(&b.place.station_m))
+        });
+        let mut kept: Vec<Placed<'_>> = Vec::new();
+        for one in placed {
+            let is_near = kept.last().is_some_and(|last| {
+                order(last) == order(&one)
+                    && one.place.station_m - last.place.station_m < self.every - 1e-6
+            });
+            if !is_near {
+                kept.push(one);
+            }
+        }
+        let bar = progress::count("storing");
+        bar.set_length(kept.len() as u64);
+        let mut views = Vec::with_capacity(kept.len());
+        for one in kept {
+            let about = || format!("image {}", one.image.name);
+            let (camera, image) = self.store(commit, manifest, one.image).with_context(about)?;
+            views.push(RecordedView {
+                trajectory: one.trajectory.name.clone(),
+                station_m: one.place.station_m,
+                camera_name: one.camera_name,
+                camera,
+                world_from_camera: one.alignment.pose(&one.image.world_from_camera),
+                exposure_stops: None,
+                image,
+            });
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        Ok(views)
+    }
+
+    /// Stores an image in its size. Returns its camera then.
+    fn store(
+        &self,
+        commit: &mut Commit,
+        manifest: &Manifest,
+        image: &RealImage,
+    ) -> anyhow::Result<(Camera, ObjectRef)> {
+        let background = manifest.profile.background;
+        let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
+        let [width, height] = [camera.width_px, camera.height_px];
+        let longest = width.max(height);
+        if longest > self.side {
+            let scaled = |side: u32| {
+                let side = f64::from(side) * f64::from(self.side) / f64::from(longest);
+                (side.round() as u32).max(1)
+            };
+            let small = [scaled(width), scaled(height)];
+            camera = camera.scaled(small[0].into(), small[1].into())?;
+            camera.native_size_px = None;
+            let large = RgbImage::from_raw(width, height, rgb8);
+            let large = large.context("an image has 3 bytes per pixel")?;
+            rgb8 = imageops::resize(&large, small[0], small[1], FilterType::Lanczos3).into_raw();
+        }
+        let file = wildcity_session::jpeg(&rgb8, camera.width_px, camera.height_px, self.quality);
+        Ok((camera, commit.put_image(&file.map_err(anyhow::Error::msg)?)?))
+    }
+}
+
+/// The camera of each image: its folder if the images are in several folders, else its file name without the digits at
+/// its end.
+fn camera_names(images: &[&RealImage]) -> Vec<String> {
+    let folder = |image: &RealImage| Path::new(&image.name).parent().map(Path::to_owned);
+    let folders: BTreeSet<Option<PathBuf>> = images.iter().map(|image| folder(image)).collect();
+    let name = |image: &&RealImage| {
+        let path = Path::new(&image.name);
+        let text = match folders.len() > 1 {
+            true => path.parent().and_then(Path::file_name),
+            false => path.file_stem(),
+        };
+        let text = text.unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        let ends_name = |c: char| c.is_ascii_digit() || "._-".contains(c);
+        let text = if folders.len() > 1 { &*text } else { text.trim_end_matches(ends_name) };
+        let allowed = |c: char| if c.is_ascii_alphanumeric() || "_-".contains(c) { c } else { '_' };
+        let text: String = text.chars().map(allowed).collect();
+        if is_name(&text) { text } else { "camera".to_owned() }
+    };
+    images.iter().map(name).collect()
+}
+
+/// A distance in metres, with or without its unit.
+fn metres(text: &str) -> Result<f64, String> {
+    let number: f64 = text
+        .strip_suffix('m')
+        .unwrap_or(text)
+        .trim()
+        .parse()
+        .map_err(|_| "expected metres, such as 2 or 2m".to_owned())?;
+    match (0.0..=1000.0).contains(&number) {
+        true => Ok(number),
+        false => Err("expected 0 to 1000 m".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use wildcity_scene::geometry::Pose;
+    use wildcity_scene::geometry::camera::Pinhole;
+
+    fn named(names: &[&str]) -> Vec<String> {
+        let pinhole = Pinhole { fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0 };
+        let image = |name: &&str| RealImage {
+            name: (*name).to_owned(),
+            file: PathBuf::new(),
+            mask: None,
+            camera: Camera::from_pinhole(2, 2, pinhole),
+            world_from_camera: Pose::IDENTITY,
+            near: None,
+        };
+        let images: Vec<RealImage> = names.iter().map(image).collect();
+        camera_names(&images.iter().collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn cameras_are_named_by_folder_or_file() {
+        assert_eq!(named(&["images/front/1.png", "images/Left 2/1.png"]), ["front", "left_2"]);
+        assert_eq!(named(&["images/front_0001.jpg", "images/rear_0001.jpg"]), ["front", "rear"]);
+        assert_eq!(named(&["0001.jpg", "0002.jpg"]), ["camera", "camera"]);
+    }
+
+    #[test]
+    fn distances_have_an_optional_unit() {
+        assert_eq!(metres("2m"), Ok(2.0));
+        assert_eq!(metres("0.5"), Ok(0.5));
+        assert!(metres("-1").is_err() && metres("two").is_err());
+    }
+}

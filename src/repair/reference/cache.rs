@@ -1,0 +1,83 @@
+//! References in memory, up to a number of bytes: the least recently used go first.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::Reference;
+
+/// Bytes of references in memory unless a program says otherwise: 80 images of 1440 x 928 px.
+pub const DEFAULT_BYTES: u64 = 512 << 20;
+
+/// A hash of all that a reference depends on.
+pub type ReferenceKey = [u8; 32];
+
+/// References that sessions share. A reference that is in use stays in memory until its last user drops it.
+#[derive(Debug)]
+pub struct ReferenceCache {
+    limit_bytes: u64,
+    state: Mutex<State>,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    entries: HashMap<ReferenceKey, Entry>,
+    bytes: u64,
+    /// Counts uses.
+    clock: u64,
+}
+
+#[derive(Debug)]
+struct Entry {
+    reference: Arc<Reference>,
+    used: u64,
+}
+
+impl Default for ReferenceCache {
+    fn default() -> Self {
+        Self::new(DEFAULT_BYTES)
+    }
+}
+
+impl ReferenceCache {
+    /// A cache of at most so many bytes.
+    pub fn new(limit_bytes: u64) -> Self {
+        Self { limit_bytes, state: Mutex::default() }
+    }
+
+    /// A reference, if it is in memory.
+    pub fn get(&self, key: &ReferenceKey) -> Option<Arc<Reference>> {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.clock += 1;
+        let used = state.clock;
+        let entry = state.entries.get_mut(key)?;
+        entry.used = used;
+        Some(Arc::clone(&entry.reference))
+    }
+
+    /// Keeps a reference, and forgets others until all fit. One that is larger than the cache is not kept.
+    pub fn insert(&self, key: ReferenceKey, reference: Arc<Reference>) {
+        let bytes = reference.bytes();
+        if bytes > self.limit_bytes {
+            return;
+        }
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        state.clock += 1;
+        let used = state.clock;
+        if let Some(before) = state.entries.insert(key, Entry { reference, used }) {
+            state.bytes -= before.reference.bytes();
+        }
+        state.bytes += bytes;
+        while state.bytes > self.limit_bytes {
+            let oldest = state.entries.iter().min_by_key(|(_, entry)| entry.used);
+            let Some(key) = oldest.map(|(key, _)| *key) else { break };
+            let removed = state.entries.remove(&key).map_or(0, |entry| entry.reference.bytes());
+            state.bytes -= removed;
+        }
+    }
+
+    /// References in memory, and their bytes.
+    pub fn held(&self) -> (usize, u64) {
+        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        (state.entries.len(), state.bytes)
+    }
+}

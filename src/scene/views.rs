@@ -1,0 +1,198 @@
+//! Recorded images of a twin: what the cameras really saw along its drives.
+//!
+//! A manifest names a *table* of them, which is JSON and an object of its own, and the table names each image, a JPEG or
+//! PNG that is an object as well. Images are read when a repair model needs them ([`Manifest::views`]).
+//!
+//! [`Manifest::views`]: crate::Manifest::views
+
+use serde::{Deserialize, Serialize};
+
+use super::manifest::ObjectRef;
+use super::rig::is_name;
+use crate::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
+use crate::geometry::{Camera, CameraError, Pose};
+
+/// An image that a camera took on a recorded drive.
+///
+/// JSON: `{"trajectory", "station_m", "camera", "width", "height", "fx", "fy", "cx", "cy", "world_from_camera":
+/// {"xyz", "q"}, "image": {"object", "bytes"}}` and, as in rig files, `lens`, `windshield` and `native_size`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "ViewFields", into = "ViewFields")]
+pub struct RecordedView {
+    /// The drive, by its name.
+    pub trajectory: String,
+    /// Where along the drive it was taken, in metres from its start.
+    pub station_m: f64,
+    /// Name of the camera, `[a-z0-9._-]+`.
+    pub camera_name: String,
+    /// Size, intrinsics and lens of the stored image.
+    pub camera: Camera,
+    /// Pose of the camera in the world.
+    pub world_from_camera: Pose,
+    /// The exposure of the image in stops against the twin's, if that is known.
+    pub exposure_stops: Option<f64>,
+    /// The JPEG or PNG.
+    pub image: ObjectRef,
+}
+
+/// Why a table of recorded images was refused.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ViewError {
+    /// A name is empty, too long, or has other characters than `[a-z0-9._-]`.
+    #[error("{field} {name:?} is not a name: 1 to 64 of a-z 0-9 . _ -, not beginning with .")]
+    Name {
+        /// `camera` or `trajectory`.
+        field: &'static str,
+        /// The refused name.
+        name: String,
+    },
+    /// A number is not finite.
+    #[error("{field} is {value:?}; give a finite number")]
+    Number {
+        /// `station_m` or `exposure_stops`.
+        field: &'static str,
+        /// The refused value.
+        value: f64,
+    },
+    /// The camera cannot be used.
+    #[error("camera {name:?}: {cause}")]
+    Camera {
+        /// Its name.
+        name: String,
+        /// Why.
+        cause: CameraError,
+    },
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ViewFields {
+    trajectory: String,
+    station_m: f64,
+    camera: String,
+    width: u32,
+    height: u32,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    fx: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    fy: Option<f64>,
+    cx: f64,
+    cy: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    lens: Option<LensFields>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    windshield: Option<WindshieldFields>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    native_size: Option<[f64; 2]>,
+    world_from_camera: Pose,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    exposure_stops: Option<f64>,
+    image: ObjectRef,
+}
+
+impl RecordedView {
+    /// Checks names, numbers and the camera.
+    ///
+    /// # Errors
+    /// Names the first field that cannot be used.
+    pub fn check(&self) -> Result<(), ViewError> {
+        for (field, name) in [("trajectory", &self.trajectory), ("camera", &self.camera_name)] {
+            if !is_name(name) {
+                return Err(ViewError::Name { field, name: name.clone() });
+            }
+        }
+        let numbers =
+            [("station_m", Some(self.station_m)), ("exposure_stops", self.exposure_stops)];
+        for (field, value) in numbers {
+            if let Some(value) = value.filter(|value| !value.is_finite()) {
+                return Err(ViewError::Number { field, value });
+            }
+        }
+        let wrong = |cause| ViewError::Camera { name: self.camera_name.clone(), cause };
+        self.camera.check().map_err(wrong)
+    }
+}
+
+impl From<RecordedView> for ViewFields {
+    fn from(from: RecordedView) -> Self {
+        let Intrinsics { size_px, focal_px, center_px, lens, windshield, native_size_px } =
+            Intrinsics::of(&from.camera);
+        let [width, height] = size_px;
+        let [fx, fy] = focal_px;
+        let [cx, cy] = center_px;
+        Self {
+            trajectory: from.trajectory,
+            station_m: from.station_m,
+            camera: from.camera_name,
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+            lens,
+            windshield,
+            native_size: native_size_px,
+            world_from_camera: from.world_from_camera,
+            exposure_stops: from.exposure_stops,
+            image: from.image,
+        }
+    }
+}
+
+impl TryFrom<ViewFields> for RecordedView {
+    type Error = ViewError;
+
+    fn try_from(fields: ViewFields) -> Result<Self, ViewError> {
+        let intrinsics = Intrinsics {
+            size_px: [fields.width, fields.height],
+            focal_px: [fields.fx, fields.fy],
+            center_px: [fields.cx, fields.cy],
+            lens: fields.lens,
+            windshield: fields.windshield,
+            native_size_px: fields.native_size,
+        };
+        let camera = intrinsics.camera();
+        let camera =
+            camera.map_err(|cause| ViewError::Camera { name: fields.camera.clone(), cause })?;
+        let view = Self {
+            trajectory: fields.trajectory,
+            station_m: fields.station_m,
+            camera_name: fields.camera,
+            camera,
+            world_from_camera: fields.world_from_camera,
+            exposure_stops: fields.exposure_stops,
+            image: fields.image,
+        };
+        view.check()?;
+        Ok(view)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::Pinhole;
+
+    #[test]
+    fn a_view_is_read_as_it_was_written_and_checked() {
+        let pinhole = Pinhole { fx: 100.0, fy: 101.0, cx: 50.0, cy: 40.0 };
+        let view = RecordedView {
+            trajectory: "log".into(),
+            station_m: 12.5,
+            camera_name: "front".into(),
+            camera: Camera::from_pinhole(100, 80, pinhole),
+            world_from_camera: Pose::IDENTITY,
+            exposure_stops: None,
+            image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+        };
+        let text = serde_json::to_string(&view).unwrap();
+        assert_eq!(serde_json::from_str::<RecordedView>(&text).unwrap(), view);
+        let renamed = text.replace("\"front\"", "\"Front camera\"");
+        let error = serde_json::from_str::<RecordedView>(&renamed).unwrap_err();
+        assert!(error.to_string().contains("camera \"Front camera\""), "{error}");
+        let flat = text.replace("\"height\":80", "\"height\":0");
+        let error = serde_json::from_str::<RecordedView>(&flat).unwrap_err();
+        assert!(error.to_string().contains("height"), "{error}");
+    }
+}

@@ -1,0 +1,176 @@
+//! References in memory: recorded images with the depth that the twin has there, and what a view sees of them.
+
+use std::sync::{Arc, OnceLock};
+
+use image::{ImageReader, Limits};
+
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_repair::Image;
+use wildcity_repair::reference::{
+    LEAST_OPACITY, Projection, Rays, Reference, WarpTarget, opaque_depth, overlaps, resized, warp,
+};
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{RenderProfile, Scene};
+use wildcity_twin::store::{Catalog, StoreError, Version};
+
+use super::references::ReferenceView;
+use super::rendered_image::RenderedImage;
+
+/// Most names of references that are told of an image.
+pub(crate) const TOLD: usize = 8;
+
+/// The rays of some cameras, each computed when it is first needed.
+#[derive(Debug, Default)]
+pub(crate) struct CameraRays(Vec<OnceLock<Rays>>);
+
+/// What the model gets beside an image.
+#[derive(Debug, Default)]
+pub(crate) struct Beside {
+    /// For the roles `reference_warped` and `reference_valid`.
+    pub(crate) warped: Option<(Image, Vec<f32>)>,
+    /// For the role `reference`, in the size of the image.
+    pub(crate) reference: Option<Image>,
+    /// Name of that one.
+    pub(crate) nearest: Option<String>,
+    /// The names of those that gave something, the most pixels first.
+    pub(crate) names: Vec<String>,
+}
+
+/// An image that may be repaired, as the search for its references sees it.
+pub(crate) struct Sight<'a> {
+    pub(crate) camera: &'a RigCamera,
+    pub(crate) rays: &'a Rays,
+    pub(crate) view: &'a View,
+    pub(crate) image: &'a RenderedImage,
+}
+
+impl Beside {
+    /// Adds the image of the role `reference`, in the size of a camera's images.
+    pub(crate) fn set_reference(&mut self, name: &str, reference: &Reference, camera: &Camera) {
+        let [width, height] = [camera.width_px, camera.height_px].map(|side| side as usize);
+        self.reference = Some(resized(&reference.image, width, height));
+        self.nearest = Some(name.to_owned());
+        self.names.push(name.to_owned());
+    }
+}
+
+impl CameraRays {
+    pub(crate) fn new(cameras: usize) -> Self {
+        Self((0..cameras).map(|_| OnceLock::new()).collect())
+    }
+
+    /// The rays of a camera, by its index.
+    pub(crate) fn of(&self, index: usize, camera: &RigCamera) -> &Rays {
+        self.0[index].get_or_init(|| Rays::of(&camera.camera))
+    }
+}
+
+impl Sight<'_> {
+    /// Its depth where it is opaque.
+    pub(crate) fn depth_m(&self) -> Vec<f32> {
+        opaque_depth(&self.image.depth_m, &self.image.opacity)
+    }
+
+    fn target<'a>(&'a self, depth_m: &'a [f32]) -> WarpTarget<'a> {
+        let shutter = self.view.rolling_shutter.as_ref();
+        WarpTarget {
+            camera: &self.camera.camera,
+            rays: self.rays,
+            world_from_camera: self.view.world_from_camera,
+            shutter: shutter.map(|shutter| (shutter.direction, shutter.world_from_camera_first)),
+            depth_m,
+        }
+    }
+
+    /// Those of some references that overlap with it.
+    pub(crate) fn overlapping(&self, references: Vec<ReferenceView>) -> Vec<ReferenceView> {
+        let depth_m = self.depth_m();
+        let target = self.target(&depth_m);
+        let is_seen =
+            |view: &ReferenceView| overlaps(&target, &view.camera, &view.world_from_camera);
+        references.into_iter().filter(is_seen).collect()
+    }
+
+    /// Brings references, with their names, into it.
+    pub(crate) fn warped(&self, references: &[(String, Arc<Reference>)], beside: &mut Beside) {
+        let depth_m = self.depth_m();
+        let images: Vec<Arc<Reference>> =
+            references.iter().map(|(_, reference)| reference.clone()).collect();
+        let warped = warp(&self.target(&depth_m), &images);
+        let mut used: Vec<(usize, &String)> =
+            warped.pixels.iter().copied().zip(references.iter().map(|(name, _)| name)).collect();
+        used.retain(|(pixels, _)| *pixels > 0);
+        used.sort_by(|(a, _), (b, _)| b.cmp(a));
+        let left = TOLD.saturating_sub(beside.names.len());
+        beside.names.extend(used.into_iter().take(left).map(|(_, name)| name.clone()));
+        beside.warped = Some((warped.image, warped.valid));
+    }
+}
+
+/// Reads the recorded image of a reference; `None` if it has none. Blocks.
+///
+/// # Errors
+/// The image cannot be read, or is not one of its camera's size.
+pub(crate) fn read(
+    catalog: &Catalog,
+    version: &Version,
+    view: &ReferenceView,
+) -> Result<Option<Image>, StoreError> {
+    let Some(recorded) = &view.recorded else { return Ok(None) };
+    let bytes = catalog.view_image(version, recorded)?;
+    let damaged = |reason: String| StoreError::Damaged {
+        path: format!("recorded image {} ({})", view.name, recorded.image.object).into(),
+        reason,
+    };
+    let mut reader = ImageReader::new(std::io::Cursor::new(&bytes));
+    let mut limits = Limits::default();
+    limits.max_image_width = Some(view.camera.width_px);
+    limits.max_image_height = Some(view.camera.height_px);
+    reader.limits(limits);
+    let reader = reader.with_guessed_format().map_err(|error| damaged(error.to_string()))?;
+    let image = reader.decode().map_err(|error| damaged(error.to_string()))?.into_rgb8();
+    let [width, height] = [view.camera.width_px, view.camera.height_px];
+    if [image.width(), image.height()] != [width, height] {
+        let [w, h] = [image.width(), image.height()];
+        return Err(damaged(format!("it has {w} x {h} px; its camera has {width} x {height}")));
+    }
+    let [width, height] = [width as usize, height as usize];
+    Ok(Some(Image { width, height, rgb8: image.into_raw() }))
+}
+
+/// Draws the depth of a reference, and its pixels if it has no recorded ones.
+pub(crate) fn draw(
+    view: &ReferenceView,
+    recorded: Option<Image>,
+    projection: Arc<Projection>,
+    scene: &Scene,
+    profile: &RenderProfile,
+    backend: &dyn Backend,
+) -> Result<Reference, RenderError> {
+    let pixels = view.camera.pixels();
+    let views = [view.view()];
+    let mut depth_m = vec![0.0; pixels];
+    let mut opacity = vec![0.0; pixels];
+    let is_drawn = recorded.is_none();
+    let mut image = recorded.unwrap_or_else(|| Image {
+        width: view.camera.width_px as usize,
+        height: view.camera.height_px as usize,
+        rgb8: vec![0; 3 * pixels],
+    });
+    let target = Target {
+        rgb8: is_drawn.then_some(&mut image.rgb8[..]),
+        depth_m: Some(&mut depth_m),
+        opacity: Some(&mut opacity),
+        appearance: is_drawn.then_some(&view.appearance),
+        ..Target::default()
+    };
+    backend.render(&Frame { scene, profile, views: &views }, &mut [target], &|_, _| {})?;
+    for (depth_m, opacity) in depth_m.iter_mut().zip(&opacity) {
+        if *opacity < LEAST_OPACITY {
+            *depth_m = 0.0;
+        }
+    }
+    let world_from_camera = view.world_from_camera;
+    Ok(Reference { image, depth_m, projection, world_from_camera })
+}

@@ -1,0 +1,319 @@
+//! Which recorded images lie beside a view.
+//!
+//! The place of the rig along the nearest drive decides. For a warp these are five places from 8 m behind it to 2 m ahead,
+//! each with all cameras whose images overlap with the view. Those behind count more, since what lies ahead was seen from
+//! there. For the role `reference` it is the nearest image of the same camera that looks in about the same direction.
+//!
+//! A twin with recorded images has them at any stations. For a twin without, the twin itself is drawn every
+//! [`STEP_M`] on its drive, with the session's cameras: nothing new in it, but the twin is right there, and wrong
+//! beside the drive.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use glam::DVec3;
+
+use wildcity_render::View;
+use wildcity_repair::reference::{Projection, ReferenceKey};
+use wildcity_scene::appearance::Appearance;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::views::RecordedView;
+use wildcity_twin::store::Version;
+
+/// Places along the drive, from the rig's, in metres.
+const OFFSETS_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
+
+/// An image is at a place if it is at most so far from it, in metres.
+const WITHIN_M: f64 = 1.5;
+
+/// Distance between the places where a twin without recorded images is drawn, in metres.
+const STEP_M: f64 = 2.0;
+
+/// Largest distance of a `reference` along the drive, in metres.
+const REFERENCE_WITHIN_M: f64 = 30.0;
+
+/// Largest angle between the axes of a camera and of its `reference`: 30°.
+const REFERENCE_RAD: f64 = std::f64::consts::PI / 6.0;
+
+/// A `reference` is kept until another one is so much nearer, in metres: a change would be seen as flicker.
+const KEPT_M: f64 = 0.5;
+
+/// Most tables of lenses that a version keeps, 2 MB each. A rig has a few cameras.
+const PROJECTIONS: usize = 64;
+
+/// What a repair model compares images with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ReferenceSource {
+    /// Recorded images of the twin.
+    Recorded,
+    /// The twin has none: images of the twin itself, drawn on its recorded drive.
+    Rendered,
+}
+
+/// An image beside a view, before it is read or drawn.
+#[derive(Clone, Debug)]
+pub(crate) struct ReferenceView {
+    /// The drive, the station in metres, and the camera: `log@12.50/front`.
+    pub(crate) name: String,
+    pub(crate) camera: Camera,
+    /// Of a drawn image; without overlay.
+    pub(crate) appearance: Appearance,
+    pub(crate) world_from_camera: Pose,
+    /// The recorded image, unless it is drawn.
+    pub(crate) recorded: Option<Arc<RecordedView>>,
+    station_m: f64,
+}
+
+/// The images beside the views of a version of a twin.
+#[derive(Debug)]
+pub(crate) struct ReferenceViews {
+    version: Arc<Version>,
+    drives: Vec<Drive>,
+    /// The cameras that the twin is drawn with if it has no recorded images.
+    cameras: Vec<RigCamera>,
+    source: ReferenceSource,
+    /// Tables of lenses, which take some milliseconds each.
+    projections: Mutex<Vec<(Camera, Arc<Projection>)>>,
+}
+
+/// A drive with its recorded images.
+#[derive(Debug)]
+struct Drive {
+    /// Among the trajectories of the version.
+    index: usize,
+    length_m: f64,
+    /// By camera, in the order of the table: its images by their stations.
+    cameras: Vec<(String, Vec<Arc<RecordedView>>)>,
+}
+
+/// A place on a drive.
+struct Place<'a> {
+    drive: &'a Drive,
+    station_m: f64,
+}
+
+impl ReferenceView {
+    /// A hash of all that its reference depends on.
+    pub(crate) fn key(&self, version_hash: &str, profile_hash: &blake3::Hash) -> ReferenceKey {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(version_hash.as_bytes()).update(profile_hash.as_bytes());
+        let image = self.recorded.as_ref().map(|view| &view.image.object);
+        let Self { name, camera, world_from_camera, .. } = self;
+        let exposure = &self.appearance.exposure;
+        let text = format!("{name} {camera:?} {world_from_camera:?} {image:?} {exposure:?}");
+        *hasher.update(text.as_bytes()).finalize().as_bytes()
+    }
+
+    /// How it is drawn.
+    pub(crate) fn view(&self) -> View {
+        View::new(self.camera, self.world_from_camera)
+    }
+
+    /// Angle between its axis and that of another camera, in radians.
+    fn angle_rad(&self, world_from_camera: &Pose) -> f64 {
+        let axis = |pose: &Pose| pose.rotation * DVec3::Z;
+        axis(&self.world_from_camera).angle_between(axis(world_from_camera))
+    }
+}
+
+impl ReferenceViews {
+    /// Those of a version with a table of recorded images, which may be empty: then the twin is drawn with some cameras.
+    /// `None` without a recorded drive.
+    pub(crate) fn of(
+        version: Arc<Version>,
+        table: Vec<RecordedView>,
+        cameras: &[RigCamera],
+    ) -> Option<Self> {
+        let source = match table.is_empty() {
+            true => ReferenceSource::Rendered,
+            false => ReferenceSource::Recorded,
+        };
+        let drawn_with = |camera: &RigCamera| {
+            let exposure = camera.appearance.exposure;
+            let appearance = Appearance { exposure, overlay: None };
+            RigCamera { appearance, shutter: None, ..camera.clone() }
+        };
+        let trajectories = &version.manifest.trajectories;
+        let mut drives: Vec<Drive> = Vec::with_capacity(trajectories.len());
+        for (index, trajectory) in trajectories.iter().enumerate() {
+            let length_m = trajectory.length_m();
+            drives.push(Drive { index, length_m, cameras: Vec::new() });
+        }
+        for view in table {
+            let of = trajectories.iter().position(|drive| drive.name == view.trajectory);
+            let Some(drive) = of.and_then(|index| drives.get_mut(index)) else { continue };
+            let at = drive.cameras.iter().position(|(name, _)| *name == view.camera_name);
+            let at = at.unwrap_or_else(|| {
+                drive.cameras.push((view.camera_name.clone(), Vec::new()));
+                drive.cameras.len() - 1
+            });
+            drive.cameras[at].1.push(Arc::new(view));
+        }
+        for (_, views) in drives.iter_mut().flat_map(|drive| &mut drive.cameras) {
+            views.sort_by(|a, b| a.station_m.total_cmp(&b.station_m));
+        }
+        if source == ReferenceSource::Recorded {
+            drives.retain(|drive| !drive.cameras.is_empty());
+        }
+        let cameras = cameras.iter().map(drawn_with).collect();
+        let projections = Mutex::default();
+        (!drives.is_empty()).then_some(Self { version, drives, cameras, source, projections })
+    }
+
+    /// Where the images come from.
+    pub(crate) fn source(&self) -> ReferenceSource {
+        self.source
+    }
+
+    /// Whether there is an image of a camera.
+    pub(crate) fn has_camera(&self, name: &str) -> bool {
+        match self.source {
+            ReferenceSource::Recorded => {
+                self.drives.iter().flat_map(|drive| &drive.cameras).any(|(own, _)| own == name)
+            }
+            ReferenceSource::Rendered => self.cameras.iter().any(|camera| camera.name == name),
+        }
+    }
+
+    /// The images to bring into a view of a rig, place by place, camera by camera.
+    pub(crate) fn around(&self, world_from_rig: &Pose) -> Vec<ReferenceView> {
+        let Some(place) = self.place(world_from_rig.position_m) else { return Vec::new() };
+        let mut around: Vec<ReferenceView> = Vec::new();
+        for offset_m in OFFSETS_M {
+            let wanted_m = place.station_m + offset_m;
+            let is_near = |view: &ReferenceView| (view.station_m - wanted_m).abs() <= WITHIN_M;
+            for view in self.at(&place, wanted_m).into_iter().filter(is_near) {
+                if around.iter().all(|other| other.name != view.name) {
+                    around.push(view);
+                }
+            }
+        }
+        around
+    }
+
+    /// The image for the role `reference`: of the same camera, nearest along the drive among those that look in the
+    /// same direction within 30°. The one that was used before, by its name, stays until another is 0.5 m nearer.
+    pub(crate) fn nearest(
+        &self,
+        camera: &str,
+        world_from_camera: &Pose,
+        world_from_rig: &Pose,
+        kept: Option<&str>,
+    ) -> Option<ReferenceView> {
+        let place = self.place(world_from_rig.position_m)?;
+        let distance_m = |view: &ReferenceView| (view.station_m - place.station_m).abs();
+        let fits = |view: &ReferenceView| {
+            distance_m(view) <= REFERENCE_WITHIN_M
+                && view.angle_rad(world_from_camera) <= REFERENCE_RAD
+        };
+        let all: Vec<ReferenceView> =
+            self.of_camera(&place, camera).into_iter().filter(fits).collect();
+        let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
+        let kept = all.iter().find(|view| Some(&*view.name) == kept);
+        let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < KEPT_M);
+        Some(kept.unwrap_or(nearest).clone())
+    }
+
+    /// How a camera projects.
+    pub(crate) fn projection(&self, camera: &Camera) -> Arc<Projection> {
+        let lock = || self.projections.lock().unwrap_or_else(PoisonError::into_inner);
+        let find = |all: &[(Camera, Arc<Projection>)]| {
+            all.iter().find(|(own, _)| own == camera).map(|(_, projection)| projection.clone())
+        };
+        if let Some(known) = find(&lock()) {
+            return known;
+        }
+        let projection = Arc::new(Projection::of(camera));
+        let mut all = lock();
+        if all.len() < PROJECTIONS {
+            all.push((*camera, projection.clone()));
+        }
+        projection
+    }
+
+    /// The place of a point: that of the nearest drive, and where along it.
+    fn place(&self, point_m: DVec3) -> Option<Place<'_>> {
+        let trajectories = &self.version.manifest.trajectories;
+        let places =
+            self.drives.iter().map(|drive| (trajectories[drive.index].nearest(point_m), drive));
+        let nearest = places.min_by(|(a, _), (b, _)| a.distance_m.total_cmp(&b.distance_m));
+        nearest.map(|(place, drive)| Place { drive, station_m: place.station_m })
+    }
+
+    /// For each camera the image nearest to a station, in metres.
+    fn at(&self, place: &Place<'_>, station_m: f64) -> Vec<ReferenceView> {
+        match self.source {
+            ReferenceSource::Recorded => {
+                let nearest = |(_, views): &(String, Vec<Arc<RecordedView>>)| {
+                    let distance_m = |view: &&Arc<RecordedView>| (view.station_m - station_m).abs();
+                    // The first of equals: the lower station.
+                    let nearest =
+                        views.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)));
+                    nearest.map(recorded)
+                };
+                place.drive.cameras.iter().filter_map(nearest).collect()
+            }
+            ReferenceSource::Rendered => {
+                let step = self.step(place.drive, station_m);
+                let drawn = |camera| self.drawn(place.drive, step, camera);
+                self.cameras.iter().map(drawn).collect()
+            }
+        }
+    }
+
+    /// The images of a camera around a place.
+    fn of_camera(&self, place: &Place<'_>, camera: &str) -> Vec<ReferenceView> {
+        match self.source {
+            ReferenceSource::Recorded => {
+                let of = place.drive.cameras.iter().filter(|(name, _)| name == camera);
+                of.flat_map(|(_, views)| views).map(recorded).collect()
+            }
+            ReferenceSource::Rendered => {
+                let around = (REFERENCE_WITHIN_M / STEP_M) as usize;
+                let middle = self.step(place.drive, place.station_m);
+                let of: Vec<&RigCamera> =
+                    self.cameras.iter().filter(|own| own.name == camera).collect();
+                let most = self.step(place.drive, f64::INFINITY);
+                (middle.saturating_sub(around)..=(middle + around).min(most))
+                    .flat_map(|step| of.iter().map(move |camera| (step, *camera)))
+                    .map(|(step, camera)| self.drawn(place.drive, step, camera))
+                    .collect()
+            }
+        }
+    }
+
+    /// The nearest step of a drive at which the twin is drawn; the lower of two equally near ones.
+    fn step(&self, drive: &Drive, station_m: f64) -> usize {
+        let last = (drive.length_m / STEP_M).floor();
+        (station_m / STEP_M - 0.5).ceil().clamp(0.0, last) as usize
+    }
+
+    fn drawn(&self, drive: &Drive, step: usize, camera: &RigCamera) -> ReferenceView {
+        let station_m = step as f64 * STEP_M;
+        let trajectory = &self.version.manifest.trajectories[drive.index];
+        let world_from_rig = trajectory.at_station(station_m);
+        ReferenceView {
+            name: name(&trajectory.name, station_m, &camera.name),
+            camera: camera.camera,
+            appearance: camera.appearance.clone(),
+            world_from_camera: world_from_rig * camera.rig_from_camera,
+            recorded: None,
+            station_m,
+        }
+    }
+}
+
+fn recorded(view: &Arc<RecordedView>) -> ReferenceView {
+    ReferenceView {
+        name: name(&view.trajectory, view.station_m, &view.camera_name),
+        camera: view.camera,
+        appearance: Appearance::default(),
+        world_from_camera: view.world_from_camera,
+        recorded: Some(view.clone()),
+        station_m: view.station_m,
+    }
+}
+
+fn name(trajectory: &str, station_m: f64, camera: &str) -> String {
+    format!("{trajectory}@{station_m:.2}/{camera}")
+}

@@ -1,0 +1,100 @@
+//! The recorded images of a version: a table, and an object for each image. Versions share both.
+
+use std::collections::BTreeSet;
+
+use wildcity_scene::Manifest;
+use wildcity_scene::align::Alignment;
+use wildcity_scene::manifest::{ObjectRef, ViewsRef};
+use wildcity_scene::views::RecordedView;
+
+use super::layout::is_hash;
+use super::{Catalog, Commit, StoreError, Version};
+use crate::limits;
+
+impl Commit {
+    /// Writes an image, a JPEG or PNG, which [`Commit::put_views`] then names.
+    ///
+    /// # Errors
+    /// [`StoreError::ViewSize`], or it cannot be written.
+    pub fn put_image(&mut self, bytes: &[u8]) -> Result<ObjectRef, StoreError> {
+        check_size("image", bytes.len() as u64, limits::VIEW_IMAGE_BYTES)?;
+        self.put_object(bytes)
+    }
+
+    /// Writes the table of a version's recorded images. The version has them once a change or settings name the
+    /// result.
+    ///
+    /// # Errors
+    /// [`StoreError::ViewSize`], or it cannot be written.
+    pub fn put_views(&mut self, views: &[RecordedView]) -> Result<ViewsRef, StoreError> {
+        let table = self.catalog().encode(&views)?;
+        check_size("table", table.len() as u64, limits::VIEWS_TABLE_BYTES)?;
+        let ObjectRef { object, bytes } = self.put_object(&table)?;
+        Ok(ViewsRef {
+            object,
+            bytes,
+            images: views.len() as u64,
+            image_bytes: views.iter().map(|view| view.image.bytes).sum(),
+        })
+    }
+}
+
+impl Catalog {
+    /// The recorded images of a version, in the order of their table; none if it has none. Images are not read.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if the table differs from what was committed.
+    pub fn views(&self, version: &Version) -> Result<Vec<RecordedView>, StoreError> {
+        self.views_of(&version.manifest)
+    }
+
+    /// Reads a recorded image, and compares it with its hash. Through the disk cache, if there is one.
+    ///
+    /// # Errors
+    /// [`StoreError::Damaged`] if it differs from what was committed.
+    pub fn view_image(
+        &self,
+        version: &Version,
+        view: &RecordedView,
+    ) -> Result<Vec<u8>, StoreError> {
+        let twin = &version.manifest.twin;
+        self.objects.read_object(twin, &view.image.object, limits::VIEW_IMAGE_BYTES)
+    }
+
+    pub(super) fn views_of(&self, manifest: &Manifest) -> Result<Vec<RecordedView>, StoreError> {
+        let Some(named) = &manifest.views else { return Ok(Vec::new()) };
+        let twin = &manifest.twin;
+        let bytes = self.objects.read_object(twin, &named.object, limits::VIEWS_TABLE_BYTES)?;
+        let damaged = |reason: String| StoreError::Damaged {
+            path: self.objects.object_path(twin, &named.object),
+            reason,
+        };
+        let views: Vec<RecordedView> =
+            serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
+        match views.iter().find(|view| !is_hash(&view.image.object)) {
+            Some(view) => Err(damaged(format!("{:?} is not a hash", view.image.object))),
+            None => Ok(views),
+        }
+    }
+
+    /// The objects of a manifest's recorded images: the table and each image.
+    pub(super) fn view_objects(&self, manifest: &Manifest) -> Result<BTreeSet<String>, StoreError> {
+        let images = self.views_of(manifest)?.into_iter().map(|view| view.image.object);
+        let table = manifest.views.iter().map(|views| views.object.clone());
+        Ok(images.chain(table).collect())
+    }
+}
+
+/// The views after the world was turned, moved and scaled.
+pub(super) fn aligned(views: &[RecordedView], alignment: &Alignment) -> Vec<RecordedView> {
+    let aligned = |view: &RecordedView| RecordedView {
+        world_from_camera: alignment.pose(&view.world_from_camera),
+        station_m: alignment.metres_per_unit * view.station_m,
+        ..view.clone()
+    };
+    views.iter().map(aligned).collect()
+}
+
+fn check_size(what: &'static str, bytes: u64, limit: u64) -> Result<(), StoreError> {
+    if bytes > limit { Err(StoreError::ViewSize { what, bytes, limit }) } else { Ok(()) }
+}

@@ -1,0 +1,84 @@
+//! `wildcity twin views`.
+
+use std::fs;
+use std::path::Path;
+
+use glam::DVec3;
+use image::{Rgb, RgbImage};
+use serde_json::json;
+use wildcity_scene::Trajectory;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::trajectory::Keyframe;
+use wildcity_twin::store::{Catalog, NewVersion};
+
+use crate::in_folder::{done, refused};
+use crate::scene_files::gaussians;
+
+const IDENTITY: [[f64; 3]; 3] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+
+/// Images every 0.5 m along x, of 200 x 100 px, each of one grey, and their camera list.
+fn capture(dir: &Path) {
+    fs::create_dir(dir.join("images")).unwrap();
+    let mut lines = String::new();
+    for at in 0..21_u8 {
+        let name = format!("images/Front-{at:03}.png");
+        RgbImage::from_pixel(200, 100, Rgb([10 * at; 3])).save(dir.join(&name)).unwrap();
+        let line = json!({"name": format!("f{at}"), "image": name, "width": 200, "height": 100, "fx": 150,
+            "fy": 150, "cx": 100, "cy": 50, "position": [0.5 * f64::from(at), 1.0, 2.0], "R_world_to_cam": IDENTITY});
+        lines += &format!("{line}\n");
+    }
+    fs::write(dir.join("list.jsonl"), lines).unwrap();
+}
+
+#[test]
+fn images_are_stored_scaled_along_the_drive_and_removed() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    capture(at);
+    let catalog = Catalog::open(&at.join("twins")).unwrap();
+    let scene = gaussians(100, 0, 10.0, 1);
+    let keyframe = |i: i64| Keyframe {
+        time_us: 100_000 * i,
+        world_from_rig: Pose { position_m: DVec3::X * i as f64, ..Pose::IDENTITY },
+    };
+    let log = Trajectory { name: "log".to_owned(), keyframes: (-3..20).map(keyframe).collect() };
+    let new = |name, trajectories| NewVersion {
+        trajectories,
+        ..NewVersion::of(name, &scene, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(new("street", vec![log]), &mut |_, _| {}).unwrap();
+    catalog.commit(new("bare", Vec::new()), &mut |_, _| {}).unwrap();
+    let views = |twin: &'static str| {
+        ["twin", "views", twin, "--twins", "twins", "--images", "list.jsonl", "--every", "2m"]
+    };
+    let said = done(at, &[&views("street")[..], &["--side", "100"]].concat());
+    assert!(said.starts_with("twin street version 2: 6 recorded images of 0.0 MB"), "{said}");
+
+    let version = catalog.version("street", None).unwrap();
+    let stored = catalog.views(&version).unwrap();
+    assert_eq!(stored.len(), 6);
+    for (index, view) in stored.iter().enumerate() {
+        // The drive begins 3 m before the first image.
+        assert!((view.station_m - (3.0 + 2.0 * index as f64)).abs() < 1e-9, "{view:?}");
+        assert_eq!((&*view.trajectory, &*view.camera_name), ("log", "front"));
+        let camera = &view.camera;
+        assert_eq!([camera.width_px, camera.height_px], [100, 50]);
+        assert_eq!((camera.pinhole.fx, camera.pinhole.cy), (75.0, 25.0));
+        let position_m = DVec3::new(2.0 * index as f64, 1.0, 2.0);
+        assert!(view.world_from_camera.position_m.distance(position_m) < 1e-9);
+        let bytes = catalog.view_image(&version, view).unwrap();
+        let image = image::load_from_memory(&bytes).unwrap().into_rgb8();
+        assert_eq!(image.dimensions(), (100, 50));
+        let grey = 40 * index as u8;
+        assert!(image.iter().all(|value| value.abs_diff(grey) <= 3), "{index}");
+    }
+    let said = done(at, &["inspect", "street", "--twins", "twins"]);
+    assert!(said.contains("views       6 recorded images"), "{said}");
+
+    let said = refused(at, &views("bare"));
+    assert!(said.contains("no recorded drive") && said.contains("wildcity twin drive"), "{said}");
+    let said = done(at, &["twin", "views", "street", "--twins", "twins", "--remove"]);
+    assert!(said.starts_with("twin street version 3: no recorded images"), "{said}");
+    assert_eq!(catalog.version("street", None).unwrap().manifest.views, None);
+}
