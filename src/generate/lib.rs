@@ -36,6 +36,7 @@ mod plants;
 mod random;
 mod road;
 mod route;
+mod spoil;
 mod street;
 mod surface;
 
@@ -43,6 +44,7 @@ pub use actors::{ACTOR_REVISION, ActorModel, actor_models};
 pub use canyon::canyon;
 pub use city::{Cell, City, city, city_drive, city_map};
 use serde::{Deserialize, Serialize};
+pub use spoil::Spoil;
 
 use wildcity_scene::{Gaussians, Trajectory};
 use wildcity_sim::map::MapFile;

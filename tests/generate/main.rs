@@ -8,6 +8,7 @@ mod city;
 mod drive;
 mod pictures;
 mod scenarios;
+mod spoil;
 
 use std::sync::LazyLock;
 

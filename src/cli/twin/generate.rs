@@ -8,7 +8,7 @@ use anyhow::Context;
 
 use crate::cli::directories::Twins;
 use crate::cli::{output, progress};
-use wildcity_generate::CitySettings;
+use wildcity_generate::{CitySettings, Spoil};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig};
 use wildcity_twin::store::{CommitKind, StorageOptions, VersionSettings};
@@ -41,6 +41,11 @@ pub(in crate::cli) struct Generate {
     #[arg(long, value_name = "M_PER_S", default_value_t = 10.0)]
     speed_m_s: f64,
 
+    /// Spoil the twin as captures are: nearly right on the recorded drive, wrong beside it; from 0 to 1. Colours
+    /// change with the direction, sheets hang in the air, some Gaussians are displaced, missing or needles.
+    #[arg(long, value_name = "AMOUNT")]
+    spoil: Option<f64>,
+
     /// Also write a map of the city to this file: lanes, crosswalks, intersections.
     #[arg(long, value_name = "FILE")]
     map: Option<PathBuf>,
@@ -59,6 +64,7 @@ on disk, including levels of detail:
 Examples:
   wildcity twin generate --twin town --length-km 1 --map town.map.json
   wildcity twin generate --twin city --length-km 20 --density 5
+  wildcity twin generate --twin worn --length-km 0.2 --density 2 --spoil 0.5
   wildcity render town --cameras views.json --out images";
 
 /// Bytes on disk per Gaussian of a city of low density, including levels of detail. Dense cities take fewer.
@@ -77,6 +83,9 @@ impl Generate {
             speed_m_s: self.speed_m_s,
         };
         let city = wildcity_generate::city(&settings)?;
+        let drive = wildcity_generate::city_drive(&settings)?;
+        let spoil = self.spoil.map(|amount| Spoil::new(amount, settings.seed, &drive));
+        let spoil = spoil.transpose()?;
         let catalog = self.twins.catalog()?;
         let gaussians = settings.gaussians();
         let is_on_disk = catalog.traffic().is_none();
@@ -90,19 +99,21 @@ impl Generate {
         let bar = progress::count("building");
         bar.set_length(gaussians);
         for cell in city {
-            commit.put(&cell.gaussians, None, &mut |_, _| {})?;
+            let spoiled = spoil.as_ref().map(|spoil| spoil.apply(&cell.gaussians));
+            commit.put(spoiled.as_ref().unwrap_or(&cell.gaussians), None, &mut |_, _| {})?;
             bar.inc(cell.gaussians.len() as u64);
         }
         let parts = VersionSettings {
             profile: RenderProfile { reach_m: Some(REACH_M), ..RenderProfile::default() },
             rig: Rig::preset("vehicle6"),
-            trajectories: vec![wildcity_generate::city_drive(&settings)?],
+            trajectories: vec![drive],
             sky: None,
             geo: None,
             provenance: Provenance::of(format!(
-                "city {}: {}",
+                "city {}: {}{}",
                 wildcity_generate::REVISION,
-                serde_json::to_string(&settings)?
+                serde_json::to_string(&settings)?,
+                self.spoil.map_or(String::new(), |amount| format!(", spoiled by {amount}"))
             )),
         };
         let version = commit.replace(None, parts)?;
