@@ -22,14 +22,15 @@ export function byId(id: string): HTMLElement {
   return element;
 }
 
-/** Line 2 of the bar: what the page shows, and how it is. */
-export function say(text: string, kind: "" | "good" | "bad" = ""): void {
+/** The status at the right of the bar. */
+export function showStatus(text: string, kind: "" | "good" | "bad" = ""): void {
   const state = byId("state");
   state.textContent = text;
   state.className = kind;
 }
 
-export function place(...children: Child[]): void {
+/** The title in the bar: what the page shows. */
+export function showTitle(...children: Child[]): void {
   byId("where").replaceChildren(...children);
 }
 
@@ -59,6 +60,8 @@ export function count(value: number): string {
   }
   return String(value);
 }
+
+export const messageOf = (error: unknown): string => (error instanceof Error ? error.message : String(error));
 
 /** A canvas that is as sharp as the screen. `draw` gets its size in CSS pixels, whenever that changes and when asked. */
 export class Drawing {

@@ -2,8 +2,8 @@
 
 import { Client } from "./client";
 import { Controls } from "./controls";
-import type { Wish } from "./controls";
-import { count, el, fixed, place, say } from "./dom";
+import type { DriveInput } from "./controls";
+import { count, el, fixed, messageOf, showStatus, showTitle } from "./dom";
 import { Facts, forwardSpeed } from "./facts";
 import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
@@ -66,7 +66,7 @@ export class DrivePage implements Page {
       el("div.left", {}, this.mosaic.element, this.controls.pads),
       el("aside.right", {}, this.map.element, this.facts.element, this.plot.element,
         el("div.buttons", {}, this.pause, again), this.settings.element, keys));
-    place(el("b", {}, twin), " · drive");
+    showTitle(el("b", {}, twin), " · drive");
     void this.run();
   }
 
@@ -101,18 +101,18 @@ export class DrivePage implements Page {
 
   private async run(): Promise<void> {
     try {
-      say("connecting");
+      showStatus("connecting");
       this.client = await Client.connect();
-      this.client.onLost = (lost) => say(lost ? "connection lost, resuming" : "resumed", lost ? "bad" : "");
+      this.client.onLost = (lost) => showStatus(lost ? "connection lost, resuming" : "resumed", lost ? "bad" : "");
       const { backend, twins, server } = this.client.welcome;
       const twin = twins.find(({ name }) => name === this.twin);
       if (!twin) throw new Error(`there is no twin ${this.twin} on this server`);
       this.settings.suit(backend);
       await this.open(twin);
-      say(`${server.name} ${server.version}, ${backend}`, "good");
+      showStatus(`${server.name} ${server.version}, ${backend}`, "good");
       await this.drive(twin);
     } catch (error) {
-      if (!this.ended) say(error instanceof Error ? error.message : String(error), "bad");
+      if (!this.ended) showStatus(messageOf(error), "bad");
     }
   }
 
@@ -132,7 +132,7 @@ export class DrivePage implements Page {
     fields.outputs = { encoding: "jpeg", quality, trust, images, ...(scenario ? { actors: true } : {}) };
     this.opened = await client.open({ ...fields, session: drivenSession(twin.name) });
     await this.map.load(twin.name, this.opened.version, twin.trajectories.map(({ name }) => name));
-    place(el("b", {}, twin.name), ` v${this.opened.version} · ${count(twin.gaussians)} Gaussians · drive`);
+    showTitle(el("b", {}, twin.name), ` v${this.opened.version} · ${count(twin.gaussians)} Gaussians · drive`);
     await this.show(await client.observation({ type: "reset", ...this.start }));
   }
 
@@ -155,7 +155,7 @@ export class DrivePage implements Page {
         await this.show(await this.client!.observation({ type: "reset", ...this.start }));
       } else {
         const steps = this.settings.keepsPace ? clamp(Math.round(this.requestMs / (DT_US / 1000)), 1, MOST_STEPS) : 1;
-        const action = this.action(this.controls.wish(), steps * DT_US * 1e-6);
+        const action = this.action(this.controls.read(), steps * DT_US * 1e-6);
         simulatedMs = (steps * DT_US) / 1000;
         await this.show(await this.step({ type: "step", action, until_us: steps * DT_US }));
       }
@@ -180,7 +180,7 @@ export class DrivePage implements Page {
     }
   }
 
-  private action({ throttle, steer, stop }: Wish, seconds: number): { acceleration: number; curvature: number } {
+  private action({ throttle, steer, stop }: DriveInput, seconds: number): { acceleration: number; curvature: number } {
     const speed = this.last ? forwardSpeed(this.last) : 0;
     const halt = clamp(-speed / seconds, -BRAKING, BRAKING);
     let acceleration = clamp(halt, -DRAG, DRAG);
@@ -201,7 +201,7 @@ export class DrivePage implements Page {
     this.element.dataset.x = String(metadata.ego.pose.xyz[0]);
     this.element.dataset.session = metadata.session;
     const end = metadata.events?.find(({ kind }) => kind === "end");
-    if (end) say(`the episode ended: ${end.name}. R: start again`, end.name === "route_done" ? "good" : "bad");
+    if (end) showStatus(`the episode ended: ${end.name}. R: start again`, end.name === "route_done" ? "good" : "bad");
     await this.mosaic.show(observation);
   }
 }

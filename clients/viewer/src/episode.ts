@@ -1,7 +1,8 @@
 // Seek through recorded episodes: the pictures are rendered again, and their hashes compared with the record.
 
 import { Client } from "./client";
-import { el, fixed, place, say } from "./dom";
+import { hasModifier } from "./controls";
+import { el, fixed, messageOf, showStatus, showTitle } from "./dom";
 import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
 import type { Page } from "./page";
@@ -43,7 +44,7 @@ class Player {
     return frames.findLast((frame) => frame.time_us <= timeUs) ?? frames[0];
   }
 
-  /** Shows the frame at a time, and tells `shown`. While one is rendered only the newest wish counts. */
+  /** Shows the frame at a time, and calls `shown`. While one is rendered only the newest request counts. */
   async seek(timeUs: number, shown: (metadata: Metadata) => void): Promise<void> {
     const frame = this.frameAt(timeUs);
     if (!frame || frame === this.wanted) return;
@@ -110,7 +111,7 @@ export class EpisodePage implements Page {
   private ended = false;
 
   constructor(names: string[]) {
-    place(el("b", {}, names.join(" and ")), " · recorded");
+    showTitle(el("b", {}, names.join(" and ")), " · recorded");
     this.slider.addEventListener("input", () => void this.seek());
     this.play.addEventListener("click", () => this.setPlaying(!this.isPlaying));
     addEventListener("keydown", (event) => this.key(event), { signal: this.abort.signal });
@@ -125,6 +126,7 @@ export class EpisodePage implements Page {
   }
 
   private key(event: KeyboardEvent): void {
+    if (hasModifier(event)) return;
     const step = { ArrowLeft: -1, ArrowRight: 1, PageUp: -10, PageDown: 10 }[event.code];
     if (event.code === "Space") this.setPlaying(!this.isPlaying);
     else if (step !== undefined) this.to(Number(this.slider.value) + step);
@@ -134,7 +136,7 @@ export class EpisodePage implements Page {
 
   private async begin(names: string[]): Promise<void> {
     try {
-      say("loading");
+      showStatus("loading");
       const recordings = await Promise.all(names.map(load));
       const empty = recordings.find(({ frames }) => frames.length === 0);
       if (empty) throw new Error(`${empty.name} has no frames`);
@@ -151,10 +153,10 @@ export class EpisodePage implements Page {
       this.element.append(
         el("div.players", {}, ...this.players.map(({ element }) => element)),
         el("div.below", {}, line, el("div.beside", {}, this.map.element, this.events)));
-      say("");
+      showStatus("");
       await this.seek();
     } catch (error) {
-      if (!this.ended) say(error instanceof Error ? error.message : String(error), "bad");
+      if (!this.ended) showStatus(messageOf(error), "bad");
     }
   }
 
@@ -207,7 +209,7 @@ export class EpisodePage implements Page {
       await Promise.all(this.players.map((player, at) => player.seek(timeUs, (metadata) => this.map.at(metadata, at))));
     } catch (error) {
       this.setPlaying(false);
-      if (!this.ended) say(error instanceof Error ? error.message : String(error), "bad");
+      if (!this.ended) showStatus(messageOf(error), "bad");
     }
   }
 }

@@ -1,8 +1,8 @@
 // A free camera through a twin. The server draws it: the same pixels as for agents, and any length of city.
 
 import { Client } from "./client";
-import { Controls } from "./controls";
-import { count, el, fixed, place, say } from "./dom";
+import { Controls, hasModifier } from "./controls";
+import { count, el, fixed, messageOf, showStatus, showTitle } from "./dom";
 import { Facts } from "./facts";
 import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
@@ -41,7 +41,7 @@ export class FlyPage implements Page {
     const left = el("div.left.fly", {}, this.mosaic.element, this.controls.pads);
     this.element = el("div.view", {}, left,
       el("aside.right", {}, this.map.element, this.facts.element, this.plot.element, keys));
-    place(el("b", {}, twin), " · free camera");
+    showTitle(el("b", {}, twin), " · free camera");
     this.listen(left);
     void this.run(twin);
   }
@@ -55,7 +55,9 @@ export class FlyPage implements Page {
 
   private listen(left: HTMLElement): void {
     const { signal } = this.abort;
-    addEventListener("keydown", ({ code }) => this.held.add(code), { signal });
+    addEventListener("keydown", (event) => {
+      if (!hasModifier(event)) this.held.add(event.code);
+    }, { signal });
     addEventListener("keyup", ({ code }) => this.held.delete(code), { signal });
     addEventListener("blur", () => this.held.clear(), { signal });
     left.addEventListener("pointermove", (event) => {
@@ -67,7 +69,7 @@ export class FlyPage implements Page {
 
   private async run(twinName: string): Promise<void> {
     try {
-      say("connecting");
+      showStatus("connecting");
       this.client = await Client.connect();
       const { backend, twins, server } = this.client.welcome;
       const twin = twins.find(({ name }) => name === twinName);
@@ -88,11 +90,11 @@ export class FlyPage implements Page {
       await this.map.load(twinName, opened.version, twin.trajectories.map(({ name }) => name));
       this.go(opened.start);
       this.map.onPose = (pose) => this.go(pose);
-      place(el("b", {}, twinName), ` v${opened.version} · ${count(twin.gaussians)} Gaussians · free camera`);
-      say(`${server.name} ${server.version}, ${backend}`, "good");
+      showTitle(el("b", {}, twinName), ` v${opened.version} · ${count(twin.gaussians)} Gaussians · free camera`);
+      showStatus(`${server.name} ${server.version}, ${backend}`, "good");
       await this.fly();
     } catch (error) {
-      if (!this.ended) say(error instanceof Error ? error.message : String(error), "bad");
+      if (!this.ended) showStatus(messageOf(error), "bad");
     }
   }
 
@@ -136,7 +138,7 @@ export class FlyPage implements Page {
   }
 
   private move(seconds: number): void {
-    const { throttle, steer } = this.controls.wish();
+    const { throttle, steer } = this.controls.read();
     const rise = Number(this.held.has("KeyE")) - Number(this.held.has("KeyQ"));
     if (throttle === 0 && steer === 0 && rise === 0) return;
     const isFast = this.held.has("ShiftLeft") || this.held.has("ShiftRight");

@@ -1,11 +1,12 @@
 // The first page: twins, running sessions, recorded episodes.
 
 import { Adder } from "./add";
-import { count, el, fixed, place, say } from "./dom";
+import { count, el, fixed, messageOf, showStatus, showTitle } from "./dom";
 import type { Page } from "./page";
 import type { Pose } from "./pose";
 import type { Twin } from "./protocol";
-import { Refused, get, useToken } from "./server";
+import { get, roleOfToken } from "./server";
+import type { Role } from "./server";
 import { isViewers } from "./session";
 
 interface Session {
@@ -36,14 +37,19 @@ export class HomePage implements Page {
   private readonly adder = new Adder(() => void this.load());
   private readonly twins = el("section");
   private readonly sessions = el("section");
+  /** For tokens that cannot list sessions. */
+  private readonly own = el("section", { hidden: true });
   private readonly episodes = el("section");
   private listed = false;
   private timer = 0;
   private ended = false;
 
   constructor() {
-    place();
-    this.element.append(this.twins, this.adder.element, this.sessions, this.episodes);
+    showTitle();
+    this.adder.element.hidden = true;
+    this.element.append(this.twins, this.adder.element, this.own, this.sessions, this.episodes,
+      el("p.dim", {}, el("a", { href: "#/report" }, "Show the errors of a report on the map")));
+    this.fillOwn();
     void this.load();
   }
 
@@ -53,40 +59,55 @@ export class HomePage implements Page {
   }
 
   private async load(): Promise<void> {
+    clearTimeout(this.timer);
     try {
+      const role = await roleOfToken();
+      showTitle(...(role ? [`role of your token: ${role}`] : []));
       const { twins, damaged } = await get<{ twins: Twin[]; damaged?: { name: string; reason: string }[] }>("v1/twins");
-      this.showTwins(twins, damaged ?? []);
-      await this.loadSessions();
-      say("");
+      this.showTwins(twins, damaged ?? [], role);
+      this.adder.element.hidden = role === "drive";
+      this.own.hidden = role !== "drive";
+      if (role === undefined || role === "admin") await this.loadSessions();
+      if (!this.ended) showStatus("");
     } catch (error) {
-      if (error instanceof Refused && error.code === "unauthorized") return this.askToken();
-      say(error instanceof Error ? error.message : String(error), "bad");
+      if (!this.ended) showStatus(messageOf(error), "bad");
     }
     if (!this.ended) this.timer = setTimeout(() => void this.load(), REFRESH_MS);
   }
 
   /** Sessions and episodes are listed for administrators alone. */
   private async loadSessions(): Promise<void> {
-    try {
-      this.showSessions((await get<{ sessions: Session[] }>("v1/sessions")).sessions);
-      // The server reads every record for this list.
-      if (this.listed) return;
-      this.listed = true;
-      this.showEpisodes((await get<{ episodes: Episode[] }>("v1/episodes")).episodes);
-    } catch (error) {
-      if (!(error instanceof Refused && error.code === "forbidden")) throw error;
-    }
+    this.showSessions((await get<{ sessions: Session[] }>("v1/sessions")).sessions);
+    // The server reads every record for this list.
+    if (this.listed) return;
+    this.listed = true;
+    this.showEpisodes((await get<{ episodes: Episode[] }>("v1/episodes")).episodes);
   }
 
-  private showTwins(twins: Twin[], damaged: { name: string; reason: string }[]): void {
+  /** The server lists sessions for administrators alone, but a token may watch its own ones by their names. */
+  private fillOwn(): void {
+    const field = el("input", { type: "text", placeholder: "session", spellcheck: false, ariaLabel: "session" });
+    const form = el("form.watching", {}, field, el("button", { type: "submit" }, "Watch"));
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      const name = field.value.trim();
+      if (name) location.hash = `#/watch/${encodeURIComponent(name)}`;
+    });
+    this.own.append(el("h2", {}, "Your sessions"),
+      el("p.dim", {}, "Sessions are listed for administrators. Your token can watch the sessions that it opened: give the name of one, or open the address #/watch/SESSION."), form);
+  }
+
+  private showTwins(twins: Twin[], damaged: { name: string; reason: string }[], role: Role | undefined): void {
+    const drives = role !== "push";
     const rows = twins.map((twin) => {
-      const drives = twin.trajectories.map(({ name, length_m: length }) => `${name} ${fixed(length, 0)} m`).join(", ");
-      const name = el("a.name", { href: `#/drive/${twin.name}` }, twin.name);
+      const recorded = twin.trajectories.map(({ name, length_m: length }) => `${name} ${fixed(length, 0)} m`).join(", ");
+      const link = (kind: string, text: string): HTMLElement => el("a.action", { href: `#/${kind}/${twin.name}` }, text);
+      // Placing needs pictures, which the role push cannot have, and makes a version, which the role drive cannot.
+      const actions = [...(drives ? [link("drive", "Drive"), link("fly", "Free camera")] : []),
+        ...(drives && role !== "drive" ? [link("place", "Place a drive")] : [])];
+      const name = drives ? el("a.name", { href: `#/drive/${twin.name}` }, twin.name) : el("b", {}, twin.name);
       return el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
-        el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, drives || "no recorded drive"),
-        el("td.actions", {}, el("a.action", { href: `#/drive/${twin.name}` }, "Drive"),
-          el("a.action", { href: `#/fly/${twin.name}` }, "Free camera"),
-          el("a.action", { href: `#/place/${twin.name}` }, "Place a drive")));
+        el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, recorded || "no recorded drive"), el("td.actions", {}, ...actions));
     });
     const broken = damaged.map(({ name, reason }) => el("p.bad", {}, `${name} is damaged: ${reason}`));
     const head = ["twin", "version", "Gaussians", "recorded drives", ""].map((text) => el("th", {}, text));
@@ -125,21 +146,5 @@ export class HomePage implements Page {
     });
     const table = rows.length ? el("table", {}, el("tbody", {}, ...rows)) : el("p.dim", {}, "None yet.");
     this.episodes.replaceChildren(el("h2", {}, "Recorded episodes ", compare), table);
-  }
-
-  private askToken(): void {
-    const field = el("input", { type: "password", autocomplete: "off", placeholder: "token", ariaLabel: "token" });
-    const form = el("form.token", {}, el("p", {}, "This server needs a token. It is kept until this tab is closed."),
-      field, el("button", { type: "submit" }, "Continue"));
-    form.addEventListener("submit", (event) => {
-      event.preventDefault();
-      useToken(field.value.trim());
-      this.twins.replaceChildren();
-      void this.load();
-    });
-    say("no valid token", "bad");
-    this.sessions.replaceChildren();
-    this.twins.replaceChildren(form);
-    field.focus();
   }
 }

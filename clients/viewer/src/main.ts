@@ -1,12 +1,16 @@
-// The page of the address: #/, #/drive/TWIN, #/fly/TWIN, #/place/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME.
+// The page of the address: #/, #/drive/TWIN, #/fly/TWIN, #/place/TWIN, #/watch/SESSION, #/episode/NAME, #/episode/NAME/NAME,
+// #/report.
 
-import { byId } from "./dom";
+import { byId, el, showStatus, showTitle } from "./dom";
 import { DrivePage } from "./drive";
 import { EpisodePage } from "./episode";
 import { FlyPage } from "./fly";
 import { HomePage } from "./home";
 import type { Page } from "./page";
 import { PlacePage } from "./place";
+import { ReportPage } from "./report";
+import { lacksToken, whenUnauthorized } from "./server";
+import { TokenPage } from "./token";
 import { WatchPage } from "./watch";
 
 const THEME = "wildcity-theme";
@@ -15,19 +19,40 @@ const systemIsLight = matchMedia("(prefers-color-scheme: light)");
 let page: Page | undefined;
 
 function pageOf(address: string): Page {
-  const [, kind = "", ...names] = address.split("/").map(decodeURIComponent);
-  const name = names[0] ?? "";
+  let names: string[];
+  try {
+    names = address.split("/").slice(1).map(decodeURIComponent);
+  } catch {
+    return damagedAddress(address);
+  }
+  const [kind = "", name = "", other] = names;
+  if (kind === "report") return new ReportPage();
+  if (lacksToken()) return new TokenPage(false, show);
   if (kind === "drive" && name) return new DrivePage(name);
   if (kind === "fly" && name) return new FlyPage(name);
   if (kind === "place" && name) return new PlacePage(name);
   if (kind === "watch" && name) return new WatchPage(name);
-  if (kind === "episode" && name) return new EpisodePage(names.slice(0, 2));
+  if (kind === "episode" && name) return new EpisodePage(other ? [name, other] : [name]);
   return new HomePage();
 }
 
+function damagedAddress(address: string): Page {
+  showTitle();
+  showStatus("the address is damaged", "bad");
+  const text = `The name in the address ${address} is damaged: a % is followed by something else than the bytes of a character.`;
+  return { element: el("div.home", {}, el("p", {}, text), el("a.action", { href: "#/" }, "To the first page")), end: () => {} };
+}
+
 function show(): void {
-  void page?.end();
-  page = pageOf(location.hash);
+  turnTo(() => pageOf(location.hash));
+}
+
+/** Ends the page that is shown before another one begins. */
+function turnTo(make: () => Page): void {
+  const old = page;
+  page = undefined;
+  void old?.end();
+  page = make();
   byId("page").replaceChildren(page.element);
 }
 
@@ -36,6 +61,10 @@ function applyTheme(): void {
   document.documentElement.dataset.theme = localStorage.getItem(THEME) ?? (systemIsLight.matches ? "light" : "dark");
 }
 
+whenUnauthorized((hadToken) => {
+  // Several requests may be refused together.
+  if (!(page instanceof TokenPage)) turnTo(() => new TokenPage(hadToken, show));
+});
 byId("theme").addEventListener("click", () => {
   localStorage.setItem(THEME, document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   applyTheme();

@@ -16,6 +16,12 @@ interface Drive {
   points: DrivePoint[];
 }
 
+/** A dot on the map. */
+export interface Mark {
+  xyz: Vector;
+  colour: string;
+}
+
 interface TrailPoint {
   xyz: Vector;
   trust: number | undefined;
@@ -28,6 +34,8 @@ const EGO_REAR_M = -1.0;
 const TRAIL_POINTS = 20_000;
 /** How far beside a drive a click still means it, in pixels. */
 const CLICK_PX = 14;
+const MARK_PX = 5;
+const FIT_SHARE = 0.8;
 
 export class MapView {
   /** Called when a place on a drive is clicked. */
@@ -42,6 +50,9 @@ export class MapView {
   private now: Metadata | undefined;
   private other: Pose | undefined;
   private outlines: Vector[][] = [];
+  private marks: Mark[] = [];
+  /** What the map shows all of, until the user moves it. */
+  private fitted: Vector[] | undefined;
   /** Middle of the map: a place, or the ego. */
   private centre: [number, number] | undefined;
   private pixelsPerM = 4;
@@ -60,6 +71,7 @@ export class MapView {
       this.zoom(Math.exp(-event.deltaY * 0.0015));
     }, { passive: false });
     canvas.addEventListener("dblclick", () => {
+      this.fitted = undefined;
       this.centre = undefined;
       this.drawing.redraw();
     });
@@ -106,6 +118,20 @@ export class MapView {
     this.drawing.redraw();
   }
 
+  /** Shows dots, and all of them at first. */
+  mark(marks: Mark[]): void {
+    if (this.marks.length === 0 && marks.length > 0) this.fitted = marks.map(({ xyz }) => xyz);
+    this.marks = marks;
+    this.drawing.redraw();
+  }
+
+  /** The recorded pose that is nearest to a station of a loaded drive. */
+  poseAt(trajectory: string, stationM: number): Pose | undefined {
+    const points = this.drives.find(({ name }) => name === trajectory)?.points ?? [];
+    const away = (point: DrivePoint): number => Math.abs(point.station_m - stationM);
+    return points.reduce<DrivePoint | undefined>((best, point) => (best && away(best) <= away(point) ? best : point), undefined)?.pose;
+  }
+
   /** Moves the ego without a trail; `which` is 1 for the ego of a second episode. */
   at(metadata: Metadata, which = 0): void {
     if (which === 0) this.now = metadata;
@@ -113,7 +139,21 @@ export class MapView {
     this.drawing.redraw();
   }
 
+  /** Lets a map of this size show all of these places, with a margin. */
+  private fit(places: Vector[], width: number, height: number): void {
+    const range = (axis: 0 | 1): [number, number] => {
+      const values = places.map((place) => place[axis]);
+      return [Math.min(...values), Math.max(...values)];
+    };
+    const [west, east] = range(0);
+    const [south, north] = range(1);
+    this.centre = [(west + east) / 2, (south + north) / 2];
+    const pixelsPerM = FIT_SHARE * Math.min(width / (east - west || 1), height / (north - south || 1));
+    this.pixelsPerM = clamp(pixelsPerM, 0.02, 60);
+  }
+
   private zoom(factor: number): void {
+    this.fitted = undefined;
     this.pixelsPerM = clamp(this.pixelsPerM * factor, 0.02, 60);
     this.drawing.redraw();
   }
@@ -139,6 +179,7 @@ export class MapView {
       moved += Math.hypot(...step);
       if (fingers.size === 2 && before > 0) return this.zoom(spread() / before);
       if (moved < 4) return;
+      this.fitted = undefined;
       const [x, y] = this.middle();
       this.centre = [x - step[0] / this.pixelsPerM, y + step[1] / this.pixelsPerM];
       this.drawing.redraw();
@@ -178,6 +219,7 @@ export class MapView {
   }
 
   private draw(context: CanvasRenderingContext2D, width: number, height: number): void {
+    if (this.fitted) this.fit(this.fitted, width, height);
     const toScreen = this.projection(width, height);
     const line = (points: Vector[], style: string, thickness: number, dash: number[] = []): void => {
       context.beginPath();
@@ -200,6 +242,12 @@ export class MapView {
     for (let at = 1; at < this.trail.length; at++) {
       const { xyz, trust } = this.trail[at]!;
       line([this.trail[at - 1]!.xyz, xyz], trust === undefined ? colour("accent") : trustColour(trust), 3);
+    }
+    for (const { xyz, colour: style } of this.marks) {
+      context.beginPath();
+      context.arc(...toScreen(xyz), MARK_PX, 0, 2 * Math.PI);
+      context.fillStyle = style;
+      context.fill();
     }
     const { now } = this;
     if (now) {

@@ -2,19 +2,19 @@
 // depth of the picture; the server makes the version.
 
 import { Client } from "./client";
-import { count, el, fixed, place, say } from "./dom";
+import { Clicks, scaleOf } from "./clicks";
+import type { Scale, Step } from "./clicks";
+import { count, el, fixed, messageOf, showStatus, showTitle } from "./dom";
+import { axisOf, levelGround, normalOf, toPlane } from "./ground";
+import type { Ground } from "./ground";
 import { Orbit, RIG_FROM_CAMERA } from "./orbit";
+import { Overlay } from "./overlay";
 import type { Page } from "./page";
-import { add, clamp, cross, dot, length, normalize, rotate, scaled, subtract } from "./pose";
+import { add, clamp, dot, length, rotate, scaled, subtract } from "./pose";
 import type { Pose, Vector } from "./pose";
 import type { Observation } from "./protocol";
 import { get, post } from "./server";
 import { viewerSession } from "./session";
-
-interface Ground {
-  points: [Vector, Vector, Vector];
-  above: Vector;
-}
 
 interface Survey {
   version: number;
@@ -23,10 +23,7 @@ interface Survey {
   ground: Ground | null;
 }
 
-type Step = "ground" | "scale" | "path";
-
 const FIELD_OF_VIEW = (60 * Math.PI) / 180;
-const NEEDED: Record<Step, number> = { ground: 3, scale: 2, path: 1000 };
 const HELP: Record<Step, string> = {
   ground: "Keep the grid if it lies on the ground. Otherwise click three places on the ground, far apart; or say which axis is up, and click one place.",
   scale: "Click the two ends of something whose size you know, and give the size. Skip it if the twin is in metres.",
@@ -34,12 +31,12 @@ const HELP: Record<Step, string> = {
 };
 /** Pixels that the pointer may move within a click. */
 const CLICK_PX = 5;
-const GRID_LINES = 10;
+const SAVE = "Save and drive";
 
 export class PlacePage implements Page {
   readonly element: HTMLElement;
   private readonly canvas = el("canvas");
-  private readonly overlay = el("canvas.overlay");
+  private readonly overlay = new Overlay();
   private readonly picture: HTMLElement;
   private readonly tabs: Record<Step, HTMLButtonElement>;
   private readonly help = el("p.help");
@@ -47,10 +44,14 @@ export class PlacePage implements Page {
   private readonly distance = el("input", { type: "number", value: "1", step: "0.1", min: "0", ariaLabel: "distance in metres" });
   private readonly scaleRow: HTMLElement;
   private readonly rig = el("select", { ariaLabel: "rig" });
-  private readonly save = el("button.save", { type: "button", disabled: true }, "Save and drive");
+  private readonly save = el("button.save", { type: "button", disabled: true }, SAVE);
   private readonly abort = new AbortController();
   private readonly twin: string;
-  private readonly clicked: Record<Step, Vector[]> = { ground: [], scale: [], path: [] };
+  private readonly clicks = new Clicks();
+  /** The up axes of the camera before the last two clicks: a third place of the ground changes it. */
+  private upsBefore: Vector[] = [];
+  /** Whether the user was told that no distance was given. */
+  private assumesMetres = false;
   private step: Step = "ground";
   private orbit: Orbit | undefined;
   private proposal: Ground | undefined;
@@ -89,8 +90,8 @@ export class PlacePage implements Page {
     for (const name of ["vehicle6", "surround6", "alpamayo1", "alpamayo2"]) this.rig.append(el("option", { value: name }, name));
     this.up = el("div.buttons.up", {}, "Up is", ...(["z", "-z", "y", "-y", "x", "-x"] as const).map((axis) =>
       button(axis.replace("-", "−"), () => this.setAxis(axisOf(axis)))));
-    this.save.addEventListener("click", () => void this.publish());
-    this.picture = el("div.picture", {}, this.canvas, this.overlay);
+    this.save.addEventListener("click", () => this.confirmAndPublish());
+    this.picture = el("div.picture", {}, this.canvas, this.overlay.canvas);
     const left = el("div.left.place", {}, this.picture);
     this.element = el("div.view.placing", {}, left, el("aside.right", {},
       el("div.buttons.tabs", {}, ...Object.values(this.tabs)),
@@ -100,7 +101,7 @@ export class PlacePage implements Page {
       el("div.buttons.rig", {}, "Rig ", this.rig),
       el("div.buttons", {}, this.save),
       el("p.keys", {}, "Drag: turn · right button or two fingers: move · wheel or pinch: nearer · double click: turn about that place")));
-    place(el("b", {}, twin), " · place a drive");
+    showTitle(el("b", {}, twin), " · place a drive");
     this.listen();
     this.refresh();
     void this.run();
@@ -115,8 +116,8 @@ export class PlacePage implements Page {
 
   private async run(): Promise<void> {
     try {
-      say("looking for the ground");
-      const survey = await get<Survey>(`v1/twins/${this.twin}/ground`);
+      showStatus("looking for the ground");
+      const survey = await get<Survey>(`v1/twins/${encodeURIComponent(this.twin)}/ground`);
       this.version = survey.version;
       this.proposal = survey.ground ?? undefined;
       const radius = survey.radius || 1;
@@ -136,12 +137,12 @@ export class PlacePage implements Page {
       });
       this.canvas.width = w;
       this.canvas.height = h;
-      place(el("b", {}, this.twin), ` v${this.version} · place a drive`);
-      say(this.proposal ? "a ground was found" : "no ground was found: click three places of it", "good");
+      showTitle(el("b", {}, this.twin), ` v${this.version} · place a drive`);
+      showStatus(this.proposal ? "a ground was found" : "no ground was found: click three places of it", "good");
       this.refresh();
       await this.draw();
     } catch (error) {
-      if (!this.ended) say(error instanceof Error ? error.message : String(error), "bad");
+      if (!this.ended) showStatus(messageOf(error), "bad");
     }
   }
 
@@ -168,7 +169,7 @@ export class PlacePage implements Page {
       this.shown = observation;
       this.shownPose = pose;
       this.element.dataset.step = String(Number(this.element.dataset.step ?? 0) + 1);
-      this.refresh();
+      this.drawOverlay();
     }
   }
 
@@ -220,11 +221,14 @@ export class PlacePage implements Page {
     picture.addEventListener("pointercancel", up, { signal });
     picture.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
     picture.addEventListener("dblclick", (event) => {
+      if (!this.orbit) return;
       const at = this.placeAt(event.clientX, event.clientY);
-      if (!at || !this.orbit) return;
-      // The two clicks of it meant no place.
-      this.clicked[this.step].splice(-2);
-      this.orbit.pivot = at;
+      this.clicks.restoreBeforeDoubleClick(this.step);
+      this.orbit.up = this.upsBefore[0] ?? this.orbit.up;
+      if (at) {
+        this.orbit.pivot = at;
+        showStatus("");
+      }
       this.moved();
       this.refresh();
     }, { signal });
@@ -276,15 +280,16 @@ export class PlacePage implements Page {
   }
 
   private click(x: number, y: number): void {
-    const places = this.clicked[this.step];
+    if (this.orbit) this.upsBefore = [...this.upsBefore.slice(-1), this.orbit.up];
     // A path is on the ground, also where a bush is before it, and where nothing was captured.
     const { ground } = this;
     const at = this.step === "path" && ground ? this.onGround(ground, x, y) : this.placeAt(x, y);
-    if (!at) return say("there is nothing at that place: click on a surface", "bad");
-    if (places.length >= NEEDED[this.step]) places.length = 0;
-    places.push(at);
-    say("");
-    if (this.step === "ground" && places.length === 3 && this.ground) this.setUp(normalOf(this.ground));
+    const before = this.clicks.of(this.step).length;
+    this.clicks.click(this.step, at);
+    if (!at) return showStatus("there is nothing at that place: click on a surface", "bad");
+    const places = this.clicks.of(this.step).length;
+    showStatus(places > before ? "" : "begun again with this place; Undo brings the earlier places back");
+    if (this.step === "ground" && places === 3 && this.ground) this.setUp(normalOf(this.ground));
     this.refresh();
   }
 
@@ -301,13 +306,10 @@ export class PlacePage implements Page {
 
   /** The ground that was clicked, or the one that was found. */
   private get ground(): Ground | undefined {
-    const [a, b, c] = this.clicked.ground;
+    const [a, b, c] = this.clicks.of("ground");
     const { axis, proposal } = this;
     if (a && b && c) return { points: [a, b, c], above: this.shownPose?.xyz ?? a };
-    if (a && axis) {
-      const across = normalize(cross(axis, Math.abs(axis[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
-      return { points: [a, add(a, across), add(a, cross(axis, across))], above: add(a, axis) };
-    }
+    if (a && axis) return levelGround(a, axis);
     return proposal && (!axis || dot(normalOf(proposal), axis) > 0.7) ? proposal : undefined;
   }
 
@@ -329,20 +331,17 @@ export class PlacePage implements Page {
   }
 
   private undo(): void {
-    this.clicked[this.step].pop();
+    this.clicks.undo(this.step);
     this.refresh();
   }
 
   private clear(): void {
-    this.clicked[this.step].length = 0;
+    this.clicks.clear(this.step);
     this.refresh();
   }
 
-  /** Metres per unit: of the two places, or 1. */
-  private get metresPerUnit(): number {
-    const [a, b] = this.clicked.scale;
-    const metres = Number(this.distance.value);
-    return a && b && metres > 0 ? metres / length(subtract(a, b)) : 1;
+  private get scale(): Scale {
+    return scaleOf(this.clicks.of("scale"), Number(this.distance.value));
   }
 
   private refresh(): void {
@@ -350,129 +349,64 @@ export class PlacePage implements Page {
     this.help.textContent = HELP[this.step];
     this.scaleRow.hidden = this.step !== "scale";
     this.up.hidden = this.step !== "ground";
-    const path = this.clicked.path;
-    let metres = 0;
-    for (let at = 1; at < path.length; at++) metres += length(subtract(path[at]!, path[at - 1]!)) * this.metresPerUnit;
+    const { scale } = this;
+    const path = this.clicks.of("path");
+    let units = 0;
+    for (let at = 1; at < path.length; at++) units += length(subtract(path[at]!, path[at - 1]!));
+    const scaleText = scale.state === "assumed" ? "no distance: 1 m per unit" : scale.missing || `${fixed(scale.metresPerUnit, 4)} m per unit`;
     const found = {
       ground: this.groundText(),
-      scale: this.clicked.scale.length < 2 ? `${this.clicked.scale.length} of 2 places` : `${fixed(this.metresPerUnit, 4)} m per unit`,
-      path: `${count(path.length)} places, ${fixed(metres, 1)} m`,
+      scale: scaleText,
+      path: `${count(path.length)} places, ${fixed(units * scale.metresPerUnit, 1)} m${scale.state === "given" ? "" : ` · ${scaleText}`}`,
     };
     this.found.textContent = found[this.step];
-    this.save.disabled = path.length < 2 || !this.ground;
-    for (const [step, places] of Object.entries(this.clicked)) this.element.dataset[step] = String(places.length);
+    this.assumesMetres = false;
+    this.save.textContent = SAVE;
+    this.save.disabled = path.length < 2 || !this.ground || scale.state === "incomplete";
+    for (const step of ["ground", "scale", "path"] as const) this.element.dataset[step] = String(this.clicks.of(step).length);
     this.drawOverlay();
   }
 
   private groundText(): string {
-    const clicks = this.clicked.ground.length;
+    const clicks = this.clicks.of("ground").length;
     if (clicks === 3) return "the ground is that of the three places";
     if (clicks > 0 && this.axis) return "the ground is level at that place; two more give its tilt";
     if (clicks > 0) return `${clicks} of 3 places`;
     return this.ground ? "using the ground that was found" : "no ground yet";
   }
 
-  /** Where a place is in the picture, in CSS pixels; undefined behind the camera. */
-  private toScreen(at: Vector): [number, number] | undefined {
-    const pose = this.shownPose;
-    if (!pose) return undefined;
-    const inverse = (q: Pose["q"]): Pose["q"] => [q[0], -q[1], -q[2], -q[3]];
-    const [x, y, z] = rotate(inverse(RIG_FROM_CAMERA.q), rotate(inverse(pose.q), subtract(at, pose.xyz)));
-    if (z <= 1e-6) return undefined;
-    const [w, h] = this.size;
-    const box = this.shownBox();
-    const own = this.overlay.getBoundingClientRect();
-    const pixels = box.width / w;
-    return [box.left - own.left + (w / 2 + (x * this.focal) / z) * pixels, box.top - own.top + (h / 2 + (y * this.focal) / z) * pixels];
+  private drawOverlay(): void {
+    const { shownPose: pose, size, focal } = this;
+    this.overlay.draw(pose && { pose, size, focal, box: this.shownBox() }, this.clicks, this.ground, this.orbit);
   }
 
-  private drawOverlay(): void {
-    const { overlay } = this;
-    const { clientWidth: width, clientHeight: height } = overlay;
-    overlay.width = width * devicePixelRatio;
-    overlay.height = height * devicePixelRatio;
-    const context = overlay.getContext("2d")!;
-    context.scale(devicePixelRatio, devicePixelRatio);
-    const line = (places: Vector[], style: string, thickness: number): void => {
-      context.beginPath();
-      let isDown = false;
-      for (const at of places) {
-        const point = this.toScreen(at);
-        if (point && isDown) context.lineTo(...point);
-        else if (point) context.moveTo(...point);
-        isDown = point !== undefined;
-      }
-      context.strokeStyle = style;
-      context.lineWidth = thickness;
-      context.stroke();
-    };
-    const { ground, orbit } = this;
-    if (ground && orbit) {
-      const normal = normalOf(ground);
-      const centre = add(orbit.pivot, scaled(normal, dot(subtract(ground.points[0], orbit.pivot), normal)));
-      const across = normalize(cross(normal, Math.abs(normal[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
-      const along = cross(normal, across);
-      const step = orbit.distance / GRID_LINES;
-      for (let at = -GRID_LINES; at <= GRID_LINES; at++) {
-        const row = (u: Vector, v: Vector): Vector[] => Array.from({ length: 21 }, (_, i) =>
-          add(centre, add(scaled(u, at * step), scaled(v, (i - 10) * step))));
-        line(row(across, along), "#ff603288", 1);
-        line(row(along, across), "#ff603288", 1);
-      }
+  /** Saves; without a known distance only when the user has read that it is missing, and presses again. */
+  private confirmAndPublish(): void {
+    if (this.scale.state === "assumed" && !this.assumesMetres) {
+      this.assumesMetres = true;
+      this.found.textContent = "No distance was given. If the twin is in metres, save; otherwise give one in step 2.";
+      this.save.textContent = "Save with 1 m per unit";
+      return;
     }
-    line(this.clicked.scale, "#5fbf96", 2);
-    line(this.clicked.path, "#6bb5ee", 4);
-    for (const [step, colour] of [["ground", "#ff6032"], ["scale", "#5fbf96"], ["path", "#6bb5ee"]] as const) {
-      for (const at of this.clicked[step]) {
-        const point = this.toScreen(at);
-        if (!point) continue;
-        context.beginPath();
-        context.arc(...point, 6, 0, 2 * Math.PI);
-        context.fillStyle = colour;
-        context.fill();
-        context.strokeStyle = "#fff";
-        context.lineWidth = 2;
-        context.stroke();
-      }
-    }
+    void this.publish();
   }
 
   private async publish(): Promise<void> {
-    const { ground, clicked } = this;
+    const { ground, clicks } = this;
     if (!ground) return;
     this.save.disabled = true;
-    say("saving");
+    showStatus("saving");
     try {
-      const [a, b] = clicked.scale;
+      const [a, b] = clicks.of("scale");
       const scale = a && b ? { points: [a, b], distance_m: Number(this.distance.value) } : undefined;
-      const drive = { name: "path", points: clicked.path.map((at) => toPlane(at, ground)), speed: 5 };
-      const made = await post<{ version: number }>(`v1/twins/${this.twin}/edits`,
+      const drive = { name: "path", points: clicks.of("path").map((at) => toPlane(at, ground)), speed: 5 };
+      const made = await post<{ version: number }>(`v1/twins/${encodeURIComponent(this.twin)}/edits`,
         { base: this.version, ground, ...(scale && { scale }), drive, rig: this.rig.value });
-      say(`version ${made.version}`, "good");
+      showStatus(`version ${made.version}`, "good");
       location.hash = `#/drive/${encodeURIComponent(this.twin)}`;
     } catch (error) {
-      say(error instanceof Error ? error.message : String(error), "bad");
+      showStatus(messageOf(error), "bad");
       this.save.disabled = false;
     }
   }
-}
-
-function axisOf(name: string): Vector {
-  const sign = name.startsWith("-") ? -1 : 1;
-  const at = "xyz".indexOf(name.at(-1)!);
-  const axis: Vector = [0, 0, 0];
-  axis[at] = sign;
-  return axis;
-}
-
-/** The unit normal of the ground, on its upper side. */
-function normalOf({ points: [a, b, c], above }: Ground): Vector {
-  const normal = normalize(cross(subtract(b, a), subtract(c, a)));
-  return dot(normal, subtract(above, a)) < 0 ? scaled(normal, -1) : normal;
-}
-
-/** The foot of a place on the ground. */
-function toPlane(at: Vector, ground: Ground): Vector {
-  const normal = normalOf(ground);
-  return add(at, scaled(normal, dot(subtract(ground.points[0], at), normal)));
 }

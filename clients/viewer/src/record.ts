@@ -47,6 +47,7 @@ export async function load(name: string): Promise<Recording> {
     name, cameras, twin: header.twin, backend: header.backend, profile: Object.fromEntries(set), frames: [], events: [],
     lanes: [], drawsActors: false, outcome: undefined,
   };
+  const { frames } = recording;
   let version: number = header.version;
   let known: { name: string; class: string; size: Vector; asset?: string }[] = [];
   let actors: Actor[] = [];
@@ -67,8 +68,7 @@ export async function load(name: string): Promise<Recording> {
       });
     }
     if (line.kind !== "frame" || line.request === "observe" || line.poses.length === 0) continue;
-    const frames = recording.frames.filter(({ step }) => step < line.step);
-    recording.frames = frames;
+    while (frames.length > 0 && frames.at(-1)!.step >= line.step) frames.pop();
     frames.push({ step: line.step, time_us: line.time_us, pose: line.poses.at(-1), version, images: lastImages(line, cameras), actors });
   }
   return recording;

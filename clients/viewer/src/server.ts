@@ -14,14 +14,48 @@ export class Refused extends Error {
   }
 }
 
-const TOKEN = "wildcity-token";
+/** What a token may do: open sessions, upload and push, or everything. */
+export type Role = "drive" | "push" | "admin";
 
-/** Remembers the token until the tab is closed. */
-export function useToken(token: string): void {
-  sessionStorage.setItem(TOKEN, token);
-}
+/** Keys of what is remembered until the tab is closed. */
+const TOKEN = "wildcity-token";
+const ROLE = "wildcity-role";
+/** Set once the server has asked for a token. */
+const ASKED = "wildcity-asked-for-token";
 
 const token = (): string | null => sessionStorage.getItem(TOKEN);
+
+export function useToken(value: string): void {
+  sessionStorage.setItem(TOKEN, value);
+  sessionStorage.removeItem(ROLE);
+}
+
+/** Whether requests are known to fail until there is a token. */
+export const lacksToken = (): boolean => !token() && sessionStorage.getItem(ASKED) !== null;
+
+let unauthorized: (hadToken: boolean) => void = () => {};
+
+/** `then` is called whenever the server asks for a token, or does not know the one it got. */
+export function whenUnauthorized(then: (hadToken: boolean) => void): void {
+  unauthorized = then;
+}
+
+/** The role of the token; undefined without a token. A server without tokens allows everything. */
+export async function roleOfToken(): Promise<Role | undefined> {
+  if (!token()) return undefined;
+  const known = sessionStorage.getItem(ROLE);
+  if (known) return known as Role;
+  let role: Role = "admin";
+  try {
+    await get("v1/sessions");
+  } catch (error) {
+    if (!(error instanceof Refused && error.code === "forbidden" && error.field === "authorization")) throw error;
+    // The refusal names the role of the token, and no answer of the server does.
+    role = /role is (\w+)/.exec(error.message)?.[1] === "push" ? "push" : "drive";
+  }
+  sessionStorage.setItem(ROLE, role);
+  return role;
+}
 
 interface Sent {
   body?: BodyInit;
@@ -34,6 +68,11 @@ async function request(method: string, path: string, { body, headers: own }: Sen
   if (bearer) headers.authorization = `Bearer ${bearer}`;
   const response = await fetch(path, { method, headers, ...(body !== undefined && { body }) });
   if (response.ok) return response;
+  if (response.status === 401) {
+    sessionStorage.removeItem(TOKEN);
+    sessionStorage.setItem(ASKED, "");
+    unauthorized(bearer !== null);
+  }
   throw new Refused(await response.json().catch(() => ({ message: `HTTP ${response.status}` })));
 }
 
@@ -66,8 +105,12 @@ export async function socket(path: string, protocol = PROTOCOL): Promise<WebSock
   }
   const socket = new WebSocket(url, protocol);
   socket.binaryType = "arraybuffer";
-  return new Promise((resolve, reject) => {
-    socket.onopen = () => resolve(socket);
-    socket.onerror = () => reject(new Error("the server refused the WebSocket, or is gone"));
+  const isOpen = await new Promise<boolean>((resolve) => {
+    socket.onopen = () => resolve(true);
+    socket.onerror = () => resolve(false);
   });
+  if (isOpen) return socket;
+  // Browsers do not say why a WebSocket was refused. Another request is refused for the same reason, and says it.
+  await get("v1/twins");
+  throw new Error("the server refused the WebSocket: the token's role or its limit of sessions does not allow it");
 }

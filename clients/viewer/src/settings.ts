@@ -1,14 +1,32 @@
 // What the driver can choose; remembered by the browser.
 
 import { el } from "./dom";
+import { clamp } from "./pose";
 
 const KEY = "wildcity-settings";
 const WIDTHS = [320, 480, 640, 960, 1280, 99_999];
 
-interface Stored {
+/** What the browser remembers. */
+export interface Stored {
   width?: number;
   quality?: number;
   pace?: boolean;
+}
+
+/** The settings that a text of the browser's storage has. Those that are missing or damaged are left out. */
+export function parseStored(text: string | null): Stored {
+  let value: unknown;
+  try {
+    value = JSON.parse(text ?? "{}");
+  } catch {
+    return {};
+  }
+  const { width, quality, pace } = Object(value) as Record<string, unknown>;
+  const stored: Stored = {};
+  if (WIDTHS.includes(width as number)) stored.width = width as number;
+  if (Number.isInteger(quality) && clamp(quality as number, 1, 100) === quality) stored.quality = quality;
+  if (typeof pace === "boolean") stored.pace = pace;
+  return stored;
 }
 
 export class Settings {
@@ -21,7 +39,7 @@ export class Settings {
   private readonly widths = el("select", { title: "Smaller images are faster" });
 
   constructor(onChange: () => void) {
-    const stored: Stored = JSON.parse(localStorage.getItem(KEY) ?? "{}");
+    const stored = parseStored(localStorage.getItem(KEY));
     this.chosenWidth = stored.width;
     this.quality = stored.quality ?? 85;
     this.keepsPace = stored.pace ?? true;
@@ -34,7 +52,7 @@ export class Settings {
       onChange();
     };
     this.widths.addEventListener("change", change(() => (this.chosenWidth = Number(this.widths.value))));
-    quality.addEventListener("change", change(() => (this.quality = Math.min(100, Math.max(1, Math.round(Number(quality.value)) || 85)))));
+    quality.addEventListener("change", change(() => (this.quality = clamp(Math.round(Number(quality.value)) || 85, 1, 100))));
     scenario.addEventListener("change", change(() => (this.scenario = scenario.value.trim())));
     pace.addEventListener("change", () => {
       this.keepsPace = pace.checked;

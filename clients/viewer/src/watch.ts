@@ -1,6 +1,6 @@
 // Watch a running session: its newest observations, without taking part in it.
 
-import { el, place, say } from "./dom";
+import { el, messageOf, showStatus, showTitle } from "./dom";
 import { Facts } from "./facts";
 import { MapView } from "./map";
 import { Mosaic } from "./mosaic";
@@ -29,7 +29,7 @@ export class WatchPage implements Page {
     this.element = el("div.view", {},
       el("div.left", {}, this.mosaic.element),
       el("aside.right", {}, this.map.element, this.facts.element, this.plot.element, note));
-    place(el("b", {}, session), " · watch");
+    showTitle(el("b", {}, session), " · watch");
     void this.begin();
   }
 
@@ -42,16 +42,17 @@ export class WatchPage implements Page {
     try {
       this.socket = await socket(`v1/sessions/${encodeURIComponent(this.session)}/watch`, WATCH_PROTOCOL);
     } catch {
-      return say(`${this.session} cannot be watched: it has ended, or belongs to another token`, "bad");
+      if (this.ended) return;
+      return showStatus(`${this.session} cannot be watched: it has ended, or belongs to another token`, "bad");
     }
     if (this.ended) return this.socket.close(1000);
-    say("waiting for the next step");
+    showStatus("waiting for the next step");
     this.socket.onmessage = ({ data }) => {
       this.newest = parseObservation(data as ArrayBuffer);
       void this.draw();
     };
     this.socket.onclose = ({ code }) => {
-      if (!this.ended) say(code === 1000 ? "the session ended" : "the connection is lost", code === 1000 ? "" : "bad");
+      if (!this.ended) showStatus(code === 1000 ? "the session ended" : "the connection is lost", code === 1000 ? "" : "bad");
     };
   }
 
@@ -70,10 +71,10 @@ export class WatchPage implements Page {
         this.facts.show(metadata);
         this.element.dataset.step = String(metadata.step);
         await this.mosaic.show(observation);
-        say(`${metadata.twin} v${metadata.version}, ${metadata.backend}`, "good");
+        showStatus(`${metadata.twin} v${metadata.version}, ${metadata.backend}`, "good");
       }
     } catch (error) {
-      say(error instanceof Error ? error.message : String(error), "bad");
+      showStatus(messageOf(error), "bad");
     } finally {
       this.draws = false;
     }

@@ -27,13 +27,20 @@ const lines = [
   { kind: "end", outcome: "completed", steps: 3 },
 ];
 
-test("a record is read as it was driven", async () => {
-  globalThis.sessionStorage = { getItem: () => null };
+globalThis.sessionStorage = { getItem: () => null };
+const { load } = await bundled("record");
+
+/** Lets the server have a record. */
+function serve(record) {
+  const text = record.map((line) => JSON.stringify(line)).join("\n") + "\n";
   globalThis.fetch = async (path) => {
     assert.equal(path, "v1/episodes/run-1");
-    return new Response(lines.map((line) => JSON.stringify(line)).join("\n") + "\n");
+    return new Response(text);
   };
-  const { load } = await bundled("record");
+}
+
+test("a record is read as it was driven", async () => {
+  serve(lines);
   const { frames, events, profile, outcome, lanes, drawsActors } = await load("run-1");
   assert.deepEqual(profile, { near: 0.01 });
   assert.equal(outcome, "completed");
@@ -52,4 +59,25 @@ test("a record is read as it was driven", async () => {
     { time_us: 150_000, text: "contact van (ego at fault)", isBad: true },
     { time_us: 300_000, text: "ended route done", isBad: false },
   ]);
+});
+
+test("reading takes a time in proportion to the number of frames", async () => {
+  const seconds = async (count) => {
+    const frames = Array.from({ length: count }, (_, step) => frame("step", step, ["a", "b"]));
+    // A restore in the middle replaces the second half.
+    const again = frames.slice(count / 2).map((line) => ({ ...line, images: ["c", "d"] }));
+    serve([lines[0], ...frames, ...again]);
+    const begun = performance.now();
+    const recording = await load("run-1");
+    const taken = performance.now() - begun;
+    assert.deepEqual(recording.frames.map(({ step }) => step), frames.map(({ step }) => step));
+    assert.equal(recording.frames.at(-1).images.get("rear"), "d");
+    assert.equal(recording.frames[0].images.get("rear"), "b");
+    return taken;
+  };
+  await seconds(9_000);
+  const least = async (count) => Math.min(await seconds(count), await seconds(count), await seconds(count));
+  // Four times the frames take about four times as long; if each frame looked at all others, sixteen times.
+  const ratio = (await least(36_000)) / (await least(9_000));
+  assert.ok(ratio < 10, `${ratio}`);
 });

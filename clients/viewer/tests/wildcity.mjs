@@ -66,6 +66,19 @@ export async function tokenFile(folder, tokens) {
   return path;
 }
 
+/** A scene of some Gaussians, as a PLY file. */
+export function scene(name) {
+  const properties = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+  const count = 200;
+  const header = `ply\nformat binary_little_endian 1.0\nelement vertex ${count}\n${properties.map((property) => `property float ${property}\n`).join("")}end_header\n`;
+  const values = Float32Array.from({ length: count * properties.length }, (_, at) => {
+    const [n, property] = [Math.floor(at / properties.length), at % properties.length];
+    // A patch of ground: 20 by 10 of them, 0.1 apart, flat.
+    return [0.1 * (n % 20), 0.1 * Math.floor(n / 20), 0, (n % 7) / 7, 0.5, 0.2, 4, -3, -3, -5, 1, 0, 0, 0][property];
+  });
+  return { name, mimeType: "application/octet-stream", buffer: Buffer.concat([Buffer.from(header), Buffer.from(values.buffer)]) };
+}
+
 /** The pixels of the twin's start, by camera, as the Python client decodes them. */
 export async function decodedByPython(socket, twin, sizes) {
   const out = await mkdtemp(join(tmpdir(), "viewer-"));
@@ -74,10 +87,18 @@ export async function decodedByPython(socket, twin, sizes) {
   return out;
 }
 
-export const launch = () => chromium.launch({
+export const launch = (...args) => chromium.launch({
   executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  args: ["--no-sandbox", "--use-angle=swiftshader"],
+  args: ["--no-sandbox", "--use-angle=swiftshader", ...args],
 });
+
+/** Lets a page have the files of dist in place of those in the program, which then need not be built again. */
+async function replaceByDist(context) {
+  for (const name of ["viewer.js", "style.css"]) {
+    const path = new URL(`../dist/${name}`, import.meta.url).pathname;
+    await context.route(`**/${name}`, (route) => route.fulfill({ path }));
+  }
+}
 
 /** A page that fails the test if it says anything on its console, fails, or asks another server for anything. */
 export async function open(browser, server, address = "", options = {}) {
@@ -92,6 +113,7 @@ export async function open(browser, server, address = "", options = {}) {
     const url = request.url();
     if (!url.startsWith(server.url) && !url.startsWith("blob:")) complaints.push(`asked for ${url}`);
   });
+  if (process.env.WILDCITY_DIST) await replaceByDist(context);
   await page.goto(`${server.url}${address}`);
   return { page, complaints, close: () => context.close() };
 }

@@ -1,0 +1,182 @@
+// Addresses, settings, new twins and reports.
+import assert from "node:assert/strict";
+import { after, before, test } from "node:test";
+import { home, launch, open, scene, serve, steps } from "./wildcity.mjs";
+
+let place, server, browser;
+
+before(async () => {
+  place = await home();
+  [server, browser] = await Promise.all([serve(place.folder), launch()]);
+});
+
+after(async () => {
+  await browser?.close();
+  await server?.stop();
+  await place?.remove();
+});
+
+const sessions = async () => (await (await fetch(`${server.url}v1/sessions`)).json()).sessions;
+const versions = async () => {
+  const { twins } = await (await fetch(`${server.url}v1/twins`)).json();
+  return Object.fromEntries(twins.map(({ name, version }) => [name, version]));
+};
+
+/** Waits until something holds; the test's own time is the limit. */
+async function until(holds) {
+  while (!(await holds())) await new Promise((resolve) => setTimeout(resolve, 100));
+}
+
+test("a damaged address has a message, and ends the page before", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/drive/demo");
+  await steps(page, 1);
+  assert.equal((await sessions()).length, 1);
+  await page.evaluate(() => (location.hash = "#/drive/%E0%A4%A"));
+  await page.waitForSelector("text=The name in the address #/drive/%E0%A4%A is damaged");
+  assert.equal(await page.$(".view"), null);
+  await until(async () => (await sessions()).length === 0);
+  await page.click("text=To the first page");
+  await page.waitForSelector("text=Recorded episodes");
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("damaged settings do not stop the drive", async () => {
+  const { page, complaints, close } = await open(browser, server);
+  await page.evaluate(() => localStorage.setItem("wildcity-settings", '{"width": 4'));
+  await page.click("text=demo");
+  await steps(page, 1);
+  assert.deepEqual(complaints, []);
+
+  // In a recorded episode the arrows step; with Alt they are the browser's.
+  const session = await page.getAttribute(".view", "data-session");
+  await steps(page, 3);
+  await page.click("#home");
+  await page.click(`text=${session}-1`);
+  await page.waitForSelector(".player[data-same]");
+  const at = () => page.$eval(".track input", ({ value }) => value);
+  await page.keyboard.press("ArrowRight");
+  assert.equal(await at(), "1");
+  for (const modifier of ["Alt", "Control", "Meta"]) {
+    const isFree = await page.evaluate((key) => {
+      const event = new KeyboardEvent("keydown", { code: "ArrowLeft", cancelable: true, bubbles: true, [`${key}Key`]: true });
+      return document.body.dispatchEvent(event);
+    }, { Alt: "alt", Control: "ctrl", Meta: "meta" }[modifier]);
+    assert.ok(isFree, `${modifier} and left is taken`);
+  }
+  assert.equal(await at(), "1");
+  await close();
+});
+
+test("a file with the name of a twin asks for a name", async () => {
+  const { page, complaints, close } = await open(browser, server);
+  const before = await versions();
+  await page.getByLabel("scene files").setInputFiles(scene("demo.ply"));
+  const name = page.getByLabel("name of the twin");
+  await name.waitFor();
+  assert.equal(await name.inputValue(), "demo-2");
+  await page.getByRole("button", { name: "Cancel" }).click();
+  await name.waitFor({ state: "hidden" });
+  assert.deepEqual(await versions(), before);
+
+  await page.getByLabel("scene files").setInputFiles(scene("demo.ply"));
+  await page.click("text=Add as demo-2");
+  await page.waitForSelector(".placing[data-step]");
+  assert.deepEqual(await versions(), { ...before, "demo-2": 1 });
+
+  // The same name again only if the user says so.
+  await page.click("#home");
+  await page.getByLabel("scene files").setInputFiles(scene("demo-2.ply"));
+  await name.fill("demo-2");
+  await page.click("text=Replace demo-2 by a new version");
+  await page.waitForSelector(".placing[data-step]");
+  assert.deepEqual(await versions(), { ...before, "demo-2": 2 });
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("an error of a new twin stays", async () => {
+  const { page, close } = await open(browser, server);
+  await page.getByLabel("scene files").setInputFiles({ name: "broken.ply", mimeType: "", buffer: Buffer.from("ply\nno\n") });
+  const error = page.locator(".adder .bad");
+  await error.waitFor();
+  const text = await error.textContent();
+  assert.ok(text.length > 10, text);
+  // The lists are read again meanwhile.
+  for (let read = 0; read < 2; read++) await page.waitForResponse(/v1\/twins$/);
+  await page.waitForResponse(/v1\/sessions$/);
+  assert.equal(await error.textContent(), text);
+  await close();
+});
+
+test("a double click keeps the places, and a missing scale is not saved in silence", async () => {
+  const { page, complaints, close } = await open(browser, server, "#/place/demo");
+  await steps(page, 1);
+  const box = await page.locator(".picture").boundingBox();
+  const at = (x, y) => [box.x + x * box.width, box.y + y * box.height];
+  const placed = (step) => page.getAttribute(".placing", `data-${step}`);
+  const click = async (x, y) => {
+    await page.mouse.click(...at(x, y));
+    // Two clicks at once would be a double click.
+    await page.waitForTimeout(600);
+  };
+  await page.click("text=2 Scale");
+  for (const [x, y] of [[0.5, 0.5], [0.5, 0.55], [0.45, 0.5], [0.55, 0.5], [0.5, 0.6], [0.4, 0.55]]) {
+    if ((await placed("scale")) !== "2") await click(x, y);
+  }
+  assert.equal(await placed("scale"), "2");
+  const text = await page.textContent(".found");
+  await page.mouse.dblclick(...at(0.52, 0.52));
+  assert.equal(await placed("scale"), "2");
+  assert.equal(await page.textContent(".found"), text);
+
+  // One place is no scale.
+  await page.getByRole("button", { name: "Undo" }).click();
+  await page.click("text=3 Path");
+  for (const [x, y] of [[0.45, 0.5], [0.5, 0.5], [0.55, 0.5], [0.5, 0.6]]) await click(x, y);
+  assert.match(await page.textContent(".found"), /the scale has 1 of 2 places/);
+  assert.ok(await page.isDisabled(".save"));
+  await page.click("text=2 Scale");
+  await page.getByRole("button", { name: "Clear" }).click();
+  await page.click("text=3 Path");
+  assert.match(await page.textContent(".found"), /no distance: 1 m per unit/);
+  const before = await versions();
+  await page.getByRole("button", { name: "Save and drive" }).click();
+  assert.match(await page.textContent(".found"), /No distance was given/);
+  assert.deepEqual(await versions(), before);
+  await page.getByRole("button", { name: "Save with 1 m per unit" }).click();
+  await page.waitForSelector(".view:not(.placing)[data-step]");
+  assert.equal((await versions()).demo, before.demo + 1);
+  assert.deepEqual(complaints, []);
+  await close();
+});
+
+test("the errors of a report are on the map", async () => {
+  const { page, complaints, close } = await open(browser, server);
+  await page.click("text=Show the errors of a report on the map");
+  const files = ["report.json", "report.html"].map((name) => new URL(`report/${name}`, import.meta.url).pathname);
+  await page.getByLabel("report files").setInputFiles(files);
+  await page.waitForSelector("text=71 m, 1 m left: 115.8 dB");
+  await page.getByLabel("setting").selectOption("tau_px=4 alpha_cut=0.032 stop=0.004");
+  await page.waitForSelector("text=71 m, 1 m left: 34.8 dB");
+  await page.waitForSelector("text=The worst window is at 71 m, 1 m left.");
+  const captions = await page.$$eval("figcaption", (all) => all.map(({ textContent }) => textContent));
+  assert.deepEqual(captions, ["as rendered", "reference", "error"]);
+  // The map has a dot of the colour of each place, and they fit in it.
+  const dots = await page.$$eval(".dot", (all) => all.map((dot) => getComputedStyle(dot).backgroundColor));
+  assert.equal(dots.length, 8);
+  await page.waitForFunction((colours) => {
+    const map = document.querySelector(".map");
+    const copy = new OffscreenCanvas(map.width, map.height).getContext("2d", { willReadFrequently: true });
+    copy.drawImage(map, 0, 0);
+    const { data } = copy.getImageData(0, 0, map.width, map.height);
+    const seen = new Set();
+    for (let at = 0; at < data.length; at += 4) seen.add(`rgb(${data[at]}, ${data[at + 1]}, ${data[at + 2]})`);
+    return colours.every((colour) => seen.has(colour));
+  }, dots);
+
+  await page.getByLabel("report files").setInputFiles({ name: "other.json", mimeType: "", buffer: Buffer.from("{}") });
+  await page.waitForSelector("text=this JSON is no report");
+  assert.deepEqual(complaints, []);
+  await close();
+});
