@@ -46,7 +46,10 @@ fn a_spoiled_twin_can_be_stored() {
     for index in 0..once.len() {
         let length = once.quats_wxyz[index].iter().map(|q| q * q).sum::<f32>().sqrt();
         assert!((length - 1.0).abs() < 1e-5, "quaternion {index} of length {length}");
-        assert!(once.ln_scales[index].iter().all(|ln| (-30.0..=10.0).contains(ln)), "scale {index}");
+        assert!(
+            once.ln_scales[index].iter().all(|ln| (-30.0..=10.0).contains(ln)),
+            "scale {index}"
+        );
     }
     // The formats of records hold coefficients up to 16.
     assert!(once.sh.iter().all(|c| c.abs() < 16.0));
