@@ -254,7 +254,7 @@ fn rows_of_a_moving_camera_have_their_own_poses() {
             shutter: Some((direction, first)),
             depth_m: &depth_m,
         };
-        let warped = warp(&target, &[reference.clone()]);
+        let warped = warp(&target, std::slice::from_ref(&reference));
         let mut compared = 0;
         for index in (0..depth_m.len()).filter(|index| warped.valid[*index] > 0.0) {
             let pixels = [&warped.image, &image].map(|image| &image.rgb8[3 * index..][..3]);
@@ -284,7 +284,7 @@ fn nothing_comes_without_depth_or_from_far_beside() {
         depth_m: &opaque,
     };
     let reference = walls.reference(&camera, at(0.2, 0.0, 0.0));
-    let warped = warp(&view, &[reference.clone()]);
+    let warped = warp(&view, std::slice::from_ref(&reference));
     let valid = |parity: usize| {
         warped.valid.iter().skip(parity).step_by(2).map(|valid| f64::from(*valid)).sum::<f64>()
     };

@@ -26,7 +26,8 @@ pub(super) struct RayPoints {
 }
 
 impl Rays {
-    /// Of a camera. With a bent lens this is a table of 12 bytes per pixel, which takes a tenth of a second to fill.
+    /// Of a camera. With a bent lens this is a table of 12 bytes per pixel, which takes a microsecond per
+    /// pixel to fill.
     pub fn of(camera: &Camera) -> Self {
         let pinhole = &camera.pinhole;
         if camera.is_pinhole() {
