@@ -2,6 +2,7 @@
 
 mod driver;
 mod mosaic;
+mod off_trajectory;
 mod scenario;
 
 use std::io::{self, ErrorKind, Write};
@@ -16,7 +17,8 @@ use serde_json::json;
 use wildcity_client::protocol::message::ScenarioChoice;
 use wildcity_client::protocol::observation::Event;
 use wildcity_client::{Client, Movement, Observation, Open, Pose};
-use wildcity_generate::StreetSettings;
+use wildcity_generate::{Spoil, StreetSettings};
+use wildcity_repair::{LoadOptions, Models};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RecordFormat, Rig};
 use wildcity_server::{Config, Directories};
@@ -31,6 +33,7 @@ use self::scenario::DemoScenario;
 use super::actor::generated;
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
+use super::repair_options::runtime_library;
 use super::{output, progress, view};
 
 /// Build a demo street, drive through it as an agent, and write images of the drive.
@@ -41,6 +44,9 @@ use super::{output, progress, view};
 /// instead, where the street can be driven by hand.
 ///
 /// With --scenario, there is traffic: the agent keeps its distance from other vehicles and pedestrians.
+///
+/// With --off-trajectory, it does not drive. It draws views beside the drive from a spoiled copy of the street, which
+/// is wrong there as captures are, and compares them with the street itself; with --repair also after the repair.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {
@@ -60,6 +66,18 @@ pub(super) struct Demo {
     #[arg(long, conflicts_with_all = ["steps", "scenario"])]
     view: bool,
 
+    /// Draw views this far to the left of the drive, in metres, instead of driving.
+    #[arg(long, value_name = "M", conflicts_with_all = ["steps", "scenario", "view"], allow_negative_numbers = true)]
+    off_trajectory: Option<f64>,
+
+    /// Repair these views by the model that comes with the program.
+    #[arg(long, requires = "off_trajectory")]
+    repair: bool,
+
+    /// ONNX Runtime library for --repair, from version 1.18 on [default: ORT_DYLIB_PATH]
+    #[arg(long, value_name = "PATH", requires = "repair")]
+    onnxruntime: Option<PathBuf>,
+
     #[command(flatten)]
     twins: Twins,
 
@@ -73,12 +91,17 @@ Examples:
   wildcity demo --view
   wildcity demo --steps 20 --out /tmp/look
   wildcity demo --scenario cut-in
+  wildcity demo --off-trajectory 3 --repair --onnxruntime libonnxruntime.so.1.32.0
   wildcity serve            (then an agent can open the twin \"demo\")";
 
 /// Name of the demo twin.
 pub(super) const TWIN: &str = "demo";
 /// Name of the demo twin that `wildcity report` measures: the same street in record format f32.
 const EXACT_TWIN: &str = "demo-f32";
+/// Name of the demo twin that is spoiled.
+const SPOILED_TWIN: &str = "demo-spoiled";
+/// How much it is spoiled: [`Spoil::new`].
+const SPOILED_BY: f64 = 0.5;
 /// Prefix of the provenance of the demo street, in every revision of the generator.
 const STREET: &str = "street ";
 /// Speed of the agent, in m/s.
@@ -91,26 +114,50 @@ const MOSAIC_STEPS: u64 = 10;
 impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
-        let version = demo_twin(&twins, TWIN, StorageOptions::default())?;
+        let version = demo_twin(&twins, TWIN, StorageOptions::default(), None)?;
         let assets = match self.scenario {
             Some(_) => generated(&self.twins.catalog()?)?,
             None => Vec::new(),
         };
         output::create_dir(&self.out)?;
+        if self.off_trajectory.is_some() {
+            demo_twin(&twins, SPOILED_TWIN, StorageOptions::default(), Some(SPOILED_BY))?;
+        }
         let directories = Directories {
             twins,
             episodes: self.out.join("episodes"),
             scenarios: self.out.join("scenarios"),
             uploads: self.out.join("uploads"),
         };
+        let repairs = match self.repair {
+            true => {
+                let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
+                off_trajectory::model(&self.out.join("model"), options)?
+            }
+            false => Models::default(),
+        };
         let config = Config {
             cache: self.twins.cache(),
+            repairs: Arc::new(repairs),
             ..Config::local(directories, Arc::from(self.backend.backend()?))
         };
         if self.view {
             return view::serve(config, Some(TWIN), true);
         }
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
+        if let Some(offset_m) = self.off_trajectory {
+            let twins = [TWIN, SPOILED_TWIN];
+            let catalog = self.twins.catalog()?;
+            let drive = &version.manifest.trajectories[0];
+            return runtime.block_on(async {
+                let running = wildcity_server::start(config).await?;
+                let url = running.url();
+                let views = off_trajectory::Views { offset_m, repair: self.repair, out: &self.out };
+                let shown = views.show(&url, &catalog, twins, drive).await;
+                running.stop().await;
+                shown
+            });
+        }
         let drive = runtime.block_on(async {
             let running = wildcity_server::start(config).await?;
             let drive = self.drive(&running.url(), &version, &assets).await;
@@ -259,23 +306,34 @@ pub(super) fn exact_twin(twins: &Path) -> anyhow::Result<Version> {
         twins,
         EXACT_TWIN,
         StorageOptions { record: RecordFormat::F32, ..StorageOptions::default() },
+        None,
     )
 }
 
 /// The demo twin in the user's directory. It is built on first use, and again if the generator changed or
 /// the files are damaged.
-fn demo_twin(twins: &Path, name: &str, storage: StorageOptions) -> anyhow::Result<Version> {
+fn demo_twin(
+    twins: &Path,
+    name: &str,
+    storage: StorageOptions,
+    spoil: Option<f64>,
+) -> anyhow::Result<Version> {
     let catalog = Catalog::open(twins)?;
     let settings = StreetSettings::default();
     let revision = wildcity_generate::REVISION;
     let settings_json = serde_json::to_string(&settings)?;
-    let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}"));
+    let spoiled = spoil.map_or(String::new(), |amount| format!(", spoiled by {amount}"));
+    let provenance = Provenance::of(format!("{STREET}{revision}: {settings_json}{spoiled}"));
     let reason = match existing(&catalog, name, &provenance)? {
         Existing::Usable(version) => return Ok(*version),
         Existing::Rebuild(reason) => reason,
     };
     writeln!(io::stderr(), "building the demo twin in {} ({reason})", twins.display())?;
-    let street = wildcity_generate::street(&settings)?;
+    let mut street = wildcity_generate::street(&settings)?;
+    if let Some(amount) = spoil {
+        let spoil = Spoil::new(amount, settings.seed, &street.trajectory)?;
+        street.gaussians = spoil.apply(&street.gaussians);
+    }
     let sky = sky::read_bytes(wildcity_generate::SKY, None)?;
     let bar = progress::count("writing");
     let version = catalog.commit(
