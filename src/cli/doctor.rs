@@ -15,6 +15,7 @@ use wildcity_twin::store::StoreError;
 
 use super::directories::{Episodes, Twins, Uploads};
 use super::exit::Exit;
+use super::serve::Serve;
 
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
 ///
@@ -24,6 +25,10 @@ use super::exit::Exit;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Doctor {
+    /// TOML file of `wildcity serve --config`: check what it names, too: address, tokens, certificate, audit log, scenarios.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["twins", "episodes", "uploads"])]
+    config: Option<PathBuf>,
+
     #[command(flatten)]
     twins: Twins,
 
@@ -41,6 +46,7 @@ pub(super) struct Doctor {
 const EXAMPLES: &str = "\
 Examples:
   wildcity doctor
+  wildcity doctor --config /etc/wildcity/wildcity.toml
   wildcity doctor --twins s3://city/twins";
 
 /// Memory below which a city of some blocks does not fit.
@@ -83,18 +89,29 @@ impl Level {
 
 impl Doctor {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let mut findings =
-            vec![devices_found(), processors(), memory(), open_files(), clock(), port()];
-        let directories = [("episodes", self.episodes.dir()?), ("uploads", self.uploads.dir()?)];
+        let serve = self.config.as_deref().map(Serve::of_file).transpose()?;
+        let (twins, episodes, uploads) = match serve.as_ref().map(Serve::directories) {
+            Some(all) => (&all.twins, &all.episodes, &all.uploads),
+            None => (&self.twins, &self.episodes, &self.uploads),
+        };
+        let mut findings = vec![devices_found(), processors(), memory(), open_files(), clock()];
+        match &serve {
+            Some(serve) => findings.extend(serve.checks().into_iter().map(|(about, found)| {
+                let level = if found.is_ok() { Level::Good } else { Level::Bad };
+                Finding::new(level, about, found.unwrap_or_else(|wrong| wrong))
+            })),
+            None => findings.push(port()),
+        }
+        let directories = [("episodes", episodes.dir()?), ("uploads", uploads.dir()?)];
         findings.extend(directories.map(|(about, dir)| disk(about, &dir)));
-        findings.extend(self.twins());
+        findings.extend(twins_found(twins));
         let mut out = io::stdout().lock();
         if self.json {
             let of = |Finding { level, about, text }: &Finding| json!({ "level": level.name(), "about": about, "text": text });
             writeln!(out, "{}", json!(findings.iter().map(of).collect::<Vec<_>>()))?;
         } else {
             for Finding { level, about, text } in &findings {
-                writeln!(out, "{:<5}{about:<11}{text}", level.name())?;
+                writeln!(out, "{:<5}{about:<12}{text}", level.name())?;
             }
         }
         let bad = findings.iter().filter(|finding| finding.level == Level::Bad).count();
@@ -104,50 +121,50 @@ impl Doctor {
         }
         Ok(())
     }
+}
 
-    /// The directory or the object store of the twins, and the twins.
-    fn twins(&self) -> Vec<Finding> {
-        let bad = |text: String| vec![Finding::new(Level::Bad, "twins", text)];
-        let dir = match self.twins.dir() {
-            Ok(dir) => dir,
-            Err(error) => return bad(format!("{error:#}")),
-        };
-        let is_remote = dir.to_string_lossy().contains("://");
-        let mut findings = match is_remote {
-            true => Vec::new(),
-            false => vec![disk("twins", &dir)],
-        };
-        let begun = std::time::Instant::now();
-        let listed = self.twins.catalog().and_then(|catalog| {
-            let twins = catalog.twins()?;
-            Ok((twins, catalog.actors()?))
-        });
-        match listed {
-            Ok((list, actors)) => {
+/// The directory or the object store of the twins, and the twins.
+fn twins_found(twins: &Twins) -> Vec<Finding> {
+    let bad = |text: String| vec![Finding::new(Level::Bad, "twins", text)];
+    let dir = match twins.dir() {
+        Ok(dir) => dir,
+        Err(error) => return bad(format!("{error:#}")),
+    };
+    let is_remote = dir.to_string_lossy().contains("://");
+    let mut findings = match is_remote {
+        true => Vec::new(),
+        false => vec![disk("twins", &dir)],
+    };
+    let begun = std::time::Instant::now();
+    let listed = twins.catalog().and_then(|catalog| {
+        let twins = catalog.twins()?;
+        Ok((twins, catalog.actors()?))
+    });
+    match listed {
+        Ok((list, actors)) => {
+            let text = format!(
+                "{} twins in {}, listed in {} ms",
+                list.twins.len(),
+                dir.display(),
+                begun.elapsed().as_millis()
+            );
+            let level = if list.twins.is_empty() { Level::Note } else { Level::Good };
+            findings.push(Finding::new(level, "twins", text));
+            for damaged in list.damaged {
                 let text = format!(
-                    "{} twins in {}, listed in {} ms",
-                    list.twins.len(),
-                    dir.display(),
-                    begun.elapsed().as_millis()
+                    "{} is damaged: {}; wildcity twin fsck {} says more",
+                    damaged.name, damaged.error, damaged.name
                 );
-                let level = if list.twins.is_empty() { Level::Note } else { Level::Good };
-                findings.push(Finding::new(level, "twins", text));
-                for damaged in list.damaged {
-                    let text = format!(
-                        "{} is damaged: {}; wildcity twin fsck {} says more",
-                        damaged.name, damaged.error, damaged.name
-                    );
-                    findings.push(Finding::new(Level::Bad, "twins", text));
-                }
-                for damaged in actors.damaged {
-                    let text = StoreError::from(damaged).to_string();
-                    findings.push(Finding::new(Level::Bad, "actors", text));
-                }
+                findings.push(Finding::new(Level::Bad, "twins", text));
             }
-            Err(error) => findings.extend(bad(format!("{}: {error:#}", dir.display()))),
+            for damaged in actors.damaged {
+                let text = StoreError::from(damaged).to_string();
+                findings.push(Finding::new(Level::Bad, "actors", text));
+            }
         }
-        findings
+        Err(error) => findings.extend(bad(format!("{}: {error:#}", dir.display()))),
     }
+    findings
 }
 
 fn devices_found() -> Finding {

@@ -90,6 +90,12 @@ pub enum PushError {
         /// What the operating system says.
         reason: String,
     },
+    /// The process gave it up before it began.
+    #[error("the push did not begin: {reason}")]
+    Abandoned {
+        /// Why.
+        reason: String,
+    },
     /// A defect of the program.
     #[error("a task crashed; the server's log says where")]
     Crashed,
@@ -113,6 +119,7 @@ impl PushError {
             | Self::ShuttingDown
             | Self::Session(_)
             | Self::Unreadable { .. }
+            | Self::Abandoned { .. }
             | Self::Crashed => false,
         }
     }

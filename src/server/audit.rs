@@ -1,19 +1,22 @@
 //! The audit log: which token made which version of a twin or which asset of an actor, one JSON object a line.
 //!
 //! A line is on disk before what it announces begins, and again when that ended: what cannot be logged is refused. At
-//! [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, in place of an older one, and a new file begins; if that
-//! fails, the log says why and goes on in the same file.
+//! [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, an older FILE.1 to FILE.2 and so on, and a new file begins; if
+//! that fails, the log says why and goes on in the same file. A line has a bounded length: names are checked before, and
+//! reasons are cut.
 
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use parking_lot::Mutex;
 use serde::Serialize;
 
 use crate::auth::Grant;
+use crate::blocking::blocking;
 use crate::fault::Fault;
 use crate::limits;
 
@@ -31,31 +34,33 @@ struct Log {
 
 /// A change of a twin, or of the assets of actors.
 #[derive(Clone, Debug)]
-pub(crate) struct Change<'a> {
-    /// `push`, `edit`, `rollback` or `actor`.
+pub(crate) struct Change {
+    /// `push`, `cancel`, `edit`, `rollback` or `actor`.
     pub(crate) what: &'static str,
     /// What is changed.
-    pub(crate) target: Target<'a>,
+    pub(crate) target: Target,
     /// Id of the push.
-    pub(crate) id: Option<&'a str>,
+    pub(crate) id: Option<String>,
 }
 
 /// What a change changes.
-#[derive(Clone, Copy, Debug)]
-pub(crate) enum Target<'a> {
+#[derive(Clone, Debug)]
+pub(crate) enum Target {
     /// The twin of this name.
-    Twin(&'a str),
+    Twin(String),
     /// The asset of this name.
-    Actor(&'a str),
+    Actor(String),
 }
 
 /// What a change made.
 #[derive(Clone, Debug)]
-pub(crate) enum Made<'a> {
+pub(crate) enum Made {
     /// A version of this number.
     Version(u64),
     /// An asset of this hash.
-    Asset(&'a str),
+    Asset(String),
+    /// Neither: a push was cancelled.
+    Nothing,
 }
 
 /// A line.
@@ -87,23 +92,69 @@ impl Audit {
         path.map(|path| Log::open(path, limits::AUDIT_BYTES).map(Mutex::new)).transpose().map(Self)
     }
 
-    /// Writes that a change begins.
+    /// Writes that a change begins, on a thread that may wait for the disk.
     ///
     /// # Errors
     /// [`Fault::Audit`]: the change must not begin.
-    pub(crate) fn begin(&self, grant: &Grant, change: &Change<'_>) -> Result<(), Fault> {
+    pub(crate) async fn begin(
+        self: &Arc<Self>,
+        grant: &Arc<Grant>,
+        change: &Change,
+    ) -> Result<(), Fault> {
+        if self.0.is_none() {
+            return Ok(());
+        }
+        let shared = (self.clone(), grant.clone(), change.clone());
+        blocking(move || {
+            let (log, grant, change) = shared;
+            log.begin_now(&grant, &change)
+        })
+        .await
+    }
+
+    /// Writes what a change made, or why it made nothing, on a thread that may wait for the disk.
+    pub(crate) async fn end(
+        self: &Arc<Self>,
+        grant: &Arc<Grant>,
+        change: &Change,
+        ended: Result<Made, impl Display>,
+    ) {
+        if self.0.is_none() {
+            return;
+        }
+        let ended = ended.map_err(|reason| reason.to_string());
+        let shared = (self.clone(), grant.clone(), change.clone());
+        let written = blocking(move || {
+            let (log, grant, change) = shared;
+            log.end_now(&grant, &change, ended);
+            Ok::<_, Fault>(())
+        });
+        if let Err(fault) = written.await {
+            tracing::error!("{fault}");
+        }
+    }
+
+    /// Writes that a change begins, and waits for the disk.
+    ///
+    /// # Errors
+    /// [`Fault::Audit`]: the change must not begin.
+    pub(crate) fn begin_now(&self, grant: &Grant, change: &Change) -> Result<(), Fault> {
         self.write(grant, change, None)
     }
 
-    /// Writes what a change made, or why it made nothing. What is done is done: a line that cannot be written is an
-    /// error in the server's log.
-    pub(crate) fn end(
+    /// Writes what a change made, or why it made nothing, and waits for the disk. What is done is done: a line that
+    /// cannot be written is an error in the server's log.
+    pub(crate) fn end_now(
         &self,
         grant: &Grant,
-        change: &Change<'_>,
-        ended: Result<Made<'_>, impl Display>,
+        change: &Change,
+        ended: Result<Made, impl Display>,
     ) {
-        let ended = ended.map_err(|reason| reason.to_string());
+        let reason = |reason: String| match reason.char_indices().nth(limits::AUDIT_REASON_CHARS) {
+            Some((at, _)) => format!("{} ..", &reason[..at]),
+            None => reason,
+        };
+        let ended = ended.map_err(|error| reason(error.to_string()));
         if let Err(fault) = self.write(grant, change, Some(ended)) {
             tracing::error!(target = ?change.target, "{fault}");
         }
@@ -112,15 +163,15 @@ impl Audit {
     fn write(
         &self,
         grant: &Grant,
-        change: &Change<'_>,
-        ended: Option<Result<Made<'_>, String>>,
+        change: &Change,
+        ended: Option<Result<Made, String>>,
     ) -> Result<(), Fault> {
         let Some(log) = &self.0 else { return Ok(()) };
         let since_1970 = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let Change { what, target, id } = *change;
+        let Change { what, target, id } = change;
         let (twin, actor) = match target {
-            Target::Twin(name) => (Some(name), None),
-            Target::Actor(name) => (None, Some(name)),
+            Target::Twin(name) => (Some(&**name), None),
+            Target::Actor(name) => (None, Some(&**name)),
         };
         let begun = Line {
             time_us: since_1970.as_micros() as u64,
@@ -128,7 +179,7 @@ impl Audit {
             what,
             twin,
             actor,
-            id,
+            id: id.as_deref(),
             state: "begun",
             version: None,
             hash: None,
@@ -139,7 +190,8 @@ impl Audit {
             Some(Ok(Made::Version(version))) => {
                 Line { state: "done", version: Some(*version), ..begun }
             }
-            Some(Ok(Made::Asset(hash))) => Line { state: "done", hash: Some(*hash), ..begun },
+            Some(Ok(Made::Asset(hash))) => Line { state: "done", hash: Some(hash), ..begun },
+            Some(Ok(Made::Nothing)) => Line { state: "done", ..begun },
             Some(Err(reason)) => Line { state: "refused", reason: Some(reason), ..begun },
         };
         let mut text = serde_json::to_vec(&line).map_err(|e| Fault::Internal(e.to_string()))?;
@@ -181,12 +233,24 @@ impl Log {
         written
     }
 
-    /// Begins a new file, and keeps one old file.
+    /// Begins a new file, and keeps [`limits::AUDIT_OLD_FILES`] old ones.
     fn rotate(&mut self) {
-        let mut old = self.path.clone().into_os_string();
-        old.push(".1");
+        let old = |number: usize| match number {
+            0 => self.path.clone(),
+            _ => {
+                let mut path = self.path.clone().into_os_string();
+                path.push(format!(".{number}"));
+                PathBuf::from(path)
+            }
+        };
         let begin = || {
-            fs::rename(&self.path, &old)?;
+            // The oldest first: a rename replaces the file before it.
+            for number in (0..limits::AUDIT_OLD_FILES).rev() {
+                match fs::rename(old(number), old(number + 1)) {
+                    Err(error) if number > 0 && error.kind() == io::ErrorKind::NotFound => {}
+                    renamed => renamed?,
+                }
+            }
             OpenOptions::new().create(true).append(true).open(&self.path)
         };
         match begin() {
@@ -208,8 +272,9 @@ impl Log {
 mod tests {
     use super::*;
 
-    fn change() -> Change<'static> {
-        Change { what: "push", target: Target::Twin("street"), id: Some("p1") }
+    fn change() -> Change {
+        let target = Target::Twin("street".to_owned());
+        Change { what: "push", target, id: Some("p1".to_owned()) }
     }
 
     fn lines(path: &Path) -> Vec<serde_json::Value> {
@@ -224,9 +289,9 @@ mod tests {
         let grant = Grant::everything();
         for _ in 0..2 {
             let audit = Audit::open(Some(&path)).unwrap();
-            audit.begin(&grant, &change()).unwrap();
-            audit.end(&grant, &change(), Ok::<_, &str>(Made::Version(3)));
-            audit.end(&grant, &change(), Err("too sparse"));
+            audit.begin_now(&grant, &change()).unwrap();
+            audit.end_now(&grant, &change(), Ok::<_, &str>(Made::Version(3)));
+            audit.end_now(&grant, &change(), Err("too sparse"));
         }
         let lines = lines(&path);
         assert_eq!(lines.len(), 6);
@@ -249,11 +314,35 @@ mod tests {
         assert_eq!(fs::read_to_string(&path).unwrap(), "{\"second, too long for it\": 2}\n");
         let old = dir.path().join("audit.jsonl.1");
         assert_eq!(fs::read_to_string(&old).unwrap(), "{\"cut\n{\"first\": 1}\n");
-        // Where the old file cannot be replaced, the log goes on in the same one.
-        fs::remove_file(&old).unwrap();
-        fs::create_dir_all(old.join("taken")).unwrap();
+        // Where an old file cannot be replaced, the log goes on in the same one.
+        fs::write(dir.path().join("audit.jsonl.7"), "old").unwrap();
+        fs::create_dir_all(dir.path().join("audit.jsonl.8/taken")).unwrap();
         log.append(b"{\"third, too long for it\": 3}\n").unwrap();
         assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), 2);
+    }
+
+    #[test]
+    fn several_old_files_are_kept_and_a_long_reason_is_cut() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("audit.jsonl");
+        let mut log = Log::open(&path, 40).unwrap();
+        let last = limits::AUDIT_OLD_FILES + 2;
+        for number in 0..=last {
+            log.append(format!("{{\"line, too long for two\": {number:4}}}\n").as_bytes()).unwrap();
+        }
+        for (name, number) in
+            [("audit.jsonl", last), ("audit.jsonl.1", last - 1), ("audit.jsonl.8", 2)]
+        {
+            let text = fs::read_to_string(dir.path().join(name)).unwrap();
+            assert!(text.ends_with(&format!("{number:4}}}\n")), "{name}: {text}");
+        }
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1 + limits::AUDIT_OLD_FILES);
+
+        let audit = Audit::open(Some(&dir.path().join("long.jsonl"))).unwrap();
+        audit.end_now(&Grant::everything(), &change(), Err("é".repeat(60_000)));
+        let reason =
+            lines(&dir.path().join("long.jsonl"))[0]["reason"].as_str().unwrap().to_owned();
+        assert_eq!(reason.chars().count(), limits::AUDIT_REASON_CHARS + 3);
     }
 
     #[test]
@@ -263,9 +352,9 @@ mod tests {
         let file = OpenOptions::new().append(true).open(full).unwrap();
         let log = Log { path: full.to_owned(), file, bytes: 0, limit_bytes: 1 << 20 };
         let audit = Audit(Some(Mutex::new(log)));
-        let refused = audit.begin(&Grant::everything(), &change()).unwrap_err();
+        let refused = audit.begin_now(&Grant::everything(), &change()).unwrap_err();
         assert!(matches!(refused, Fault::Audit { .. }), "{refused}");
-        assert!(Audit::open(None).unwrap().begin(&Grant::everything(), &change()).is_ok());
+        assert!(Audit::open(None).unwrap().begin_now(&Grant::everything(), &change()).is_ok());
         assert!(Audit::open(Some(Path::new("/nowhere/audit.jsonl"))).is_err());
     }
 }

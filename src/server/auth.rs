@@ -3,11 +3,15 @@
 //! A server without tokens listens on a loopback address only, and every client may do everything.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use blake3::Hash;
+use parking_lot::Mutex;
 use serde::Deserialize;
 use sha2::{Digest as _, Sha256};
+
+use wildcity_twin::ingest;
 
 use crate::fault::Fault;
 use crate::limits;
@@ -16,9 +20,11 @@ use crate::limits;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
+    /// Read the metrics, and nothing else.
+    Metrics,
     /// Open sessions.
     Drive,
-    /// Upload and push.
+    /// Open sessions, upload and push.
     Push,
     /// Everything.
     Admin,
@@ -41,6 +47,8 @@ pub(crate) struct Grant {
 pub(crate) struct TokenLimits {
     /// Sessions, connected or waiting to be resumed.
     pub(crate) sessions: Option<usize>,
+    /// WebSocket connections, those of watchers too.
+    pub(crate) connections: Option<usize>,
     /// Pushes and edits that wait or run.
     pub(crate) pushes: Option<usize>,
     /// Bytes of uploads.
@@ -49,7 +57,15 @@ pub(crate) struct TokenLimits {
 
 /// The tokens that a server accepts.
 #[derive(Clone, Debug)]
-pub struct Tokens(Vec<Token>);
+pub struct Tokens {
+    tokens: Vec<Token>,
+    /// The file that they were read from.
+    file: Option<PathBuf>,
+}
+
+/// The tokens of a running server, which can be read again.
+#[derive(Debug)]
+pub(crate) struct CurrentTokens(Mutex<Arc<Tokens>>);
 
 #[derive(Clone, Debug)]
 struct Token {
@@ -99,7 +115,18 @@ struct Entry {
 const MIN_TOKEN_BYTES: usize = 16;
 
 impl Tokens {
-    /// Reads a file of tokens: `{"tokens": [{"name", "role", "token" or "hash", "twins", "limits"}]}`, where
+    /// Reads a file, as [`Self::parse`] does, and notes its path: a running server reads it again at SIGHUP.
+    ///
+    /// # Errors
+    /// The file cannot be read, is larger than [`limits::TOKENS_FILE_BYTES`], or has an entry that cannot be used.
+    pub fn read(path: &Path) -> Result<Self, TokensError> {
+        let text = ingest::read_whole(path, limits::TOKENS_FILE_BYTES).map_err(|error| {
+            TokensError { location: "the file".to_owned(), reason: error.to_string() }
+        })?;
+        Ok(Self { file: Some(path.to_owned()), ..Self::parse(&text)? })
+    }
+
+    /// Parses a file of tokens: `{"tokens": [{"name", "role", "token" or "hash", "twins", "limits"}]}`, where
     /// `hash` is `blake3:` or `sha-256:` and the hash of the token in hex.
     ///
     /// # Errors
@@ -149,12 +176,12 @@ impl Tokens {
             let grant = Grant { name, role, twins, limits };
             tokens.push(Token { grant: Arc::new(grant), secret });
         }
-        Ok(Self(tokens))
+        Ok(Self { tokens, file: None })
     }
 
     /// Number of tokens that may upload.
     pub(crate) fn uploaders(&self) -> usize {
-        self.0.iter().filter(|token| token.grant.require(Role::Push).is_ok()).count()
+        self.tokens.iter().filter(|token| token.grant.require(Role::Push).is_ok()).count()
     }
 
     /// Bytes that the uploads of a token may take, by name, for tokens with a limit of their own.
@@ -163,7 +190,7 @@ impl Tokens {
             let bytes = token.grant.limits.upload_bytes?;
             Some((token.grant.name.clone(), bytes))
         };
-        self.0.iter().filter_map(limited).collect()
+        self.tokens.iter().filter_map(limited).collect()
     }
 
     /// What the token in the value of an `Authorization` header allows.
@@ -176,7 +203,7 @@ impl Tokens {
         let of_sha256 = blake3::hash(&Sha256::digest(token));
         // Compares with all tokens even after a match: the time must not depend on which one it is.
         let mut matching = None;
-        for Token { grant, secret } in &self.0 {
+        for Token { grant, secret } in &self.tokens {
             let is_equal = match secret {
                 Secret::OfToken(hash) => *hash == of_token,
                 Secret::OfSha256(hash) => *hash == of_sha256,
@@ -186,6 +213,31 @@ impl Tokens {
             }
         }
         matching.cloned().ok_or(Fault::Unauthorized)
+    }
+}
+
+impl CurrentTokens {
+    pub(crate) fn new(tokens: Tokens) -> Self {
+        Self(Mutex::new(Arc::new(tokens)))
+    }
+
+    /// The tokens of this moment.
+    pub(crate) fn get(&self) -> Arc<Tokens> {
+        self.0.lock().clone()
+    }
+
+    /// Reads the file again, if the tokens came from one, and returns its path. Connections that exist keep what
+    /// their token allowed.
+    ///
+    /// # Errors
+    /// The path, and why the file cannot be used: then the old tokens stay.
+    pub(crate) fn read_again(&self) -> Result<Option<PathBuf>, (PathBuf, TokensError)> {
+        let Some(file) = self.get().file.clone() else { return Ok(None) };
+        match Tokens::read(&file) {
+            Ok(tokens) => *self.0.lock() = Arc::new(tokens),
+            Err(error) => return Err((file, error)),
+        }
+        Ok(Some(file))
     }
 }
 
@@ -208,16 +260,29 @@ impl Grant {
         Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
     }
 
-    /// Requires a role, which [`Role::Admin`] includes.
+    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`] that of
+    /// [`Role::Drive`].
     ///
     /// # Errors
     /// [`Fault::Forbidden`] if the token has another role.
     pub(crate) fn require(&self, role: Role) -> Result<(), Fault> {
-        if self.role == role || self.role == Role::Admin {
+        if self.role.includes(role) {
             return Ok(());
         }
         let needs = role.name();
         let reason = format!("its role is {}, not {needs}", self.role.name());
+        Err(Fault::Forbidden { field: "authorization", reason })
+    }
+
+    /// Requires any role but [`Role::Metrics`].
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`] if the token may read metrics alone.
+    pub(crate) fn require_more_than_metrics(&self) -> Result<(), Fault> {
+        if self.role != Role::Metrics {
+            return Ok(());
+        }
+        let reason = "its role is metrics: it may GET /metrics alone".to_owned();
         Err(Fault::Forbidden { field: "authorization", reason })
     }
 
@@ -259,8 +324,13 @@ impl Grant {
 }
 
 impl Role {
+    fn includes(self, role: Self) -> bool {
+        self == role || self == Self::Admin || (self == Self::Push && role == Self::Drive)
+    }
+
     fn name(self) -> &'static str {
         match self {
+            Self::Metrics => "metrics",
             Self::Drive => "drive",
             Self::Push => "push",
             Self::Admin => "admin",
@@ -302,6 +372,65 @@ mod tests {
         let grant = tokens.grant(Some(b"Bearer one")).unwrap();
         assert!(grant.require(Role::Drive).is_ok() && grant.require(Role::Push).is_err());
         assert!(grant.allows_twin("street") && !grant.allows_twin("road"));
+    }
+
+    #[test]
+    fn admin_includes_all_roles_and_push_includes_drive() {
+        use Role::{Admin, Drive, Metrics, Push};
+        for (role, included) in [
+            (Metrics, [true, false, false, false]),
+            (Drive, [false, true, false, false]),
+            (Push, [false, true, true, false]),
+            (Admin, [true, true, true, true]),
+        ] {
+            assert_eq!([Metrics, Drive, Push, Admin].map(|other| role.includes(other)), included);
+        }
+    }
+
+    #[test]
+    fn a_file_is_read_again_and_a_damaged_one_changes_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("tokens.json");
+        let write = |token: &str| {
+            let text =
+                format!(r#"{{"tokens": [{{"name": "a", "role": "push", "token": "{token}"}}]}}"#);
+            std::fs::write(&path, text).unwrap();
+        };
+        write("first-first-first");
+        let tokens = CurrentTokens::new(Tokens::read(&path).unwrap());
+        let knows =
+            |token: &str| tokens.get().grant(Some(format!("Bearer {token}").as_bytes())).is_ok();
+        write("second-second-second");
+        assert!(knows("first-first-first") && !knows("second-second-second"));
+        assert_eq!(tokens.read_again().unwrap(), Some(path.clone()));
+        assert!(!knows("first-first-first") && knows("second-second-second"));
+        write("short");
+        let (file, error) = tokens.read_again().unwrap_err();
+        assert_eq!((file, error.location.as_str()), (path.clone(), "tokens[0].token"));
+        assert!(knows("second-second-second"));
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(tokens.read_again().unwrap_err().1.location, "the file");
+        // Tokens that came from no file stay as they are.
+        let parsed = br#"{"tokens": [{"name": "a", "role": "push", "token": "0123456789abcdef"}]}"#;
+        let parsed = CurrentTokens::new(Tokens::parse(parsed).unwrap());
+        assert_eq!(parsed.read_again().unwrap(), None);
+    }
+
+    /// A reader of the documentation must replace what is said there of a token.
+    #[test]
+    fn the_examples_of_the_documentation_are_no_tokens() {
+        let page = include_str!("../../docs/operators.md");
+        let examples: Vec<&str> = page.split("```json\n{\"tokens\"").skip(1).collect();
+        assert_eq!(examples.len(), 2);
+        for example in examples {
+            let text = format!("{{\"tokens\"{}", example.split("```").next().unwrap());
+            let file: serde_json::Value = serde_json::from_str(&text).unwrap();
+            for entry in file["tokens"].as_array().unwrap() {
+                let one = serde_json::json!({ "tokens": [entry] }).to_string();
+                let error = Tokens::parse(one.as_bytes()).unwrap_err();
+                assert!(error.location.starts_with("tokens[0]."), "{error}");
+            }
+        }
     }
 
     #[test]

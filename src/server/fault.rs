@@ -232,6 +232,23 @@ pub(crate) enum Fault {
         /// What it lacks.
         reason: String,
     },
+    /// The request is for a name that the server does not go by.
+    #[error(
+        "the server is not called {host:?}; it answers to {served}. If that is its name, start it with --origin \
+         https://NAME"
+    )]
+    ForbiddenHost {
+        /// The header `Host`.
+        host: String,
+        /// The names that it answers to.
+        served: &'static str,
+    },
+    /// A header that may be there once is there more than once.
+    #[error("the header {header} is there more than once")]
+    HeaderTwice {
+        /// The header.
+        header: &'static str,
+    },
     /// A web page of another machine sent the request.
     #[error(
         "pages from {origin} are refused; only those of this machine and of --origin are accepted"

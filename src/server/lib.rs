@@ -5,7 +5,10 @@
 //! start          starts a server
 //! shutdown       a running server, and stopping it without losing running steps
 //! stream         a connection, with or without TLS
-//! tls            certificate and key, and reading them again
+//! tls            certificate and key
+//! certificate    when a certificate expires
+//! reload         reading the certificate and the tokens again at SIGHUP
+//! readiness      whether sessions can be opened
 //! state          what all connections share
 //! listen         accepts connections, a bounded number
 //! newcomers      the slots of connections, before and after authentication
@@ -13,7 +16,7 @@
 //! routes         HTTP routes, and the upgrade to WebSocket
 //! auth           tokens, their roles, twins and limits
 //! audit          the log of which token changed which twin
-//! open_pushes    how many pushes of each token wait or run
+//! token_counts   how many pushes and connections each token has
 //! tickets        one-time tickets, which stand for a token in the address of a WebSocket
 //! origins        which web pages and which host names are served
 //! spool          uploads on disk
@@ -33,6 +36,7 @@
 mod audit;
 mod auth;
 mod blocking;
+mod certificate;
 mod config;
 mod connection;
 mod convert;
@@ -44,8 +48,9 @@ mod listen;
 mod memory;
 mod metrics;
 mod newcomers;
-mod open_pushes;
 mod origins;
+mod readiness;
+mod reload;
 mod routes;
 mod sessions;
 mod shutdown;
@@ -56,6 +61,7 @@ mod state;
 mod stream;
 mod tickets;
 mod tls;
+mod token_counts;
 mod watchers;
 
 // The support of the tests names this package.

@@ -5,6 +5,12 @@ use std::time::Duration;
 /// Size at which the audit log is rotated, in bytes: 300,000 lines of 200 B.
 pub const AUDIT_BYTES: u64 = 64 << 20;
 
+/// Rotated files of the audit log that are kept: 512 MiB, some 2.4 million lines.
+pub const AUDIT_OLD_FILES: usize = 8;
+
+/// Characters of a reason in the audit log; longer ones are cut.
+pub const AUDIT_REASON_CHARS: usize = 500;
+
 /// The address that `serve` listens on by default.
 pub const LISTEN: &str = "127.0.0.1:8080";
 
@@ -119,6 +125,12 @@ pub const TICKET_AGE: Duration = Duration::from_secs(30);
 
 /// Tickets that were not used yet: one for each connection, and some for pages that were closed meanwhile.
 pub const TICKETS: usize = 2 * CONNECTIONS;
+
+/// Tickets of one token that were not used yet; a page needs one or two at a time.
+pub const TOKEN_TICKETS: usize = 32;
+
+/// How long the result of a look at the list of twins answers `GET /readyz`, which needs no token.
+pub const READY_AGE: Duration = Duration::from_secs(1);
 
 /// Time between two observations that a watcher is sent; it misses those in between.
 pub const WATCH_PERIOD: Duration = Duration::from_millis(100);

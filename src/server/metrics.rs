@@ -28,6 +28,7 @@ pub(crate) struct Metrics {
     pub(crate) observation_bytes: Counter,
     pub(crate) memory_bytes: Counter,
     pub(crate) versions_switched: Counter,
+    pub(crate) reloads: Counter,
     refusals: CountersByLabel,
     pushes: CountersByLabel,
     sessions: Gauge,
@@ -69,6 +70,7 @@ impl Metrics {
             observation_bytes: Counter::default(),
             memory_bytes: Counter::default(),
             versions_switched: Counter::default(),
+            reloads: Counter::default(),
             refusals: CountersByLabel::default(),
             pushes: CountersByLabel::default(),
             sessions: Gauge::default(),
@@ -93,6 +95,8 @@ impl Metrics {
         registry.register("memory_bytes", help, m.memory_bytes.clone());
         let help = "Sessions that switched to another version";
         registry.register("versions_switched", help, m.versions_switched.clone());
+        let help = "SIGHUPs after which certificate and tokens were read again";
+        registry.register("reloads", help, m.reloads.clone());
         registry.register("pushes", "Pushes that ended, by outcome", m.pushes.clone());
         let help = "Sessions, connected or waiting to be resumed";
         registry.register("sessions", help, m.sessions.clone());

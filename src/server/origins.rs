@@ -10,7 +10,7 @@ use axum::http::{HeaderMap, Uri, header};
 
 use crate::fault::Fault;
 
-/// The pages of other sites that are served.
+/// The pages of other sites that are served, as browsers send them: without the scheme's own port.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Origins(Vec<String>);
 
@@ -24,7 +24,7 @@ pub struct OriginError {
 }
 
 impl Origins {
-    /// Origins as browsers send them: scheme, host, and the port unless it is the scheme's own.
+    /// Origins: scheme, host and port. Browsers leave out the scheme's own port, and so does the list.
     ///
     /// # Errors
     /// Names the first one that no browser would send.
@@ -41,7 +41,7 @@ impl Origins {
         };
         match origins.iter().find(|origin| !is_origin(origin)) {
             Some(origin) => Err(OriginError { origin: origin.clone() }),
-            None => Ok(Self(origins)),
+            None => Ok(Self(origins.into_iter().map(without_own_port).collect())),
         }
     }
 
@@ -77,10 +77,13 @@ impl Origins {
     /// not know its own names, and serves all.
     ///
     /// # Errors
-    /// [`Fault::Forbidden`].
+    /// [`Fault::ForbiddenHost`].
     pub(crate) fn check_host(&self, has_tokens: bool, host: Option<&str>) -> Result<(), Fault> {
         let Some(host) = host else { return Ok(()) };
-        let listed = |origin: &String| origin.split_once("://").is_some_and(|(_, own)| own == host);
+        let listed = |origin: &String| {
+            let scheme = origin.split_once("://").map_or("", |(scheme, _)| scheme);
+            without_own_port(format!("{scheme}://{host}")) == *origin
+        };
         let is_address =
             has_tokens && name_of(host).trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
         let knows_none = has_tokens && self.0.is_empty();
@@ -88,16 +91,21 @@ impl Origins {
             return Ok(());
         }
         let served = match has_tokens {
-            true => "the hosts of --origin, addresses and localhost are served",
-            false => "without tokens, localhost and the hosts of --origin are served",
+            true => "the hosts of --origin, addresses and localhost",
+            false => "without tokens, localhost and the hosts of --origin",
         };
-        let reason = format!("requests for host {host:?} are refused; {served}");
-        Err(Fault::Forbidden { field: "host", reason })
+        Err(Fault::ForbiddenHost { host: host.to_owned(), served })
     }
 }
 
+/// An origin without the port of its scheme.
+fn without_own_port(origin: String) -> String {
+    let port = if origin.starts_with("https:") { ":443" } else { ":80" };
+    origin.strip_suffix(port).map(str::to_owned).unwrap_or(origin)
+}
+
 /// Whether an origin is a page served from this machine.
-fn is_local_origin(origin: &str) -> bool {
+pub(crate) fn is_local_origin(origin: &str) -> bool {
     origin.split_once("://").is_some_and(|(_, authority)| is_local_authority(authority))
 }
 
@@ -170,12 +178,28 @@ mod tests {
             ("10.1.2.3:8080", false, false, true, true),
             ("[fe80::1]:8080", false, false, true, true),
             ("evil.example.org", false, false, true, false),
+            ("sim.example.org:443", false, true, true, true),
+            ("sim.example.org:80", false, false, true, false),
         ] {
             let is_served =
                 |origins: &Origins, tokens| origins.check_host(tokens, Some(host)).is_ok();
             let found = [(&none, false), (&listed, false), (&none, true), (&listed, true)]
                 .map(|(o, t)| is_served(o, t));
             assert_eq!(found, [open, with_list, with_tokens, with_both], "{host}");
+        }
+    }
+
+    #[test]
+    fn the_port_of_the_scheme_is_left_out_as_browsers_do() {
+        for (given, sent) in [
+            ("https://a.org:443", "https://a.org"),
+            ("http://a.org:80", "http://a.org"),
+            ("https://a.org:80", "https://a.org:80"),
+            ("http://a.org:443", "http://a.org:443"),
+            ("https://a.org:8443", "https://a.org:8443"),
+        ] {
+            let origins = Origins::new(vec![given.to_owned()]).unwrap();
+            assert!(origins.lists(sent.as_bytes()), "{given}");
         }
     }
 

@@ -12,8 +12,9 @@ use tokio::time::timeout;
 use wildcity_session::Engine;
 
 use crate::listen::listen;
+use crate::reload::reload;
 use crate::state::ServerState;
-use crate::tls::{self, Tls};
+use crate::tls::Tls;
 
 /// A server that listens. Dropping it stops it without waiting.
 pub struct Running {
@@ -76,7 +77,7 @@ impl Running {
         stop: watch::Sender<bool>,
     ) -> Self {
         let has_tls = tls.is_some();
-        let reloading = tls::reload(tls.clone());
+        let reloading = reload(tls.clone(), state.clone());
         let listening = tokio::spawn(listen(state.clone(), listener, tls));
         let periodic = state.clone();
         tokio::spawn(async move {
@@ -117,6 +118,12 @@ impl Running {
     /// Number of sessions at this moment: connected, and waiting to be resumed.
     pub fn sessions(&self) -> usize {
         self.state.sessions.count()
+    }
+
+    /// How often a SIGHUP was carried out: certificate and tokens were read again, or stayed because they cannot be
+    /// used.
+    pub fn reloads(&self) -> u64 {
+        self.state.metrics.reloads.get()
     }
 
     /// Number of WebSocket connections at this moment.

@@ -14,16 +14,17 @@ use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, StoreError};
 
 use crate::audit::Audit;
-use crate::auth::Tokens;
+use crate::auth::{CurrentTokens, Tokens};
 use crate::config::{Config, Directories};
 use crate::metrics::Metrics;
-use crate::open_pushes::OpenPushes;
+use crate::readiness::Readiness;
 use crate::sessions::SessionRegistry;
 use crate::shutdown::Running;
 use crate::spool::{Spool, SpoolMedium};
 use crate::state::ServerState;
 use crate::tickets::Tickets;
 use crate::tls::{Tls, TlsError};
+use crate::token_counts::TokenCounts;
 
 /// Why a server did not start.
 #[derive(Debug, thiserror::Error)]
@@ -142,10 +143,12 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         limits,
         profile,
         shares_memory: shared_memory,
-        tokens,
+        tokens: tokens.map(CurrentTokens::new),
         tickets: Tickets::default(),
-        audit,
-        open_pushes: OpenPushes::default(),
+        audit: Arc::new(audit),
+        open_pushes: TokenCounts::default(),
+        open_connections: TokenCounts::default(),
+        readiness: Readiness::default(),
         origins,
         episodes,
         spool,

@@ -10,15 +10,16 @@ use wildcity_scene::ProfileOverrides;
 use wildcity_session::Engine;
 
 use crate::audit::Audit;
-use crate::auth::Tokens;
+use crate::auth::CurrentTokens;
 use crate::config::Limits;
 use crate::fault::Fault;
 use crate::metrics::Metrics;
-use crate::open_pushes::OpenPushes;
 use crate::origins::Origins;
+use crate::readiness::Readiness;
 use crate::sessions::SessionRegistry;
 use crate::spool::Spool;
 use crate::tickets::Tickets;
+use crate::token_counts::TokenCounts;
 
 /// What all connections of a server share.
 pub(crate) struct ServerState {
@@ -33,10 +34,13 @@ pub(crate) struct ServerState {
     pub(crate) profile: ProfileOverrides,
     /// Whether clients on this machine may ask for shared memory.
     pub(crate) shares_memory: bool,
-    pub(crate) tokens: Option<Tokens>,
+    pub(crate) tokens: Option<CurrentTokens>,
     pub(crate) tickets: Tickets,
-    pub(crate) audit: Audit,
-    pub(crate) open_pushes: OpenPushes,
+    pub(crate) audit: Arc<Audit>,
+    pub(crate) open_pushes: TokenCounts,
+    /// WebSocket connections.
+    pub(crate) open_connections: TokenCounts,
+    pub(crate) readiness: Readiness,
     pub(crate) origins: Origins,
     /// Directory where episodes are recorded.
     pub(crate) episodes: PathBuf,

@@ -19,28 +19,36 @@ pub(crate) struct Tickets {
 
 struct Entry {
     grant: Arc<Grant>,
-    expires: Instant,
+    issued: Instant,
 }
 
 impl Tickets {
-    /// A new ticket with the rights of a token.
+    /// A new ticket with the rights of a token. It replaces the token's oldest one if there are
+    /// [`limits::TOKEN_TICKETS`].
     ///
     /// # Errors
-    /// There are too many that were not used.
+    /// There are too many of all tokens that were not used.
     pub(crate) fn issue(&self, grant: Arc<Grant>) -> Result<String, Fault> {
         self.issue_at(grant, Instant::now())
     }
 
     fn issue_at(&self, grant: Arc<Grant>, now: Instant) -> Result<String, Fault> {
         let mut entries = self.entries.lock();
-        entries.retain(|_, entry| entry.expires > now);
+        entries.retain(|_, entry| entry.is_good(now));
+        let own = entries.iter().filter(|(_, entry)| entry.grant.name == grant.name);
+        let own: Vec<([u8; 32], Instant)> = own.map(|(key, entry)| (*key, entry.issued)).collect();
+        if own.len() >= limits::TOKEN_TICKETS
+            && let Some((oldest, _)) = own.iter().min_by_key(|(_, issued)| *issued)
+        {
+            entries.remove(oldest);
+        }
         if entries.len() >= limits::TICKETS {
             return Err(Fault::Busy { what: "unused tickets", limit: limits::TICKETS });
         }
         // 244 random bits of the operating system.
         let ticket =
             [uuid::Uuid::new_v4(), uuid::Uuid::new_v4()].map(|id| id.simple().to_string()).concat();
-        entries.insert(key(&ticket), Entry { grant, expires: now + limits::TICKET_AGE });
+        entries.insert(key(&ticket), Entry { grant, issued: now });
         Ok(ticket)
     }
 
@@ -54,8 +62,14 @@ impl Tickets {
 
     fn redeem_at(&self, ticket: &str, now: Instant) -> Result<Arc<Grant>, Fault> {
         let entry = self.entries.lock().remove(&key(ticket));
-        let entry = entry.filter(|entry| entry.expires > now);
+        let entry = entry.filter(|entry| entry.is_good(now));
         Ok(entry.ok_or(Fault::UnknownTicket)?.grant)
+    }
+}
+
+impl Entry {
+    fn is_good(&self, now: Instant) -> bool {
+        now < self.issued + limits::TICKET_AGE
     }
 }
 
@@ -65,7 +79,10 @@ fn key(ticket: &str) -> [u8; 32] {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::auth::Tokens;
 
     #[test]
     fn a_ticket_is_good_once_and_for_a_while() {
@@ -81,16 +98,53 @@ mod tests {
         assert!(matches!(tickets.redeem_at(&second, later), Err(Fault::UnknownTicket)));
     }
 
+    /// The grants of so many tokens.
+    fn grants(count: usize) -> Vec<Arc<Grant>> {
+        let token = |index: usize| {
+            format!(r#"{{"name": "{index}", "role": "drive", "token": "token-token-{index:06}"}}"#)
+        };
+        let list: Vec<String> = (0..count).map(token).collect();
+        let tokens = Tokens::parse(format!(r#"{{"tokens": [{}]}}"#, list.join(",")).as_bytes());
+        let tokens = tokens.unwrap();
+        let grant =
+            |index: usize| tokens.grant(Some(format!("Bearer token-token-{index:06}").as_bytes()));
+        (0..count).map(|index| grant(index).unwrap()).collect()
+    }
+
     #[test]
     fn unused_tickets_are_bounded_and_forgotten() {
         let tickets = Tickets::default();
         let now = Instant::now();
-        for _ in 0..limits::TICKETS {
-            tickets.issue_at(Grant::everything(), now).unwrap();
+        let grants = grants(limits::TICKETS / limits::TOKEN_TICKETS + 1);
+        let (last, others) = grants.split_last().unwrap();
+        for grant in others {
+            for _ in 0..limits::TOKEN_TICKETS {
+                tickets.issue_at(grant.clone(), now).unwrap();
+            }
         }
-        let refused = tickets.issue_at(Grant::everything(), now);
+        assert_eq!(tickets.entries.lock().len(), limits::TICKETS);
+        let refused = tickets.issue_at(last.clone(), now);
         assert!(matches!(refused, Err(Fault::Busy { .. })));
-        tickets.issue_at(Grant::everything(), now + limits::TICKET_AGE).unwrap();
+        tickets.issue_at(last.clone(), now + limits::TICKET_AGE).unwrap();
         assert_eq!(tickets.entries.lock().len(), 1);
+    }
+
+    #[test]
+    fn a_token_that_asks_for_many_tickets_loses_its_oldest_and_no_other_tokens() {
+        let tickets = Tickets::default();
+        let begin = Instant::now();
+        let grants = grants(2);
+        let at = |step: usize| begin + Duration::from_millis(step as u64);
+        let others = tickets.issue_at(grants[1].clone(), begin).unwrap();
+        let issued: Vec<String> = (0..limits::TOKEN_TICKETS + 2)
+            .map(|step| tickets.issue_at(grants[0].clone(), at(step)).unwrap())
+            .collect();
+        let now = at(issued.len());
+        assert_eq!(tickets.entries.lock().len(), limits::TOKEN_TICKETS + 1);
+        let is_good = issued.iter().map(|ticket| tickets.redeem_at(ticket, now).is_ok());
+        let is_good: Vec<bool> = is_good.collect();
+        assert_eq!(is_good[..2], [false, false]);
+        assert!(is_good[2..].iter().all(|good| *good), "{is_good:?}");
+        assert!(tickets.redeem_at(&others, now).is_ok());
     }
 }

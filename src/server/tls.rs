@@ -3,12 +3,15 @@
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use parking_lot::Mutex;
 use rustls::ServerConfig;
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::TlsAcceptor;
+
+use crate::certificate::expiry;
 
 /// The files of a certificate and its key, in PEM.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,6 +20,19 @@ pub struct TlsFiles {
     pub cert: PathBuf,
     /// The key, in PKCS#8, PKCS#1 or SEC1.
     pub key: PathBuf,
+}
+
+impl TlsFiles {
+    /// Reads both files as a server does, and returns when the server's certificate expires.
+    ///
+    /// # Errors
+    /// Names the file that cannot be used.
+    pub fn check(&self) -> Result<SystemTime, TlsError> {
+        read(self)?;
+        let expires = certificates(self)?.first().and_then(|certificate| expiry(certificate));
+        let reason = "when the certificate expires cannot be read".to_owned();
+        expires.ok_or(TlsError { path: self.cert.clone(), reason })
+    }
 }
 
 /// Why a certificate or a key cannot be used.
@@ -49,7 +65,9 @@ impl Tls {
         self.acceptor.lock().clone()
     }
 
-    fn read_again(&self) {
+    /// Reads the files again. Connections that exist keep their certificate. If the new files cannot be used, the old
+    /// ones stay.
+    pub(crate) fn read_again(&self) {
         match read(&self.files) {
             Ok(acceptor) => {
                 *self.acceptor.lock() = acceptor;
@@ -60,42 +78,23 @@ impl Tls {
     }
 }
 
-/// Reads the files again with every SIGHUP, until dropped. Connections that exist keep their certificate. If the new
-/// files cannot be used, the old ones stay. From the call on, SIGHUP does not end the process.
-pub(crate) fn reload(tls: Option<Arc<Tls>>) -> impl Future<Output = ()> + Send {
-    #[cfg(unix)]
-    let hangup = tls.is_some().then(|| {
-        use tokio::signal::unix::{SignalKind, signal};
-        signal(SignalKind::hangup())
-    });
-    async move {
-        #[cfg(unix)]
-        match (&tls, hangup) {
-            (Some(tls), Some(Ok(mut hangup))) => {
-                while hangup.recv().await.is_some() {
-                    tls.read_again();
-                }
-            }
-            (_, Some(Err(error))) => {
-                tracing::error!("SIGHUP does not read the certificate again: {error}");
-            }
-            _ => {}
-        }
-        std::future::pending().await
-    }
+fn wrong(path: &Path, reason: &dyn Display) -> TlsError {
+    TlsError { path: path.to_owned(), reason: reason.to_string() }
 }
 
-fn read(files: &TlsFiles) -> Result<TlsAcceptor, TlsError> {
-    let wrong = |path: &Path, reason: &dyn Display| TlsError {
-        path: path.to_owned(),
-        reason: reason.to_string(),
-    };
+/// The certificates of a file, at least one.
+fn certificates(files: &TlsFiles) -> Result<Vec<CertificateDer<'static>>, TlsError> {
     let certificates = CertificateDer::pem_file_iter(&files.cert)
         .and_then(Iterator::collect::<Result<Vec<_>, _>>)
         .map_err(|error| wrong(&files.cert, &error))?;
     if certificates.is_empty() {
         return Err(wrong(&files.cert, &"there is no certificate in PEM in it"));
     }
+    Ok(certificates)
+}
+
+fn read(files: &TlsFiles) -> Result<TlsAcceptor, TlsError> {
+    let certificates = certificates(files)?;
     let key =
         PrivateKeyDer::from_pem_file(&files.key).map_err(|error| wrong(&files.key, &error))?;
     // One provider is named, because a program may have several.

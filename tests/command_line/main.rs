@@ -51,6 +51,7 @@ mod episode;
 mod eval;
 mod garbage;
 mod generate;
+mod hang_up;
 mod import;
 mod in_folder;
 mod kills;

@@ -56,6 +56,68 @@ fn the_doctor_names_what_is_wrong() {
     assert!(damaged.iter().any(is_named), "{damaged:?}");
 }
 
+#[test]
+fn the_doctor_reads_a_configuration() {
+    let dir = tempfile::tempdir().unwrap();
+    let twins = support::twins();
+    let at = |name: &str| dir.path().join(name).display().to_string();
+    let certify = |not_after| {
+        let mut params = rcgen::CertificateParams::new(vec!["localhost".to_owned()]).unwrap();
+        params.not_after = not_after;
+        let key = rcgen::KeyPair::generate().unwrap();
+        fs::write(at("cert.pem"), params.self_signed(&key).unwrap().pem()).unwrap();
+        fs::write(at("key.pem"), key.serialize_pem()).unwrap();
+    };
+    let config = |more: &str| {
+        let text = format!(
+            "listen = \"127.0.0.1:0\"\ntwins = \"{}\"\nepisodes = \"{}\"\nuploads = \"{}\"\n\
+             scenarios = \"{}\"\ntokens = \"{}\"\ntls_cert = \"{}\"\ntls_key = \"{}\"\n{more}",
+            twins.path().display(),
+            at("episodes"),
+            at("uploads"),
+            at("scenarios"),
+            at("tokens.json"),
+            at("cert.pem"),
+            at("key.pem"),
+        );
+        fs::write(at("serve.toml"), text).unwrap();
+        wildcity().args(["doctor", "--json", "--config"]).arg(at("serve.toml")).output().unwrap()
+    };
+    let tokens = |token: &str| {
+        let text =
+            format!(r#"{{"tokens": [{{"name": "a", "role": "drive", "token": "{token}"}}]}}"#);
+        fs::write(at("tokens.json"), text).unwrap();
+    };
+    tokens("0123456789abcdef");
+    certify(rcgen::date_time_ymd(2999, 1, 1));
+    let good = config(&format!("audit_log = \"{}\"\n", at("audit.jsonl")));
+    assert!(good.status.success(), "{good:?}");
+    for subject in ["listen", "tokens", "certificate", "audit log", "scenarios", "twins"] {
+        let found = about(&good, subject);
+        assert!(!found.is_empty(), "nothing about {subject}");
+        assert!(found.iter().all(|(level, _)| level == "ok"), "{subject}: {found:?}");
+    }
+    assert!(!dir.path().join("audit.jsonl").exists(), "looking creates nothing");
+
+    tokens("short");
+    certify(rcgen::date_time_ymd(2020, 1, 1));
+    let bad = config("audit_log = \"/proc/audit.jsonl\"\n");
+    assert_eq!(bad.status.code(), Some(1), "{bad:?}");
+    for (subject, text) in [
+        ("tokens", "at least 16 characters"),
+        ("certificate", "expired"),
+        ("audit log", "cannot be written"),
+    ] {
+        let [(level, found)] = &about(&bad, subject)[..] else { panic!("{subject}: {bad:?}") };
+        assert!(level == "bad" && found.contains(text), "{found}");
+    }
+    // A key of another certificate.
+    let key = rcgen::KeyPair::generate().unwrap();
+    fs::write(at("key.pem"), key.serialize_pem()).unwrap();
+    let [(level, found)] = &about(&config(""), "certificate")[..] else { panic!("no certificate") };
+    assert!(level == "bad" && found.contains("key.pem"), "{found}");
+}
+
 fn soak(arguments: &[&str]) -> Output {
     let mut command = wildcity();
     command.args(["bench", "soak", "city", "--backend", "cpu", "--sessions", "3", "--steps", "4"]);

@@ -85,6 +85,12 @@ impl Served {
         agent.ask(json!({ "type": "close" })).await;
     }
 
+    /// Sends SIGHUP.
+    pub(crate) fn hang_up(&self) {
+        let kill = Command::new("kill").arg("-HUP").arg(self.child.id().to_string()).status();
+        assert!(kill.unwrap().success());
+    }
+
     pub(crate) fn signal_and_wait(mut self) -> Option<i32> {
         let kill = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
         assert!(kill.success());

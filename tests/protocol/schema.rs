@@ -23,6 +23,8 @@ fn schemas_are_up_to_date() {
     check::<http::Upload>("upload");
     check::<http::Push>("push");
     check::<http::VersionInfo>("version");
+    check::<http::MadeVersion>("made_version");
+    check::<http::Ground>("ground");
     check::<http::SessionInfo>("session");
     check::<http::Ticket>("ticket");
     check::<http::EpisodeInfo>("episode");

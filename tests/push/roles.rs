@@ -16,6 +16,7 @@ const PUSHER: &str = "pusher-pusher-pusher";
 const ADMIN: &str = "admin-admin-admin-admin";
 const ELSEWHERE: &str = "elsewhere-elsewhere";
 const RIVAL: &str = "rival-rival-rival";
+const SCRAPER: &str = "scraper-scraper-scraper";
 
 fn with_token(token: &str) -> ConnectOptions {
     ConnectOptions::with_token(Some(token.to_owned()))
@@ -32,6 +33,7 @@ async fn guarded_with(change: impl FnOnce(&mut Config)) -> TestServer {
         { "name": "pusher", "role": "push", "hash": format!("blake3:{hash}") },
         { "name": "admin", "role": "admin", "token": ADMIN },
         { "name": "rival", "role": "push", "token": RIVAL },
+        { "name": "scraper", "role": "metrics", "token": SCRAPER },
         { "name": "elsewhere", "role": "admin", "token": ELSEWHERE, "twins": ["other"] },
     ]});
     let tokens = Tokens::parse(text.to_string().as_bytes()).unwrap();
@@ -75,14 +77,16 @@ async fn every_route_needs_its_role() {
         ("GET /v1/actors/x", "", &[DRIVER, PUSHER, ADMIN]),
         ("POST /v1/actors", actor, &[PUSHER, ADMIN]),
         ("GET /v1/sessions", "", &[ADMIN]),
-        ("GET /metrics", "", &[ADMIN]),
+        ("POST /v1/tickets", "", &[DRIVER, PUSHER, ADMIN]),
+        ("GET /v1/episodes", "", &[ADMIN]),
+        ("GET /metrics", "", &[SCRAPER, ADMIN]),
     ] {
         for unknown in [None, Some("driver-driver-drive"), Some("")] {
             let refused = ask(&server, request, unknown, body).await;
             refused.refused(401, "unauthorized");
             assert!(refused.header("www-authenticate").is_some(), "{refused:?}");
         }
-        for token in [DRIVER, PUSHER, ADMIN] {
+        for token in [SCRAPER, DRIVER, PUSHER, ADMIN] {
             let status = ask(&server, request, Some(token), body).await.status;
             let refused = status == 401 || status == 403;
             assert_eq!(refused, !roles.contains(&token), "{request} of {token}: {status}");
@@ -131,7 +135,13 @@ async fn sessions_need_the_role_drive_and_belong_to_their_token() {
     let server = guarded().await;
     assert_eq!(upgrade(&server, None).await.err(), Some(401));
     assert_eq!(upgrade(&server, Some("rubbish")).await.err(), Some(401));
-    assert_eq!(upgrade(&server, Some(PUSHER)).await.err(), Some(403));
+    assert_eq!(upgrade(&server, Some(SCRAPER)).await.err(), Some(403));
+    // To place a drive in the viewer is to drive and to edit: one token does both.
+    let mut pusher = upgrade(&server, Some(PUSHER)).await.ok().unwrap();
+    pusher.hello().await;
+    pusher.open(json!({ "session": "placing" })).await;
+    pusher.step(1.0).await;
+    pusher.ask(json!({ "type": "close" })).await;
     let mut driver = upgrade(&server, Some(DRIVER)).await.ok().unwrap();
     assert_eq!(driver.hello().await["twins"][0]["name"], "test");
     driver.open(json!({ "session": "mine" })).await;
@@ -423,4 +433,41 @@ async fn the_audit_log_says_which_token_changed_what() {
     assert!(twins.iter().all(|line| line["twin"] == "test"), "{text}");
     assert!(actors.iter().all(|line| line["actor"] == "a" && line.get("twin").is_none()), "{text}");
     assert_eq!(actors[1]["hash"], made.body["hash"]);
+}
+
+/// A token must not be able to fill the audit log, and with it to remove older lines.
+#[tokio::test]
+async fn the_audit_log_repeats_no_long_names_and_has_cancelled_pushes() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("audit.jsonl");
+    let server = limited(json!({}), Some(&path)).await;
+    let long = "x".repeat(60_000);
+    for (route, body) in [("edits", r#"{"rig": "surround6"}"#), ("rollback", r#"{"version": 1}"#)] {
+        let request = format!("POST /v1/twins/{long}/{route}");
+        ask(&server, &request, Some(RIVAL), body).await.refused(400, "invalid_name");
+    }
+    assert_eq!(std::fs::read_to_string(&path).unwrap(), "");
+
+    let url = format!("http://127.0.0.1:{}", server.address().port());
+    // Reading it takes seconds.
+    let scene =
+        crate::http::write(dir.path(), "a.ply", &crate::http::in_cell([0, 0], 1_000_000, 1));
+    let rival = HttpClient::new(&url, &with_token(RIVAL)).unwrap();
+    let upload = rival.upload(&scene, &mut |_, _| {}).await.unwrap();
+    let push = json!({ "id": "p", "files": [{ "upload": upload.id }] }).to_string();
+    let begun = ask(&server, "POST /v1/twins/test/pushes", Some(RIVAL), &push).await;
+    assert_eq!(begun.status, 202, "{begun:?}");
+    let cancel = "DELETE /v1/twins/test/pushes/p";
+    assert_eq!(ask(&server, cancel, Some(ADMIN), "").await.status, 200);
+    ask(&server, cancel, Some(ADMIN), "").await.refused(409, "conflict");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+    let told: Vec<String> = lines
+        .filter(|line| line["what"] == "cancel")
+        .map(|line| {
+            assert_eq!((&line["token"], &line["id"]), (&json!("admin"), &json!("p")), "{line}");
+            line["state"].as_str().unwrap().to_owned()
+        })
+        .collect();
+    assert_eq!(told, ["begun", "done", "begun", "refused"]);
 }

@@ -22,6 +22,7 @@ mod bundles;
 mod damaged_twin;
 mod drives;
 mod ego;
+mod guarded;
 mod http;
 mod leases;
 mod many;

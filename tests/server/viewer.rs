@@ -252,15 +252,15 @@ async fn pages_of_listed_origins_are_answered() {
         assert_eq!(found, status, "{origin} {host}: {answer}");
         assert_eq!(answer.contains(&allows), origin == PAGE, "{answer}");
     }
-    let question = |origin: &str| {
+    let preflight = |origin: &str| {
         format!(
             "OPTIONS /v1/tickets HTTP/1.1\nHost: localhost\nOrigin: {origin}\n\
              Access-Control-Request-Method: POST\n\n"
         )
     };
-    let (status, answer) = request(&server, &question(PAGE)).await;
+    let (status, answer) = request(&server, &preflight(PAGE)).await;
     assert_eq!(status, 204, "{answer}");
     assert!(answer.contains("access-control-allow-headers: authorization, "), "{answer}");
-    let (status, answer) = request(&server, &question("https://evil.example.org")).await;
+    let (status, answer) = request(&server, &preflight("https://evil.example.org")).await;
     assert!(status != 204 && !answer.contains("access-control"), "{answer}");
 }

@@ -87,6 +87,11 @@ pub struct NewPush {
     pub preview: PreviewRequest,
 }
 
+/// The axes of a file: a preset, or nine numbers.
+#[cfg(feature = "schema")]
+const AXES_PATTERN: &str = "^(identity|y-down-z-forward|y-up-z-back|y-up-z-forward|\
+    -?[0-9]+([.][0-9]+)?([ ,]-?[0-9]+([.][0-9]+)?){8})$";
+
 /// One scene file of a push, or of an actor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -96,9 +101,11 @@ pub struct PushFile {
     pub upload: String,
     /// Axis convention of the file: a preset or nine numbers, as in `wildcity import --axes`.
     #[serde(default = "identity")]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = AXES_PATTERN)))]
     pub axes: String,
     /// Metres per unit of the file.
     #[serde(default = "one")]
+    #[cfg_attr(feature = "schema", schemars(extend("exclusiveMinimum" = 0)))]
     pub scale: f64,
     /// The name by which other files of the request name this one, such as `textures/paint.png`. If absent, that of
     /// the upload.
@@ -350,6 +357,31 @@ pub struct VersionInfo {
     pub parent: Option<u64>,
 }
 
+/// A version that was just made: the answer to `POST` of rollbacks and edits.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct MadeVersion {
+    /// Number of the version.
+    pub version: u64,
+    /// BLAKE3 of the version's manifest, in hex.
+    pub version_hash: String,
+}
+
+/// Where a twin is, and its ground: the answer to `GET /v1/twins/{twin}/ground`. All points are in the axes and the
+/// unit of the version.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+pub struct Ground {
+    /// Number of the version.
+    pub version: u64,
+    /// The middle of a ball that has most of the scene.
+    pub middle: [f64; 3],
+    /// The radius of the ball.
+    pub radius: f64,
+    /// The ground that the scene seems to stand on, as an edit takes it; null if none was found.
+    pub ground: Option<EditGround>,
+}
+
 /// `POST /v1/twins/{twin}/rollback`: makes an old version the latest again, as a new version.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -363,6 +395,9 @@ pub struct Rollback {
 /// and a rig. All points are in the axes and the unit of the base version.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[cfg_attr(feature = "schema", schemars(extend("anyOf" = [
+    { "required": ["ground"] }, { "required": ["scale"] }, { "required": ["drive"] }, { "required": ["rig"] }
+])))]
 #[serde(deny_unknown_fields)]
 pub struct NewEdit {
     /// The version that is edited. If absent, the latest.
@@ -401,6 +436,7 @@ pub struct EditScale {
     /// Two points.
     pub points: [[f64; 3]; 2],
     /// Their distance, in metres.
+    #[cfg_attr(feature = "schema", schemars(extend("exclusiveMinimum" = 0)))]
     pub distance_m: f64,
 }
 
@@ -417,6 +453,7 @@ pub struct EditDrive {
     pub points: Vec<[f64; 3]>,
     /// Its speed, in m/s.
     #[serde(default = "five")]
+    #[cfg_attr(feature = "schema", schemars(extend("exclusiveMinimum" = 0)))]
     pub speed: f64,
 }
 

@@ -1,19 +1,19 @@
 //! `wildcity serve`.
 
+mod check;
 mod config_file;
 mod limit_options;
 mod log;
 
 use std::io::{self, Write};
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Context as _;
 
 use wildcity_alpasim::sensorsim;
 use wildcity_server::{Origins, TlsFiles, Tokens};
-use wildcity_twin::ingest;
 use wildcity_twin::residency::default_memory_bytes;
 use wildcity_twin::store::DamagedTwin;
 
@@ -50,8 +50,10 @@ pub(super) struct Serve {
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
 
-    /// JSON file of tokens and what each allows (see below); without it the server only listens on a
-    /// loopback address.
+    /// JSON file of tokens and what each allows: {"tokens": [{"name": "fleet", "role": "drive", "token": "TOKEN"}]}.
+    /// role is metrics, drive, push or admin; hash may stand in place of token; twins lists those that the token may use;
+    /// limits are what it may have at once: sessions, connections, pushes, upload_bytes. It is read again at SIGHUP. Without
+    /// it the server only listens on a loopback address. docs/operators.md says more.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
 
@@ -65,13 +67,13 @@ pub(super) struct Serve {
     tls_key: Option<PathBuf>,
 
     /// Web pages of other sites that may send requests, separated by commas, for example
-    /// https://sim.example.org; pages of this machine always may. The server is then also called by these
-    /// hosts, by its addresses or localhost, and by no other name.
+    /// https://sim.example.org; pages of this machine always may. The server then answers to these hosts, its
+    /// addresses and localhost, and to no other name: list the name that it is called by, too.
     #[arg(long, value_name = "ORIGINS", value_parser = origins)]
     origin: Option<Origins>,
 
     /// File of the audit log: which token pushed, edited or rolled back which twin, a JSON object a line. What cannot
-    /// be logged is refused. At 64 MiB the file is renamed to FILE.1.
+    /// be logged is refused. At 64 MiB the file is renamed to FILE.1, and the one before to FILE.2; eight of these are kept.
     #[arg(long, value_name = "FILE")]
     audit_log: Option<PathBuf>,
 
@@ -136,13 +138,15 @@ Examples:
   wildcity serve --config serve.toml --sessions 16
   curl http://127.0.0.1:8080/v1/twins
 
-Tokens file: role is drive (sessions), push (uploads and pushes) or admin (everything). Give the token
-itself, of at least 16 characters, or hash: blake3: or sha-256: and its hash in hex. twins lists the
-twins that it may use; without the list it may use all. limits are what it may have at once: sessions,
-pushes, upload_bytes.
+Tokens file: role is metrics (GET /metrics alone), drive (sessions), push (sessions, uploads and pushes) or
+admin (everything). Give the token itself, of at least 16 characters, or hash: blake3: or sha-256: and its
+hash in hex. twins lists the twins that it may use; without the list it may use all. limits are what it may
+have at once: sessions, connections, pushes, upload_bytes.
+  openssl rand -base64 24                 makes a TOKEN
+  printf %s TOKEN | sha256sum             prints its HASH
   {\"tokens\": [
-    {\"name\": \"fleet\", \"role\": \"drive\", \"token\": \"u3mR8qkV0aXn2wLc\", \"twins\": [\"street\"]},
-    {\"name\": \"trainer\", \"role\": \"push\", \"hash\": \"sha-256:9f86d081884c7d659a2feaa0c55ad015...\"}]}";
+    {\"name\": \"fleet\", \"role\": \"drive\", \"token\": \"TOKEN\", \"twins\": [\"street\"]},
+    {\"name\": \"trainer\", \"role\": \"push\", \"hash\": \"sha-256:HASH\"}]}";
 
 impl Serve {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -195,7 +199,11 @@ impl Serve {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
-        let tokens = self.tokens.as_deref().map(read_tokens).transpose()?;
+        let tokens = self
+            .tokens
+            .as_deref()
+            .map(|path| Tokens::read(path).with_context(|| format!("--tokens {}", path.display())));
+        let tokens = tokens.transpose()?;
         let tls = match (self.tls_cert, self.tls_key) {
             (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
             (None, None) => None,
@@ -252,13 +260,6 @@ impl Serve {
         runtime.shutdown_background();
         served
     }
-}
-
-fn read_tokens(path: &Path) -> anyhow::Result<Tokens> {
-    let cannot = || format!("--tokens {}", path.display());
-    let text = ingest::read_whole(path, wildcity_server::limits::TOKENS_FILE_BYTES)
-        .with_context(cannot)?;
-    Tokens::parse(&text).with_context(cannot)
 }
 
 fn address(text: &str) -> Result<SocketAddr, String> {

@@ -66,10 +66,9 @@ pub(crate) fn drive_body(version: &Version, request: &DriveRequest) -> Result<Va
 pub(crate) fn drive_query(name: String, query: &str) -> Result<(Option<u64>, DriveRequest), Fault> {
     let mut section = RouteSection::default();
     let mut version = None;
-    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
-        let (field, text) = pair.split_once('=').unwrap_or((pair, ""));
+    for (field, text) in form_urlencoded::parse(query.as_bytes()) {
         let invalid = |reason: &str| Fault::InvalidRequest {
-            field: Some(field.to_owned()),
+            field: Some(field.clone().into_owned()),
             reason: format!("{field}: {reason}"),
         };
         if field == "version" {
@@ -79,7 +78,7 @@ pub(crate) fn drive_query(name: String, query: &str) -> Result<(Option<u64>, Dri
             }
             continue;
         }
-        let target = match field {
+        let target = match &*field {
             "from_m" => &mut section.from_m,
             "to_m" => &mut section.to_m,
             "every_m" => &mut section.every_m,
@@ -91,4 +90,33 @@ pub(crate) fn drive_query(name: String, query: &str) -> Result<(Option<u64>, Dri
         }
     }
     Ok((version, DriveRequest { name, section }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn queries_are_decoded_and_each_field_is_there_once() {
+        let read = |query: &str| drive_query("log".to_owned(), query);
+        let (version, request) =
+            read("version=3&from_m=%31%32%2E5&every%5Fm=5e-1&&to_m=%2B13").unwrap();
+        let DriveRequest { section, .. } = request;
+        assert_eq!(version, Some(3));
+        let found = (section.from_m, section.to_m, section.every_m);
+        assert_eq!(found, (Some(12.5), Some(13.0), Some(0.5)));
+        for (query, field) in [
+            ("version=3&version=4", "version"),
+            ("from_m=1&from%5Fm=2", "from_m"),
+            ("from_m=%ZZ", "from_m"),
+            ("from_m", "from_m"),
+            ("there%20=1", "there "),
+        ] {
+            let refused = read(query).unwrap_err();
+            let Fault::InvalidRequest { field: Some(named), .. } = &refused else {
+                panic!("{refused}")
+            };
+            assert_eq!(named, field, "{query}");
+        }
+    }
 }

@@ -223,6 +223,8 @@ pub(super) fn wire_fault(fault: &Fault) -> WireFault {
         Fault::NoEpisode { .. } | Fault::NoMcap { .. } => at(Code::UnknownState, "episode"),
         Fault::Forbidden { field, .. } => at(Code::Forbidden, field),
         Fault::ForbiddenOrigin { .. } => at(Code::Forbidden, "origin"),
+        Fault::ForbiddenHost { .. } => at(Code::Forbidden, "host"),
+        Fault::HeaderTwice { header } => at(Code::InvalidRequest, header),
         Fault::NoUpgrade => at(Code::InvalidRequest, "upgrade"),
         Fault::Handshake { header, .. } => at(Code::InvalidRequest, header),
         Fault::NoSubprotocol { .. } => at(Code::UnsupportedProtocol, "sec-websocket-protocol"),
@@ -258,7 +260,9 @@ pub(super) fn of_push(error: &PushError) -> WireFault {
         PushError::Cancelled | PushError::TooLate { .. } => plain(Code::Conflict),
         PushError::ShuttingDown => plain(Code::ShuttingDown),
         PushError::Session(error) => of_session(error),
-        PushError::Unreadable { .. } | PushError::Crashed => plain(Code::Internal),
+        PushError::Unreadable { .. } | PushError::Abandoned { .. } | PushError::Crashed => {
+            plain(Code::Internal)
+        }
     }
 }
 

@@ -233,17 +233,17 @@ pub(crate) fn survey(survey: &Survey) -> Value {
             above: (point + radius * up).to_array(),
         }
     });
-    json!({
-        "version": survey.version,
-        "middle": survey.extent.middle.to_array(),
-        "radius": survey.extent.radius,
-        "ground": ground,
+    json!(http::Ground {
+        version: survey.version,
+        middle: survey.extent.middle.to_array(),
+        radius: survey.extent.radius,
+        ground,
     })
 }
 
 /// The version of an edit.
 pub(crate) fn edited(version: &PushedVersion) -> Value {
-    json!({ "version": version.number, "version_hash": version.hash })
+    json!(http::MadeVersion { version: version.number, version_hash: version.hash.clone() })
 }
 
 /// The versions of a twin, the latest last. Versions after `held` are not ready.
@@ -261,7 +261,7 @@ pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
 
 /// A version that was just made.
 pub(crate) fn version(version: &Version) -> Value {
-    json!({ "version": version.number, "version_hash": version.hash })
+    json!(http::MadeVersion { version: version.number, version_hash: version.hash.clone() })
 }
 
 /// All sessions.

@@ -16,9 +16,10 @@ use crate::audit::{Change, Made, Target};
 use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
+use crate::fault::Fault;
 use crate::idle_deadline::IdleDeadline;
-use crate::open_pushes::OpenPush;
 use crate::state::ServerState;
+use crate::token_counts::Counted;
 
 use super::pushes::{find_uploads, outcome, stopped_before_commit};
 use super::refusal::HttpResult;
@@ -55,15 +56,14 @@ pub(super) async fn push(
     grant.require(Role::Push)?;
     grant.require_all_twins()?;
     let request = convert::new_actor(&body)?;
-    let open = state.open_pushes.begin(&grant)?;
+    let open = state.open_pushes.push(&grant)?;
     let push = state.pushes.begin_actor()?;
     let files = find_uploads(&state, &grant.name, &request.files)?;
-    state.audit.begin(&grant, &change(&request.settings.name))?;
 
     let _cancelling = CancelWhenDropped(push.clone());
     let made = tokio::spawn(run(state, push, OwnedPush { grant, _open: open }, request, files));
     let made = deadline.extend_during(made).await.map_err(|_| PushError::Crashed)?;
-    let AddedActor { actor, is_new } = made?;
+    let AddedActor { actor, is_new } = made??;
     let status = if is_new { StatusCode::CREATED } else { StatusCode::OK };
     // The token is not limited to some twins.
     let mut response = (status, Json(convert::actor(&actor, true))).into_response();
@@ -87,19 +87,26 @@ impl Drop for CancelWhenDropped {
 struct OwnedPush {
     grant: Arc<Grant>,
     /// Counts among the token's pushes.
-    _open: OpenPush,
+    _open: Counted,
 }
 
-/// Runs a push to its end and records the result.
+/// Logs a push, runs it to its end and records the result.
+///
+/// # Errors
+/// [`Fault::Audit`]: it did not begin.
 async fn run(
     state: Arc<ServerState>,
     push: Arc<Push>,
     owned: OwnedPush,
     request: AssetRequest,
     files: Vec<SourceFile>,
-) -> Result<AddedActor, PushError> {
+) -> Result<Result<AddedActor, PushError>, Fault> {
     let name = request.settings.name.clone();
-    let change = change(&name);
+    let change = Change { what: "actor", target: Target::Actor(name.clone()), id: None };
+    if let Err(fault) = state.audit.begin(&owned.grant, &change).await {
+        push.end(Err(PushError::Abandoned { reason: fault.to_string() }));
+        return Err(fault);
+    }
     let catalog = state.engine.catalog();
     let published = wildcity_push::publish_asset(catalog, &state.pushes, &push, request, files)
         .instrument(tracing::debug_span!("push", actor = name));
@@ -110,17 +117,13 @@ async fn run(
         result = published => result,
         () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
-    let made = result.as_ref().map(|added| Made::Asset(&added.actor.hash));
-    state.audit.end(&owned.grant, &change, made);
+    let made = result.as_ref().map(|added| Made::Asset(added.actor.hash.clone()));
+    state.audit.end(&owned.grant, &change, made).await;
     let ended = push.close(result.as_ref().map(drop));
     match &result {
         Ok(added) => tracing::info!(actor = name, hash = added.actor.hash, "stored"),
         Err(error) => tracing::warn!(actor = name, state = ?ended, "not stored: {error}"),
     }
     state.metrics.push_ended(outcome(ended));
-    result
-}
-
-fn change(name: &str) -> Change<'_> {
-    Change { what: "actor", target: Target::Actor(name), id: None }
+    Ok(result)
 }

@@ -1,4 +1,4 @@
-//! Answers to pages of other sites (the Fetch standard, section 3.2: CORS), for the origins of `--origin`.
+//! Answers to pages of other sites (the Fetch standard, section 3.2: CORS): those of this machine and of `--origin`.
 
 use std::sync::Arc;
 
@@ -7,6 +7,7 @@ use axum::http::{HeaderValue, Method, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse as _, Response};
 
+use crate::origins::is_local_origin;
 use crate::state::ServerState;
 
 /// How long a browser remembers what a page may do, in seconds.
@@ -15,19 +16,22 @@ const METHODS: &str = "GET, POST, PATCH, DELETE";
 const REQUEST_HEADERS: &str = "authorization, content-type, upload-offset, content-digest";
 const ANSWER_HEADERS: &str = "upload-offset";
 
-/// Lets listed pages read answers, and answers a browser's question what they may send.
+/// Lets local and listed pages read answers, and answers a browser's preflight requests for them.
 pub(super) async fn answer(
     State(state): State<Arc<ServerState>>,
     request: Request,
     next: Next,
 ) -> Response {
     let origin = request.headers().get(header::ORIGIN).cloned();
-    let Some(origin) = origin.filter(|origin| state.origins.lists(origin.as_bytes())) else {
+    let is_served = |origin: &HeaderValue| {
+        state.origins.lists(origin.as_bytes()) || origin.to_str().is_ok_and(is_local_origin)
+    };
+    let Some(origin) = origin.filter(is_served) else {
         return next.run(request).await;
     };
-    let is_question = request.method() == Method::OPTIONS
+    let is_preflight = request.method() == Method::OPTIONS
         && request.headers().contains_key(header::ACCESS_CONTROL_REQUEST_METHOD);
-    let mut response = match is_question {
+    let mut response = match is_preflight {
         true => StatusCode::NO_CONTENT.into_response(),
         false => next.run(request).await,
     };
@@ -35,7 +39,7 @@ pub(super) async fn answer(
     headers.insert(header::ACCESS_CONTROL_ALLOW_ORIGIN, origin);
     headers.append(header::VARY, HeaderValue::from_static("origin"));
     let mut say = |name, value| headers.insert(name, HeaderValue::from_static(value));
-    if is_question {
+    if is_preflight {
         say(header::ACCESS_CONTROL_ALLOW_METHODS, METHODS);
         say(header::ACCESS_CONTROL_ALLOW_HEADERS, REQUEST_HEADERS);
         say(header::ACCESS_CONTROL_MAX_AGE, MAX_AGE_S);

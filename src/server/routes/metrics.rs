@@ -16,12 +16,15 @@ use crate::state::ServerState;
 
 use super::refusal::{HttpResult, Refusal};
 
+/// The route of the metrics, the only one that a token with the role `metrics` may use.
+pub(super) const PATH: &str = "/metrics";
+
 /// `GET /metrics`, in OpenMetrics' text format.
 pub(super) async fn show(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
 ) -> HttpResult {
-    grant.require(Role::Admin)?;
+    grant.require(Role::Metrics)?;
     let free_connections = state.websocket_permits.available_permits();
     let spooled = state.spool.as_ref().map(|spool| spool.usage()).unwrap_or_default();
     let gauges = GaugeValues {

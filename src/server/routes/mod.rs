@@ -18,13 +18,12 @@ mod websocket;
 use std::sync::Arc;
 
 use axum::extract::{DefaultBodyLimit, Request, State};
-use axum::http::{Method, StatusCode, Uri, header};
+use axum::http::{HeaderName, Method, StatusCode, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 use axum::{Json, Router};
 
 use crate::auth::Grant;
-use crate::convert;
 use crate::fault::Fault;
 use crate::newcomers::ConnectionSlot;
 use crate::state::ServerState;
@@ -35,13 +34,14 @@ use table::Row;
 /// The routes of a server.
 pub(crate) fn router(state: Arc<ServerState>) -> Router {
     let json_limit = DefaultBodyLimit::max(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES);
-    let all = |rows: Vec<Row>| {
-        rows.into_iter()
-            .fold(Router::new(), |router, row| router.route(row.operation.path, row.handler))
-    };
-    all(table::guarded())
-        .route_layer(from_fn_with_state(state.clone(), authorize))
-        .merge(all(table::open()))
+    let guarded = table::guarded().into_iter().map(|row| {
+        let guard = Guard { state: state.clone(), route: row.operation.path };
+        let handler = row.handler.route_layer(from_fn_with_state(guard, authorize));
+        Row { handler, ..row }
+    });
+    guarded
+        .chain(table::open())
+        .fold(Router::new(), |router, row| router.route(row.operation.path, row.handler))
         .fallback(no_route)
         .method_not_allowed_fallback(no_method)
         .layer(json_limit)
@@ -50,27 +50,41 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .with_state(state)
 }
 
+/// What guards a route.
+#[derive(Clone)]
+struct Guard {
+    state: Arc<ServerState>,
+    /// The route's path, as the table has it.
+    route: &'static str,
+}
+
 /// Refuses requests without a valid token, and passes the token's [`Grant`] to the routes.
 async fn authorize(
-    State(state): State<Arc<ServerState>>,
+    State(Guard { state, route }): State<Guard>,
     mut request: Request,
     next: Next,
 ) -> Result<Response, Refusal> {
+    check_once(&request, header::HOST, "host")?;
+    check_once(&request, header::ORIGIN, "origin")?;
     let header = request.headers().get(header::HOST).map(|host| host.to_str().unwrap_or_default());
     let host = request.uri().authority().map(|authority| authority.as_str()).or(header);
     let has_tokens = state.tokens.is_some();
     state.origins.check_page(request.headers(), has_tokens, host)?;
+    // Before the ticket, which only a request that is otherwise good may use up.
+    state.origins.check_host(has_tokens, host)?;
     let grant = match &state.tokens {
-        Some(tokens) => match tickets::of(&request) {
+        Some(tokens) => match tickets::of(&request, route)? {
             Some(ticket) => state.tickets.redeem(ticket)?,
             None => {
                 let authorization = request.headers().get(header::AUTHORIZATION);
-                tokens.grant(authorization.map(|value| value.as_bytes()))?
+                tokens.get().grant(authorization.map(|value| value.as_bytes()))?
             }
         },
         None => Grant::everything(),
     };
-    state.origins.check_host(has_tokens, host)?;
+    if route != metrics::PATH {
+        grant.require_more_than_metrics()?;
+    }
     if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
         slot.become_known()?;
     }
@@ -78,14 +92,19 @@ async fn authorize(
     Ok(next.run(request).await)
 }
 
+/// Refuses a header that is there more than once: which one counts would be a guess.
+fn check_once(request: &Request, name: HeaderName, header: &'static str) -> Result<(), Fault> {
+    match request.headers().get_all(name).iter().count() {
+        0 | 1 => Ok(()),
+        _ => Err(Fault::HeaderTwice { header }),
+    }
+}
+
 /// `GET /readyz`: whether sessions can be opened, which needs the list of twins.
 async fn ready(State(state): State<Arc<ServerState>>) -> Response {
-    match state.engine.check_twins().await {
-        Ok(()) => "ready\n".into_response(),
-        Err(error) => {
-            let body = Json(convert::refusal_body(&error.into()));
-            (StatusCode::SERVICE_UNAVAILABLE, body).into_response()
-        }
+    match state.readiness.refusal(&state.engine).await {
+        None => "ready\n".into_response(),
+        Some(body) => (StatusCode::SERVICE_UNAVAILABLE, Json(body)).into_response(),
     }
 }
 

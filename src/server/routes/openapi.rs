@@ -104,7 +104,7 @@ mod tests {
                 )
             }
             Content::Object => json(json!({ "type": "object" })),
-            Content::Other(media_type) => json!({ media_type: {} }),
+            Content::Media(media_type) => json!({ media_type: {} }),
         })
     }
 
@@ -134,18 +134,29 @@ mod tests {
     }
 
     fn described(operation: &Operation, schemas: &mut Schemas) -> Value {
-        let mut success = json!({ "description": "Success." });
-        if let Some(content) = content("", operation.answer, schemas) {
-            success["content"] = content;
-        }
+        let mut answer = |description: &str, kind: Content| {
+            let kind = if operation.method == Method::Head { Content::None } else { kind };
+            let mut answer = json!({ "description": description });
+            if let Some(content) = content("", kind, schemas) {
+                answer["content"] = content;
+            }
+            answer
+        };
+        let success = answer("Success.", operation.answer);
         let mut answers = Map::from_iter([(operation.success.to_string(), success)]);
-        if operation.role.is_some() || operation.path == "/readyz" {
-            let refusal = content("", Content::Json("refusal"), schemas);
-            let refusal = json!({ "description": "Refused; nothing changed.", "content": refusal });
-            answers.insert("default".to_owned(), refusal);
+        let refusal = Content::Json("refusal");
+        for &(status, description) in operation.others {
+            let kind = if status < 300 { operation.answer } else { refusal };
+            let before = answers.insert(status.to_string(), answer(description, kind));
+            assert!(before.is_none(), "{status} of {}", operation.path);
+        }
+        if operation.role.is_some() {
+            let description = "Refused; nothing changed.";
+            answers.insert("default".to_owned(), answer(description, refusal));
         }
         let role = operation.role.map_or(String::new(), |role| match role {
-            "any" => "Any token.".to_owned(),
+            "any" => "Any token, except those with the role metrics.".to_owned(),
+            "drive" => "Tokens with the role drive, push or admin.".to_owned(),
             role => format!("Tokens with the role {role} or admin."),
         });
         let mut described = json!({
@@ -167,6 +178,7 @@ mod tests {
     fn verb(method: Method) -> &'static str {
         match method {
             Method::Get => "get",
+            Method::Head => "head",
             Method::Post => "post",
             Method::Patch => "patch",
             Method::Delete => "delete",

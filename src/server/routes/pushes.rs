@@ -17,8 +17,8 @@ use crate::auth::{Grant, Role};
 use crate::blocking::blocking;
 use crate::convert;
 use crate::fault::Fault;
-use crate::open_pushes::OpenPush;
 use crate::state::ServerState;
+use crate::token_counts::Counted;
 
 use super::refusal::HttpResult;
 
@@ -42,17 +42,17 @@ pub(super) async fn begin(
     let twin = request.twin.clone();
     let mut open = None;
     let files = || {
-        open = Some(state.open_pushes.begin(&grant)?);
-        let files = find_uploads(&state, &grant.name, &request.files)?;
-        let target = Target::Twin(&twin);
-        state.audit.begin(&grant, &Change { what: "push", target, id: Some(&id) })?;
-        Ok::<_, Fault>(files)
+        open = Some(state.open_pushes.push(&grant)?);
+        find_uploads(&state, &grant.name, &request.files)
     };
     let push = match state.pushes.begin(&request, &id, files)? {
         Begun::Known(push) => push,
         Begun::New { push, files } => {
-            let owned = OwnedPush { grant, id: id.clone(), _open: open };
-            tokio::spawn(run(state.clone(), push.clone(), owned, request, files));
+            let target = Target::Twin(twin.clone());
+            let change = Change { what: "push", target, id: Some(id.clone()) };
+            let owned = OwnedPush { grant, change, _open: open };
+            let logged = tokio::spawn(log_and_run(state, push.clone(), owned, request, files));
+            logged.await.map_err(|_| PushError::Crashed)??;
             push
         }
     };
@@ -80,16 +80,44 @@ pub(super) async fn cancel(
     grant.require(Role::Push)?;
     grant.require_twin(&twin)?;
     let push = state.pushes.get(&twin, &id).map_err(Fault::from)?;
-    push.cancel().map_err(|why| Fault::from(PushError::TooLate { id: id.clone(), why }))?;
+    let cancelling = push.clone();
+    let change =
+        Change { what: "cancel", target: Target::Twin(twin.clone()), id: Some(id.clone()) };
+    let cancelled = blocking(move || {
+        state.audit.begin_now(&grant, &change)?;
+        let cancelled = cancelling.cancel();
+        state.audit.end_now(&grant, &change, cancelled.map(|()| Made::Nothing));
+        Ok::<_, Fault>(cancelled)
+    });
+    cancelled.await?.map_err(|why| PushError::TooLate { id: id.clone(), why })?;
     Ok(answer(StatusCode::OK, &id, &twin, &push))
 }
 
 /// The token that owns a push, and its count.
 struct OwnedPush {
     grant: Arc<Grant>,
-    id: String,
+    change: Change,
     /// Counts among the token's pushes.
-    _open: Option<OpenPush>,
+    _open: Option<Counted>,
+}
+
+/// Logs that a push begins, and starts it. Returns when it is logged. A client that goes away changes nothing.
+///
+/// # Errors
+/// [`Fault::Audit`]: it did not begin.
+async fn log_and_run(
+    state: Arc<ServerState>,
+    push: Arc<Push>,
+    owned: OwnedPush,
+    request: PushRequest,
+    files: Vec<SourceFile>,
+) -> Result<(), Fault> {
+    if let Err(fault) = state.audit.begin(&owned.grant, &owned.change).await {
+        push.end(Err(PushError::Abandoned { reason: fault.to_string() }));
+        return Err(fault);
+    }
+    tokio::spawn(run(state, push, owned, request, files));
+    Ok(())
 }
 
 /// Runs a push to its end and records the result.
@@ -100,11 +128,12 @@ async fn run(
     request: PushRequest,
     files: Vec<SourceFile>,
 ) {
+    let OwnedPush { grant, change, _open } = owned;
     let twin = request.twin.clone();
     let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
     let published =
         wildcity_push::publish(&state.engine, &state.pushes, &push, request, files, &viewpoints)
-            .instrument(tracing::debug_span!("push", twin, id = owned.id));
+            .instrument(tracing::debug_span!("push", twin, id = change.id));
     let result = tokio::select! {
         // A cancelled push does not wait for its reading to stop.
         biased;
@@ -112,9 +141,8 @@ async fn run(
         result = published => result,
         () = stopped_before_commit(&state, &push) => Err(PushError::ShuttingDown),
     };
-    let change = Change { what: "push", target: Target::Twin(&twin), id: Some(&owned.id) };
     let made = result.as_ref().map(|version| Made::Version(version.number));
-    state.audit.end(&owned.grant, &change, made);
+    state.audit.end(&grant, &change, made).await;
     let reason = result.as_ref().err().map(ToString::to_string);
     let ended = push.end(result);
     if let Some(reason) = reason {

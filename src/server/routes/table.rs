@@ -31,6 +31,8 @@ pub(super) struct Operation {
     /// Status of success, and what is sent then.
     pub(super) success: u16,
     pub(super) answer: Content,
+    /// Other answers to requests that the document describes.
+    pub(super) others: &'static [Other],
     pub(super) body: Content,
     /// Parameters beside those of the path.
     pub(super) parameters: &'static [Parameter],
@@ -39,10 +41,14 @@ pub(super) struct Operation {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Method {
     Get,
+    Head,
     Post,
     Patch,
     Delete,
 }
+
+/// A status beside that of success. Below 300 the answer has what success has, otherwise it is a refusal.
+pub(super) type Other = (u16, &'static str);
 
 /// What a body is.
 #[derive(Clone, Copy)]
@@ -59,7 +65,7 @@ pub(super) enum Content {
     /// An object without a schema of its own.
     Object,
     /// Anything else, by its media type.
-    Other(&'static str),
+    Media(&'static str),
 }
 
 /// What a parameter may be.
@@ -108,6 +114,7 @@ impl Operation {
             summary,
             success: 200,
             answer: Content::None,
+            others: &[],
             body: Content::None,
             parameters: &[],
         }
@@ -115,6 +122,10 @@ impl Operation {
 
     const fn answers(self, success: u16, answer: Content) -> Self {
         Self { success, answer, ..self }
+    }
+
+    const fn or(self, others: &'static [Other]) -> Self {
+        Self { others, ..self }
     }
 
     const fn takes(self, body: Content) -> Self {
@@ -128,6 +139,7 @@ impl Operation {
     fn does<H: Handler<T, Arc<ServerState>>, T: 'static>(self, handler: H) -> Row {
         let method = match self.method {
             Method::Get => MethodFilter::GET,
+            Method::Head => MethodFilter::HEAD,
             Method::Post => MethodFilter::POST,
             Method::Patch => MethodFilter::PATCH,
             Method::Delete => MethodFilter::DELETE,
@@ -176,26 +188,32 @@ const UPLOAD_PARAMETERS: &[Parameter] = &[
     },
 ];
 
+const NO_HANDSHAKE: Other = (426, "The request is no handshake of a WebSocket.");
+const NONE: Other = (404, "There is none.");
+const FULL: Other = (507, "There is no room for it.");
+
+const METRICS: Option<&str> = Some("metrics");
 const DRIVE: Option<&str> = Some("drive");
 const PUSH: Option<&str> = Some("push");
 const ADMIN: Option<&str> = Some("admin");
 const ANY: Option<&str> = Some("any");
 
-const TEXT: Content = Content::Other("text/plain");
+const TEXT: Content = Content::Media("text/plain");
 
 /// The routes that need a token on a server with tokens.
 pub(super) fn guarded() -> Vec<Row> {
-    use Content::{Json, List, Object, Other};
-    use Method::{Delete, Get, Patch, Post};
+    use Content::{Json, List, Media};
+    use Method::{Delete, Get, Head, Patch, Post};
     let op = Operation::new;
     let mut rows = vec![
         op(
             Get,
-            "/v1/session",
+            websocket::SESSION,
             DRIVE,
             "Upgrade to the WebSocket of a session (subprotocol wildcity.v1).",
         )
         .answers(101, Content::None)
+        .or(&[NO_HANDSHAKE])
         .with(&[TICKET])
         .does(websocket::upgrade),
         op(Get, "/v1/sessions", ADMIN, "All sessions.")
@@ -203,11 +221,12 @@ pub(super) fn guarded() -> Vec<Row> {
             .does(sessions::list),
         op(
             Get,
-            "/v1/sessions/{session}/watch",
+            websocket::WATCH,
             DRIVE,
             "Upgrade to a WebSocket with a session's observations.",
         )
         .answers(101, Content::None)
+        .or(&[NO_HANDSHAKE, NONE])
         .with(&[TICKET])
         .does(websocket::watch),
         op(
@@ -222,22 +241,27 @@ pub(super) fn guarded() -> Vec<Row> {
             .answers(200, List("episodes", "episode"))
             .does(episodes::list),
         op(Get, "/v1/episodes/{episode}", ADMIN, "The record of an episode, a JSON object a line.")
-            .answers(200, Other("application/x-ndjson"))
+            .answers(200, Media("application/x-ndjson"))
+            .or(&[NONE])
             .does(episodes::show),
         op(Get, "/v1/episodes/{episode}/mcap", ADMIN, "An episode that ended as MCAP.")
-            .answers(200, Other("application/vnd.mcap"))
+            .answers(200, Media("application/vnd.mcap"))
+            .or(&[NONE])
             .does(episodes::mcap),
         op(Get, "/v1/twins", ANY, "The latest version of every twin, and the damaged twins.")
             .answers(200, Json("twins"))
             .does(twins::list),
         op(Get, "/v1/twins/{twin}", ANY, "The latest version of a twin.")
             .answers(200, Json("answer#TwinInfo"))
+            .or(&[NONE])
             .does(twins::show),
         op(Get, "/v1/twins/{twin}/versions", ANY, "All versions of a twin, the latest last.")
             .answers(200, List("versions", "version"))
+            .or(&[NONE])
             .does(twins::versions),
         op(Get, "/v1/twins/{twin}/trajectories/{name}", ANY, "Poses of a recorded drive.")
             .answers(200, Json("drive"))
+            .or(&[(400, "The stations are not on the drive, or there are too many poses."), NONE])
             .with(DRIVE_PARAMETERS)
             .does(twins::trajectory),
         op(
@@ -247,7 +271,8 @@ pub(super) fn guarded() -> Vec<Row> {
             "Makes an old version the latest, under a new number.",
         )
         .takes(Json("rollback"))
-        .answers(200, Object)
+        .answers(200, Json("made_version"))
+        .or(&[NONE])
         .does(twins::rollback),
         op(
             Get,
@@ -255,7 +280,8 @@ pub(super) fn guarded() -> Vec<Row> {
             PUSH,
             "Where a twin is, and the ground it seems to stand on.",
         )
-        .answers(200, Object)
+        .answers(200, Json("ground"))
+        .or(&[NONE])
         .does(twins::ground),
         op(
             Post,
@@ -264,32 +290,56 @@ pub(super) fn guarded() -> Vec<Row> {
             "Makes a version on level ground, in metres, with a drive and a rig.",
         )
         .takes(Json("new_edit"))
-        .answers(200, Object)
+        .answers(200, Json("made_version"))
+        .or(&[
+            (400, "No ground, scale, drive or version can be made of these numbers."),
+            (404, "There is no such twin, version or rig."),
+            (409, "Others changed the twin meanwhile."),
+        ])
         .does(twins::edit),
         op(Post, "/v1/twins/{twin}/pushes", PUSH, "Makes a new version from uploads.")
             .takes(Json("new_push"))
             .answers(202, Json("push"))
+            .or(&[
+                (400, "The axes of a file are no rotation, or a setting is none of the profile."),
+                (404, "There is no such upload or version."),
+                (409, "Others changed the same cells since the base."),
+            ])
             .does(pushes::begin),
         op(Get, "/v1/twins/{twin}/pushes/{id}", PUSH, "State of a push.")
             .answers(200, Json("push"))
+            .or(&[NONE])
             .does(pushes::show),
         op(Delete, "/v1/twins/{twin}/pushes/{id}", PUSH, "Cancels a push.")
             .answers(200, Json("push"))
+            .or(&[NONE, (409, "It is too late.")])
             .does(pushes::cancel),
         op(
             Post,
             "/v1/uploads",
             PUSH,
-            "Announces a file; 200 instead if all of its bytes are there already.",
+            "Announces a file.",
         )
         .takes(Json("new_upload"))
         .answers(201, Json("upload"))
+        .or(&[
+            (200, "All of its bytes are there already."),
+            (400, "The file is too large, or its name too long in bytes."),
+            (422, "A file without bytes has another digest, or the size is not that of the content."),
+            FULL,
+        ])
         .does(uploads::begin),
         op(Get, "/v1/uploads/{id}", PUSH, "State of an upload.")
             .answers(200, Json("upload"))
+            .or(&[NONE])
+            .does(uploads::show),
+        op(Head, "/v1/uploads/{id}", PUSH, "State of an upload: its header Upload-Offset.")
+            .answers(200, Content::None)
+            .or(&[NONE])
             .does(uploads::show),
         op(Delete, "/v1/uploads/{id}", PUSH, "Removes an upload.")
             .answers(204, Content::None)
+            .or(&[NONE])
             .does(uploads::delete),
         op(Get, "/v1/actors", ANY, "All assets of actors, and the damaged ones.")
             .answers(200, Json("actors"))
@@ -301,18 +351,26 @@ pub(super) fn guarded() -> Vec<Row> {
             "The asset of an actor of this name, or of a hash that begins so.",
         )
         .answers(200, Json("actors#ActorAsset"))
+        .or(&[(400, "Several assets have a hash that begins so."), NONE])
         .does(actors::show),
         op(
             Post,
             "/v1/actors",
             PUSH,
-            "Makes an asset of an actor from uploads; 200 instead if it is there already.",
+            "Makes an asset of an actor from uploads.",
         )
         .takes(Json("new_actor"))
         .answers(201, Json("actors#ActorAsset"))
+        .or(&[
+            (200, "It is there already."),
+            (400, "The axes of a file are no rotation."),
+            (404, "There is no such upload."),
+            (409, "An asset of another content has the name."),
+            (422, "The files cannot be an asset."),
+        ])
         .does(actors::push),
-        op(Get, "/metrics", ADMIN, "Metrics for Prometheus.")
-            .answers(200, Other("application/openmetrics-text"))
+        op(Get, metrics::PATH, METRICS, "Metrics for Prometheus.")
+            .answers(200, Media("application/openmetrics-text"))
             .does(metrics::show),
     ];
     // The body of an upload is not held in memory: it is written to disk as it arrives.
@@ -322,8 +380,15 @@ pub(super) fn guarded() -> Vec<Row> {
         PUSH,
         "Sends bytes of a file, from the offset that the upload is at.",
     )
-    .takes(Other("application/octet-stream"))
+    .takes(Media("application/octet-stream"))
     .answers(200, Json("upload"))
+    .or(&[
+        (400, "Content-Digest is none, or Upload-Offset is missing."),
+        NONE,
+        (409, "The upload goes on from another offset."),
+        (422, "The bytes are not those that were announced."),
+        FULL,
+    ])
     .with(UPLOAD_PARAMETERS)
     .does(uploads::append);
     append.handler = append.handler.layer(DefaultBodyLimit::disable());
@@ -339,13 +404,16 @@ pub(super) fn open() -> Vec<Row> {
         op(Get, "/healthz", None, "Whether the process runs.")
             .answers(200, TEXT)
             .does(async || "ok\n"),
-        op(Get, "/readyz", None, "Whether sessions can be opened.").answers(200, TEXT).does(ready),
+        op(Get, "/readyz", None, "Whether sessions can be opened.")
+            .answers(200, TEXT)
+            .or(&[(503, "The twins cannot be listed.")])
+            .does(ready),
         op(Get, "/v1/openapi.json", None, "This document.")
             .answers(200, Content::Object)
             .does(openapi::show),
     ];
     rows.extend(viewer::FILES.iter().map(|&file| {
-        let answer = Content::Other(file.media_type());
+        let answer = Content::Media(file.media_type());
         let summary = "A file of the viewer.";
         op(Get, file.path, None, summary).answers(200, answer).does(async move || file.response())
     }));

@@ -9,9 +9,11 @@ use axum::{Extension, Json};
 
 use crate::auth::Grant;
 use crate::convert;
+use crate::fault::Fault;
 use crate::state::ServerState;
 
 use super::refusal::HttpResult;
+use super::websocket;
 
 /// `POST /v1/tickets`: a ticket with the rights of the request's token.
 pub(super) async fn issue(
@@ -22,10 +24,16 @@ pub(super) async fn issue(
     Ok((StatusCode::CREATED, Json(convert::ticket(ticket))).into_response())
 }
 
-/// The ticket in the address of a WebSocket. No other request can have one: a ticket opens one connection.
-pub(super) fn of(request: &Request) -> Option<&str> {
-    let path = request.uri().path();
-    let is_socket = path == "/v1/session" || path.ends_with("/watch");
-    let query = request.uri().query().filter(|_| is_socket)?;
-    query.split('&').find_map(|pair| pair.strip_prefix("ticket="))
+/// The ticket in the address of a WebSocket. Requests of other routes cannot have one: a ticket opens one connection.
+///
+/// # Errors
+/// The request has a ticket, but is no handshake of a WebSocket. The ticket stays good.
+pub(super) fn of<'a>(request: &'a Request, route: &str) -> Result<Option<&'a str>, Fault> {
+    let Some(protocol) = websocket::protocol_of(route) else { return Ok(None) };
+    let query = request.uri().query().unwrap_or_default();
+    let ticket = query.split('&').find_map(|pair| pair.strip_prefix("ticket="));
+    if ticket.is_some() {
+        websocket::check_handshake(request.headers(), protocol)?;
+    }
+    Ok(ticket)
 }

@@ -8,6 +8,7 @@ use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
 use wildcity_push::PushError;
+use wildcity_scene::rig::is_name;
 use wildcity_twin::store::StoreError;
 
 use crate::audit::{Change, Made, Target};
@@ -108,19 +109,20 @@ pub(super) async fn edit(
 ) -> HttpResult {
     grant.require(Role::Push)?;
     grant.require_twin(&name)?;
+    check_twin(&name)?;
     let request = convert::new_edit(name, &body)?;
-    let open = state.open_pushes.begin(&grant)?;
+    let open = state.open_pushes.push(&grant)?;
     // A client that goes away leaves a whole version, or none.
     let edited = tokio::spawn(async move {
         let _open = open;
-        let twin = request.twin.clone();
-        let change = Change { what: "edit", target: Target::Twin(&twin), id: None };
-        state.audit.begin(&grant, &change)?;
+        let target = Target::Twin(request.twin.clone());
+        let change = Change { what: "edit", target, id: None };
+        state.audit.begin(&grant, &change).await?;
         let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
         let edited =
             wildcity_push::publish_edit(&state.engine, &state.pushes, request, &viewpoints).await;
         let made = edited.as_ref().map(|version| Made::Version(version.number));
-        state.audit.end(&grant, &change, made);
+        state.audit.end(&grant, &change, made).await;
         Ok::<_, Fault>(edited?)
     });
     let edited = edited.await.map_err(|_| PushError::Crashed)?;
@@ -136,14 +138,15 @@ pub(super) async fn rollback(
 ) -> HttpResult {
     grant.require(Role::Admin)?;
     grant.require_twin(&name)?;
+    check_twin(&name)?;
     let number = convert::rollback(&body)?;
     let version = blocking(move || {
         let engine = &state.engine;
-        let change = Change { what: "rollback", target: Target::Twin(&name), id: None };
-        state.audit.begin(&grant, &change)?;
+        let change = Change { what: "rollback", target: Target::Twin(name.clone()), id: None };
+        state.audit.begin_now(&grant, &change)?;
         let rolled_back = engine.catalog().rollback(&name, number);
         let made = rolled_back.as_ref().map(|version| Made::Version(version.number));
-        state.audit.end(&grant, &change, made);
+        state.audit.end_now(&grant, &change, made);
         let version = rolled_back?;
         // A push that is still loading its version has pinned the one before; move that pin, so that
         // the rollback becomes the latest at once.
@@ -152,4 +155,12 @@ pub(super) async fn rollback(
         Ok::<_, Fault>(version)
     });
     Ok(Json(convert::version(&version.await?)).into_response())
+}
+
+/// Refuses what no twin is called, before the audit log repeats it.
+fn check_twin(name: &str) -> Result<(), Fault> {
+    match is_name(name) {
+        true => Ok(()),
+        false => Err(Fault::InvalidName { field: "twin".to_owned(), name: name.to_owned() }),
+    }
 }

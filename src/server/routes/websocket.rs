@@ -8,6 +8,7 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse as _;
 use hyper::upgrade::Upgraded;
 use hyper_util::rt::TokioIo;
+use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
 use crate::auth::{Grant, Role};
@@ -18,9 +19,15 @@ use crate::newcomers::ConnectionSlot;
 use crate::socket::Socket;
 use crate::state::ServerState;
 use crate::stream::Stream;
+use crate::token_counts::Counted;
 use crate::watchers;
 
 use super::refusal::HttpResult;
+
+/// The route of sessions.
+pub(super) const SESSION: &str = "/v1/session";
+/// The route of watchers.
+pub(super) const WATCH: &str = "/v1/sessions/{session}/watch";
 
 /// `GET /v1/session`: checks the handshake (RFC 6455, section 4.2) and hands the socket over to a
 /// [`connection`].
@@ -34,7 +41,8 @@ pub(super) async fn upgrade(
     grant.require(Role::Drive)?;
     let shared = state.clone();
     let is_forwarded = is_forwarded(request.headers());
-    hand_over(&state, slot, accept, convert::SUBPROTOCOL, request, async move |socket| {
+    let slots = Slots::take(&state, slot, &grant)?;
+    hand_over(&state, slots, accept, convert::SUBPROTOCOL, request, async move |socket| {
         connection::serve(shared, socket, grant, is_forwarded).await;
     })
 }
@@ -52,15 +60,48 @@ pub(super) async fn watch(
     grant.require(Role::Drive)?;
     let watch = state.sessions.watch(&session, &grant)?;
     let shared = state.clone();
-    hand_over(&state, slot, accept, convert::WATCH_SUBPROTOCOL, request, async move |socket| {
+    let slots = Slots::take(&state, slot, &grant)?;
+    hand_over(&state, slots, accept, convert::WATCH_SUBPROTOCOL, request, async move |socket| {
         watchers::serve(shared.stopped(), socket, watch).await;
     })
+}
+
+/// The subprotocol of a route, if the route is a WebSocket.
+pub(super) fn protocol_of(route: &str) -> Option<&'static str> {
+    match route {
+        SESSION => Some(convert::SUBPROTOCOL),
+        WATCH => Some(convert::WATCH_SUBPROTOCOL),
+        _ => None,
+    }
+}
+
+/// What a WebSocket connection counts among, until it is dropped.
+struct Slots {
+    _connection: Arc<ConnectionSlot>,
+    _of_server: OwnedSemaphorePermit,
+    _of_token: Counted,
+}
+
+impl Slots {
+    /// # Errors
+    /// [`Fault::Busy`]: the server or the token has as many WebSocket connections as it may.
+    fn take(
+        state: &ServerState,
+        connection: Arc<ConnectionSlot>,
+        grant: &Grant,
+    ) -> Result<Self, Fault> {
+        let of_token = state.open_connections.connection(grant)?;
+        let limit = state.limits.connections;
+        let of_server = state.websocket_permits.clone().try_acquire_owned();
+        let of_server = of_server.map_err(|_| Fault::Busy { what: "connections", limit })?;
+        Ok(Self { _connection: connection, _of_server: of_server, _of_token: of_token })
+    }
 }
 
 /// Answers a handshake, and serves its socket once that is upgraded.
 fn hand_over<F>(
     state: &Arc<ServerState>,
-    slot: Arc<ConnectionSlot>,
+    slots: Slots,
     accept: String,
     protocol: &'static str,
     mut request: Request,
@@ -69,16 +110,11 @@ fn hand_over<F>(
 where
     F: Future<Output = ()> + Send,
 {
-    let Ok(websocket_permit) = state.websocket_permits.clone().try_acquire_owned() else {
-        let limit = state.limits.connections;
-        return Err(Fault::Busy { what: "connections", limit }.into());
-    };
     let upgrade = hyper::upgrade::on(&mut request);
     let send_timeout = state.limits.send;
     tokio::spawn(async move {
-        // Both are held until the connection ends.
-        let _slot = slot;
-        let _websocket_permit = websocket_permit;
+        // Held until the connection ends.
+        let _slots = slots;
         match upgrade.await.map(into_stream) {
             Ok(Ok((stream, read_ahead))) => {
                 serve(Socket::new(stream, read_ahead, send_timeout).await).await;
@@ -108,7 +144,10 @@ fn into_stream(upgraded: Upgraded) -> Result<(Stream, Vec<u8>), Upgraded> {
 }
 
 /// The client's key, if the headers are those of a WebSocket handshake.
-fn check_handshake<'a>(headers: &'a HeaderMap, protocol: &'static str) -> Result<&'a [u8], Fault> {
+pub(super) fn check_handshake<'a>(
+    headers: &'a HeaderMap,
+    protocol: &'static str,
+) -> Result<&'a [u8], Fault> {
     let any = |name: header::HeaderName, is_wanted: &dyn Fn(&str) -> bool| {
         let values = headers.get_all(name).into_iter().filter_map(|value| value.to_str().ok());
         values.flat_map(|value| value.split(',')).any(|value| is_wanted(value.trim()))

@@ -11,7 +11,9 @@ use parking_lot::Mutex;
 use tokio::sync::watch;
 use tokio::time::timeout;
 
-use wildcity_episode::{EpisodeFile, export_file, mcap_of, record_bytes, remove_leftovers};
+use wildcity_episode::{
+    EpisodeFile, ExportError, export_file, mcap_of, record_bytes, remove_leftovers,
+};
 
 use crate::error::SessionError;
 use crate::limits;
@@ -65,7 +67,8 @@ impl Exports {
         let name = EpisodeFile::name_of(&record);
         let mut state = self.shared.state.lock();
         if state.waiting.len() >= limits::WAITING_EXPORTS {
-            state.fail(name, format!("{} others waited", limits::WAITING_EXPORTS));
+            let reason = format!("{} others waited", limits::WAITING_EXPORTS);
+            state.fail(name, Failure::Bad(reason));
             return;
         }
         state.waiting.push_back(name);
@@ -92,7 +95,8 @@ impl Shared {
     fn run(&self, records: &Receiver<PathBuf>) {
         for record in records {
             let exported = catch_unwind(AssertUnwindSafe(|| export(&record)));
-            let exported = exported.unwrap_or_else(|_| Err("the export crashed".to_owned()));
+            let exported =
+                exported.unwrap_or_else(|_| Err(Failure::Bad("the export crashed".to_owned())));
             let mut state = self.state.lock();
             let name = state.waiting.pop_front().unwrap_or_default();
             if let Err(reason) = exported {
@@ -104,6 +108,14 @@ impl Shared {
     }
 }
 
+/// Why an episode was not exported.
+enum Failure {
+    /// Something is wrong.
+    Bad(String),
+    /// Nothing was driven.
+    Empty(String),
+}
+
 impl State {
     fn is_waiting(&self, episode: Option<&str>) -> bool {
         match episode {
@@ -112,8 +124,17 @@ impl State {
         }
     }
 
-    fn fail(&mut self, episode: String, reason: String) {
-        tracing::error!(episode, "no MCAP file: {reason}");
+    fn fail(&mut self, episode: String, failure: Failure) {
+        let reason = match failure {
+            Failure::Bad(reason) => {
+                tracing::error!(episode, "no MCAP file: {reason}");
+                reason
+            }
+            Failure::Empty(reason) => {
+                tracing::debug!(episode, "no MCAP file: {reason}");
+                reason
+            }
+        };
         if self.failed.len() >= limits::FAILED_EXPORTS {
             self.failed.pop_front();
         }
@@ -121,16 +142,17 @@ impl State {
     }
 }
 
-fn export(record: &Path) -> Result<(), String> {
+fn export(record: &Path) -> Result<(), Failure> {
     let bytes = record_bytes(record);
     if bytes > limits::EXPORTED_RECORD_BYTES {
         let most = limits::EXPORTED_RECORD_BYTES;
-        return Err(format!(
+        return Err(Failure::Bad(format!(
             "the record has {bytes} bytes; at most {most} are exported by themselves"
-        ));
+        )));
     }
     match export_file(record, &mcap_of(record)) {
         Ok(_) => Ok(()),
-        Err(error) => Err(error.to_string()),
+        Err(error @ ExportError::Empty) => Err(Failure::Empty(error.to_string())),
+        Err(error) => Err(Failure::Bad(error.to_string())),
     }
 }

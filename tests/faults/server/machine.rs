@@ -17,17 +17,18 @@ use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Catalog;
 
 use crate::audit::Audit;
-use crate::auth::Tokens;
+use crate::auth::{CurrentTokens, Tokens};
 use crate::config::Limits;
 use crate::listen::Acceptor;
 use crate::metrics::Metrics;
-use crate::open_pushes::OpenPushes;
 use crate::origins::Origins;
+use crate::readiness::Readiness;
 use crate::sessions::SessionRegistry;
 use crate::spool::Spool;
 use crate::state::ServerState;
 use crate::stream::Stream;
 use crate::tickets::Tickets;
+use crate::token_counts::TokenCounts;
 
 use super::disk::{ROOT, SimClock, SimDisk};
 use super::support::{Painter, commit_twin_to};
@@ -89,10 +90,12 @@ impl Machine {
             limits,
             profile: Default::default(),
             shares_memory: false,
-            tokens,
+            tokens: tokens.map(CurrentTokens::new),
             tickets: Tickets::default(),
-            audit: Audit::open(None).expect("no audit log"),
-            open_pushes: OpenPushes::default(),
+            audit: Arc::new(Audit::open(None).expect("no audit log")),
+            open_pushes: TokenCounts::default(),
+            open_connections: TokenCounts::default(),
+            readiness: Readiness::default(),
             origins: Origins::default(),
             episodes: self.episodes.path().to_owned(),
             spool,

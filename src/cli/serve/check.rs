@@ -1,0 +1,111 @@
+//! What `wildcity doctor --config` looks at in the configuration of a server.
+
+use std::ffi::OsString;
+use std::fs::{self, OpenOptions};
+use std::net::TcpListener;
+use std::path::Path;
+use std::time::SystemTime;
+
+use wildcity_server::{TlsFiles, Tokens};
+
+use crate::cli::directories::ServerDirectories;
+
+use super::{Serve, config_file};
+
+/// What was looked at, and what was found: good, or what is wrong.
+pub(in crate::cli) type Check = (&'static str, Result<String, String>);
+
+impl Serve {
+    /// The options of a file, as `wildcity serve --config FILE` has them.
+    ///
+    /// # Errors
+    /// The file cannot be read, has an unknown key or a value that the option refuses.
+    pub(in crate::cli) fn of_file(file: &Path) -> anyhow::Result<Self> {
+        let mut argument = OsString::from("--config=");
+        argument.push(file);
+        Ok(config_file::resolve(vec![argument])?.serve)
+    }
+
+    /// The directories of the server.
+    pub(in crate::cli) fn directories(&self) -> &ServerDirectories {
+        &self.directories
+    }
+
+    /// Checks the address and every file that the server reads or writes besides its directories. Changes nothing.
+    pub(in crate::cli) fn checks(&self) -> Vec<Check> {
+        let mut checks = vec![("listen", self.check_listen())];
+        if let Some(path) = &self.tokens {
+            let found = Tokens::read(path).map(|_| format!("{} can be used", path.display()));
+            checks.push(("tokens", found.map_err(|error| format!("{}: {error}", path.display()))));
+        }
+        match (&self.tls_cert, &self.tls_key) {
+            (Some(cert), Some(key)) => {
+                let files = TlsFiles { cert: cert.clone(), key: key.clone() };
+                checks.push(("certificate", check_certificate(&files)));
+            }
+            (None, None) => {}
+            _ => {
+                let wrong = "tls_cert and tls_key need each other".to_owned();
+                checks.push(("certificate", Err(wrong)));
+            }
+        }
+        if let Some(path) = &self.audit_log {
+            checks.push(("audit log", check_audit_log(path)));
+        }
+        checks.push(("scenarios", self.check_scenarios()));
+        checks
+    }
+
+    fn check_listen(&self) -> Result<String, String> {
+        let listen = self.listen;
+        if self.tokens.is_none() && !listen.ip().is_loopback() {
+            return Err(format!("{listen} is no loopback address, and needs tokens"));
+        }
+        match TcpListener::bind(listen) {
+            Ok(_) => Ok(format!("{listen} is free")),
+            Err(error) => Err(format!("{listen}: {error}; a server may run already")),
+        }
+    }
+
+    fn check_scenarios(&self) -> Result<String, String> {
+        let dir = self.directories.scenarios.dir().map_err(|error| format!("{error:#}"))?;
+        let shown = dir.display();
+        if !dir.exists() {
+            return Ok(format!("there is no {shown}: none can be opened by name"));
+        }
+        let entries = fs::read_dir(&dir).map_err(|error| format!("{shown}: {error}"))?;
+        let is_file = |name: &Path| name.extension().is_some_and(|extension| extension == "json");
+        let count =
+            entries.filter(|entry| entry.as_ref().is_ok_and(|entry| is_file(&entry.path())));
+        Ok(format!("{} files in {shown}; `wildcity scenario check` reads one", count.count()))
+    }
+}
+
+fn check_certificate(files: &TlsFiles) -> Result<String, String> {
+    let expires = files.check().map_err(|error| error.to_string())?;
+    let shown = files.cert.display();
+    match expires.duration_since(SystemTime::now()) {
+        Ok(left) => {
+            Ok(format!("{shown} is that of the key, and good for {} days", left.as_secs() / 86_400))
+        }
+        Err(over) => {
+            let days = over.duration().as_secs() / 86_400;
+            Err(format!("{shown} expired {days} days ago: renew it"))
+        }
+    }
+}
+
+fn check_audit_log(path: &Path) -> Result<String, String> {
+    let shown = path.display();
+    let written = match path.exists() {
+        true => OpenOptions::new().append(true).open(path).map(drop),
+        false => {
+            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+            tempfile::tempfile_in(folder.unwrap_or(Path::new("."))).map(drop)
+        }
+    };
+    match written {
+        Ok(()) => Ok(format!("{shown} can be written")),
+        Err(error) => Err(format!("{shown} cannot be written: {error}")),
+    }
+}

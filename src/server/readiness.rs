@@ -1,0 +1,71 @@
+//! Whether sessions can be opened, looked up once for all that ask within a second.
+
+use std::time::Instant;
+
+use serde_json::Value;
+use tokio::sync::Mutex;
+
+use wildcity_session::Engine;
+
+use crate::convert;
+use crate::limits;
+
+/// The last look at the list of twins.
+#[derive(Default)]
+pub(crate) struct Readiness(Mutex<Option<Look>>);
+
+struct Look {
+    at: Instant,
+    refusal: Option<Value>,
+}
+
+impl Readiness {
+    /// The body of a refusal if the twins cannot be listed. A request that comes during a look waits for it.
+    pub(crate) async fn refusal(&self, engine: &Engine) -> Option<Value> {
+        let check = async {
+            engine.check_twins().await.err().map(|error| convert::refusal_body(&error.into()))
+        };
+        self.look(Instant::now(), check).await
+    }
+
+    async fn look(
+        &self,
+        now: Instant,
+        check: impl Future<Output = Option<Value>>,
+    ) -> Option<Value> {
+        let mut last = self.0.lock().await;
+        if let Some(Look { at, refusal }) = &*last
+            && now < *at + limits::READY_AGE
+        {
+            return refusal.clone();
+        }
+        let refusal = check.await;
+        *last = Some(Look { at: now, refusal: refusal.clone() });
+        refusal
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::Cell;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn many_questions_within_a_second_are_one_look() {
+        let readiness = Readiness::default();
+        let looks = Cell::new(0);
+        let ask = async |now: Instant| {
+            let look = async {
+                looks.set(looks.get() + 1);
+                Some(looks.get().into())
+            };
+            readiness.look(now, look).await
+        };
+        let begin = Instant::now();
+        for part in 0..10_u32 {
+            assert_eq!(ask(begin + part * limits::READY_AGE / 10).await, Some(1.into()));
+        }
+        assert_eq!(ask(begin + limits::READY_AGE).await, Some(2.into()));
+    }
+}

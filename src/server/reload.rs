@@ -1,0 +1,57 @@
+//! Reading the certificate and the tokens again at SIGHUP.
+
+use std::sync::Arc;
+
+use crate::state::ServerState;
+use crate::tls::Tls;
+
+/// Reads both again with every SIGHUP, until dropped. Connections that exist keep their certificate and what their
+/// token allowed. What cannot be used changes nothing. From the call on, SIGHUP does not end the process.
+pub(crate) fn reload(
+    tls: Option<Arc<Tls>>,
+    state: Arc<ServerState>,
+) -> impl Future<Output = ()> + Send {
+    #[cfg(unix)]
+    let hangup = {
+        use tokio::signal::unix::{SignalKind, signal};
+        signal(SignalKind::hangup())
+    };
+    async move {
+        #[cfg(unix)]
+        match hangup {
+            Ok(mut hangup) => {
+                while hangup.recv().await.is_some() {
+                    let shared = (tls.clone(), state.clone());
+                    let read = move || read_again(shared.0.as_deref(), &shared.1);
+                    if tokio::task::spawn_blocking(read).await.is_err() {
+                        tracing::error!("SIGHUP: reading again crashed");
+                    }
+                    state.metrics.reloads.inc();
+                }
+            }
+            Err(error) => tracing::error!("SIGHUP reads nothing again: {error}"),
+        }
+        #[cfg(not(unix))]
+        drop((tls, state));
+        std::future::pending().await
+    }
+}
+
+#[cfg(unix)]
+fn read_again(tls: Option<&Tls>, state: &ServerState) {
+    if let Some(tls) = tls {
+        tls.read_again();
+    }
+    match state.tokens.as_ref().map(|tokens| tokens.read_again()) {
+        Some(Ok(Some(file))) => tracing::info!(file = %file.display(), "read the tokens again"),
+        Some(Err((file, error))) => {
+            tracing::error!(file = %file.display(), "the old tokens stay: {error}");
+        }
+        Some(Ok(None)) | None if tls.is_none() => {
+            tracing::info!(
+                "SIGHUP: there is nothing to read again, neither a certificate nor tokens"
+            );
+        }
+        Some(Ok(None)) | None => {}
+    }
+}

@@ -1,0 +1,91 @@
+//! How many pushes or connections each token has at this moment.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+
+use crate::auth::Grant;
+use crate::fault::Fault;
+
+/// Numbers of things of one kind, by token.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct TokenCounts(Arc<Mutex<BTreeMap<String, usize>>>);
+
+/// One thing that counts until it is dropped.
+#[derive(Debug)]
+pub(crate) struct Counted {
+    counts: TokenCounts,
+    token: String,
+}
+
+impl TokenCounts {
+    /// Counts one more push or edit of a token.
+    ///
+    /// # Errors
+    /// [`Fault::Busy`]: the token has as many as it may.
+    pub(crate) fn push(&self, grant: &Grant) -> Result<Counted, Fault> {
+        self.begin(grant, grant.limits.pushes, "pushes of this token")
+    }
+
+    /// Counts one more WebSocket connection of a token.
+    ///
+    /// # Errors
+    /// [`Fault::Busy`]: the token has as many as it may.
+    pub(crate) fn connection(&self, grant: &Grant) -> Result<Counted, Fault> {
+        self.begin(grant, grant.limits.connections, "connections of this token")
+    }
+
+    fn begin(
+        &self,
+        grant: &Grant,
+        limit: Option<usize>,
+        what: &'static str,
+    ) -> Result<Counted, Fault> {
+        let mut counts = self.0.lock();
+        let count = counts.get(&grant.name).copied().unwrap_or(0);
+        if let Some(limit) = limit
+            && count >= limit
+        {
+            return Err(Fault::Busy { what, limit });
+        }
+        counts.insert(grant.name.clone(), count + 1);
+        Ok(Counted { counts: self.clone(), token: grant.name.clone() })
+    }
+}
+
+impl Drop for Counted {
+    fn drop(&mut self) {
+        let mut counts = self.counts.0.lock();
+        if let Some(count) = counts.get_mut(&self.token) {
+            *count -= 1;
+            if *count == 0 {
+                counts.remove(&self.token);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::auth::Tokens;
+
+    #[test]
+    fn a_token_has_as_many_pushes_as_it_may() {
+        let text = r#"{"tokens": [
+            {"name": "a", "role": "push", "token": "0123456789abcdef", "limits": {"pushes": 2}},
+            {"name": "b", "role": "push", "token": "0123456789abcdeg"}]}"#;
+        let tokens = Tokens::parse(text.as_bytes()).unwrap();
+        let [a, b] = ["f", "g"].map(|end| {
+            tokens.grant(Some(format!("Bearer 0123456789abcde{end}").as_bytes())).unwrap()
+        });
+        let pushes = TokenCounts::default();
+        let first = pushes.push(&a).unwrap();
+        let _second = pushes.push(&a).unwrap();
+        assert!(matches!(pushes.push(&a), Err(Fault::Busy { limit: 2, .. })));
+        let _others: Vec<Counted> = (0..9).map(|_| pushes.push(&b).unwrap()).collect();
+        drop(first);
+        assert!(pushes.push(&a).is_ok());
+    }
+}
