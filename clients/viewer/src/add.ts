@@ -2,7 +2,7 @@
 
 import { el, messageOf } from "./dom";
 import type { Twin } from "./protocol";
-import { append, get, post, roleOfToken } from "./server";
+import { append, get, post } from "./server";
 import { Sha256 } from "./sha256";
 import { archive } from "./zip";
 
@@ -70,8 +70,7 @@ export class Adder {
       if (push.state !== "ready") throw new Error(push.error?.message ?? push.state);
       this.showProgress(`${twin} was added`);
       this.onAdded();
-      // A token that only pushes opens no sessions, and so gets no pictures to click on.
-      if ((await roleOfToken()) !== "push") location.hash = `#/place/${encodeURIComponent(twin)}`;
+      location.hash = `#/place/${encodeURIComponent(twin)}`;
     } catch (error) {
       this.showProgress(messageOf(error), true);
     } finally {

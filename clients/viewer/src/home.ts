@@ -66,7 +66,7 @@ export class HomePage implements Page {
       const { twins, damaged } = await get<{ twins: Twin[]; damaged?: { name: string; reason: string }[] }>("v1/twins");
       this.showTwins(twins, damaged ?? [], role);
       this.adder.element.hidden = role === "drive";
-      this.own.hidden = role !== "drive";
+      this.own.hidden = role === undefined || role === "admin";
       if (role === undefined || role === "admin") await this.loadSessions();
       if (!this.ended) showStatus("");
     } catch (error) {
@@ -98,14 +98,12 @@ export class HomePage implements Page {
   }
 
   private showTwins(twins: Twin[], damaged: { name: string; reason: string }[], role: Role | undefined): void {
-    const drives = role !== "push";
     const rows = twins.map((twin) => {
       const recorded = twin.trajectories.map(({ name, length_m: length }) => `${name} ${fixed(length, 0)} m`).join(", ");
       const link = (kind: string, text: string): HTMLElement => el("a.action", { href: `#/${kind}/${twin.name}` }, text);
-      // Placing needs pictures, which the role push cannot have, and makes a version, which the role drive cannot.
-      const actions = [...(drives ? [link("drive", "Drive"), link("fly", "Free camera")] : []),
-        ...(drives && role !== "drive" ? [link("place", "Place a drive")] : [])];
-      const name = drives ? el("a.name", { href: `#/drive/${twin.name}` }, twin.name) : el("b", {}, twin.name);
+      // Placing makes a version, which the role drive may not.
+      const actions = [link("drive", "Drive"), link("fly", "Free camera"), ...(role === "drive" ? [] : [link("place", "Place a drive")])];
+      const name = el("a.name", { href: `#/drive/${twin.name}` }, twin.name);
       return el("tr", {}, el("td", {}, name), el("td.number", {}, `v${twin.version}`),
         el("td.number", {}, count(twin.gaussians)), el("td.drives", {}, recorded || "no recorded drive"), el("td.actions", {}, ...actions));
     });

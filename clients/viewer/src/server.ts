@@ -15,7 +15,7 @@ export class Refused extends Error {
 }
 
 /** What a token may do: open sessions, upload and push, or everything. */
-export type Role = "drive" | "push" | "admin";
+export type Role = "metrics" | "drive" | "push" | "admin";
 
 /** Keys of what is remembered until the tab is closed. */
 const TOKEN = "wildcity-token";
@@ -51,7 +51,7 @@ export async function roleOfToken(): Promise<Role | undefined> {
   } catch (error) {
     if (!(error instanceof Refused && error.code === "forbidden" && error.field === "authorization")) throw error;
     // The refusal names the role of the token, and no answer of the server does.
-    role = /role is (\w+)/.exec(error.message)?.[1] === "push" ? "push" : "drive";
+    role = (/role is (metrics|drive|push)/.exec(error.message)?.[1] ?? "drive") as Role;
   }
   sessionStorage.setItem(ROLE, role);
   return role;
