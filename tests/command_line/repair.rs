@@ -170,3 +170,23 @@ fn a_manifest_that_is_wrong_stops_the_server_before_it_listens() {
     let said = refused(&["--repair", "model.json,model.json", "--onnxruntime", "model.onnx"]);
     assert!(said.contains("is also that of model.json"), "{said}");
 }
+
+/// The model that comes with the project, from the spoiled street to the pictures.
+#[test]
+fn the_demo_repairs_views_beside_its_drive() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = wildcity();
+    command.args(["demo", "--off-trajectory", "3", "--repair", "--out", "out", "--onnxruntime"]);
+    command.arg(library()).current_dir(folder.path()).env("XDG_DATA_HOME", folder.path());
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let table = String::from_utf8(output.stdout).unwrap();
+    let mean_db = |kind: &str| {
+        let row = table.lines().find_map(|line| line.strip_prefix(kind)).expect(&table);
+        let db: Vec<f64> = row.split_whitespace().map(|db| db.parse().unwrap()).collect();
+        db.iter().sum::<f64>() / db.len() as f64
+    };
+    assert!(mean_db("repaired") > mean_db("rendered") + 2.0, "{table}");
+    let picture = image::open(folder.path().join("out/beside_090.png")).unwrap();
+    assert_eq!((picture.width(), picture.height()), (3 * 360, 3 * 232));
+}

@@ -83,6 +83,7 @@ impl Made {
             limit_us: Some(self.steps as i64 * 100_000),
             least_progress: 0.8,
             lanes: Vec::new(),
+            ground: Vec::new(),
             checks_static: false,
         };
         let mut lines = vec![header(), tagged("scenario", &scenario)];

@@ -291,6 +291,8 @@ fn nothing_comes_without_depth_or_from_far_beside() {
     assert_eq!(valid(0), 0.0, "pixels of low opacity have no depth");
     assert!(valid(1) > 8_000.0);
 
+    // Of each block of pixels one is looked at, so all have a depth here.
+    let view = WarpTarget { depth_m: &depth_m, ..view };
     assert!(overlaps(&view, &camera, &reference.world_from_camera));
     let turned = Pose { rotation: DQuat::from_rotation_y(2.0), ..target };
     assert!(!overlaps(&view, &camera, &turned));

@@ -6,8 +6,8 @@ use std::process::Command;
 use std::time::Duration;
 
 use rcgen::{
-    BasicConstraints, CertificateParams, CertifiedKey, IsCa, Issuer, KeyPair, KeyUsagePurpose,
-    generate_simple_self_signed,
+    BasicConstraints, CertificateParams, CertifiedKey, DnType, IsCa, Issuer, KeyPair,
+    KeyUsagePurpose, generate_simple_self_signed,
 };
 use wildcity_client::{Client, ConnectOptions, Open, Pose};
 use wildcity_server::{Config, ServerError, TlsFiles};
@@ -84,6 +84,8 @@ async fn other_clients_trust_a_private_authority() {
     let mut authority = CertificateParams::new(Vec::new()).unwrap();
     authority.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
     authority.key_usages = vec![KeyUsagePurpose::KeyCertSign];
+    // With equal names OpenSSL takes the server's certificate as signed by itself.
+    authority.distinguished_name.push(DnType::CommonName, "test authority");
     let authority_key = KeyPair::generate().unwrap();
     let root = authority.self_signed(&authority_key).unwrap();
     let issuer = Issuer::new(authority, authority_key);

@@ -114,12 +114,19 @@ const MOSAIC_STEPS: u64 = 10;
 impl Demo {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let twins = self.twins.dir()?;
+        output::create_dir(&self.out)?;
+        let repairs = match self.repair {
+            true => {
+                let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
+                off_trajectory::model(&self.out.join("model"), options)?
+            }
+            false => Models::default(),
+        };
         let version = demo_twin(&twins, TWIN, StorageOptions::default(), None)?;
         let assets = match self.scenario {
             Some(_) => generated(&self.twins.catalog()?)?,
             None => Vec::new(),
         };
-        output::create_dir(&self.out)?;
         if self.off_trajectory.is_some() {
             demo_twin(&twins, SPOILED_TWIN, StorageOptions::default(), Some(SPOILED_BY))?;
         }
@@ -128,13 +135,6 @@ impl Demo {
             episodes: self.out.join("episodes"),
             scenarios: self.out.join("scenarios"),
             uploads: self.out.join("uploads"),
-        };
-        let repairs = match self.repair {
-            true => {
-                let options = LoadOptions::new(runtime_library(self.onnxruntime.as_ref()));
-                off_trajectory::model(&self.out.join("model"), options)?
-            }
-            false => Models::default(),
         };
         let config = Config {
             cache: self.twins.cache(),

@@ -59,8 +59,8 @@ async fn record_images(
         return Ok(());
     }
     let rig = base.manifest.rig.as_ref().context("the demo twin has a rig")?;
-    let around = |view_m: &f64| (-5..=2).map(move |k| view_m + RECORDED_M * f64::from(k));
-    let stations_m: Vec<f64> = STATIONS_M.iter().flat_map(around).collect();
+    let around = |view_m: f64| (-5..=2).map(move |k| view_m + RECORDED_M * f64::from(k));
+    let stations_m: Vec<f64> = STATIONS_M.into_iter().flat_map(around).collect();
     let mut commit = catalog.begin(spoiled_twin, CommitKind::Import, StorageOptions::default())?;
     let mut views = Vec::new();
     for some_m in stations_m.chunks(8) {
@@ -178,7 +178,7 @@ async fn drawn(
 ) -> anyhow::Result<Vec<Vec<RgbImage>>> {
     let mut client = Client::connect(url, "wildcity demo").await?;
     let part = ImagePart { crop: None, size: Some(SIZE_PX.map(u64::from)) };
-    let images = CAMERAS.iter().map(|name| ((*name).to_owned(), part.clone()));
+    let images = CAMERAS.iter().map(|name| ((*name).to_owned(), part));
     let outputs = Outputs {
         cameras: Some(CAMERAS.map(str::to_owned).to_vec()),
         images: images.collect::<BTreeMap<_, _>>(),
