@@ -88,6 +88,7 @@ async fn a_session_that_drove_nothing_is_no_error_in_the_log() {
     let mut agent = Agent::connect(served.address).await;
     agent.hello().await;
     agent.open(json!({})).await;
+    agent.look(json!({ "type": "observe", "poses": [support::pose(1.0)] })).await;
     agent.ask(json!({ "type": "close" })).await;
     logs(&log, "no MCAP file: the episode has no frame").await;
     let text = fs::read_to_string(&log).unwrap();
