@@ -23,7 +23,7 @@
 //! | `model` | all of it in order |
 //! | `models` | the models that a program offers by name, each loaded when it is first asked for |
 //! | `select` | which views of a step are repaired, by trust |
-//! | [`reference`] | recorded images brought into a view by its depth |
+//! | [`mod@reference`] | recorded images brought into a view by its depth |
 
 mod error;
 mod files;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import random
 import select
@@ -226,7 +227,12 @@ def test_an_asset_of_an_actor(server: str, tmp_path: Path) -> None:
 
 def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tokens = tmp_path / "tokens.json"
-    tokens.write_text(f'{{"tokens": [{{"name": "ci", "role": "push", "token": "{TOKEN}"}}]}}')
+    metrics = f"{TOKEN}-metrics"
+    entries = [
+        {"name": "ci", "role": "push", "token": TOKEN},
+        {"name": "grafana", "role": "metrics", "token": metrics},
+    ]
+    tokens.write_text(json.dumps({"tokens": entries}))
     path = write_ply(tmp_path / "a.ply", 0.0, 1)
     with serving(tmp_path, "--tokens", str(tokens)) as address:
         with pytest.raises(Refused) as no_token:
@@ -238,5 +244,6 @@ def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             wildcity.rollback("street", 1, server=address)
         assert role.value.code == "forbidden"
         url = address.replace("http://", "ws://") + "/v1/session"
+        wildcity.connect(url, token=TOKEN).close()
         with pytest.raises(wildcity.ConnectFailed, match="403"):
-            wildcity.connect(url, token=TOKEN)
+            wildcity.connect(url, token=metrics)
