@@ -20,7 +20,7 @@ pub(crate) struct Counted {
 }
 
 impl TokenCounts {
-    /// Counts one more push or edit of a token.
+    /// Counts one more push, edit or search for the ground of a token.
     ///
     /// # Errors
     /// [`Fault::Busy`]: the token has as many as it may.

@@ -374,6 +374,9 @@ async fn a_token_has_limits_of_its_own() {
     refused.refused(503, "busy");
     let edited = ask(&server, "POST /v1/twins/test/edits", Some(RIVAL), edit).await;
     assert_eq!(edited.status, 200, "{edited:?}");
+    let ground = "GET /v1/twins/test/ground";
+    ask(&server, ground, Some(ADMIN), "").await.refused(503, "busy");
+    assert_eq!(ask(&server, ground, Some(RIVAL), "").await.status, 200);
 }
 
 #[tokio::test]

@@ -95,6 +95,8 @@ pub(super) async fn ground(
 ) -> HttpResult {
     grant.require(Role::Push)?;
     grant.require_twin(&name)?;
+    // It reads the whole twin, as a push does.
+    let _open = state.open_pushes.push(&grant)?;
     let version = state.engine.pinned_latest(&name);
     let survey = wildcity_push::survey(&state.engine, &state.pushes, name, version).await?;
     Ok(Json(convert::survey(&survey)).into_response())

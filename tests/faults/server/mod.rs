@@ -5,8 +5,7 @@
 //! history that still fails; `SEED=n cargo test -p wildcity-server --lib one_history` runs one of each kind, and
 //! `HISTORIES=n ... many_histories` any number.
 //!
-//! Not simulated: two requests for one upload at once, TLS, the kernel's sockets, and a client that does not read until
-//! the time-out for it.
+//! Not simulated: TLS, the kernel's sockets, and a client that does not read until the time-out for it.
 
 mod connections;
 #[allow(dead_code, reason = "the simulation of the store uses another part of it")]

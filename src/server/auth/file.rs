@@ -1,0 +1,171 @@
+//! The file of tokens: reading and checking it.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::sync::Arc;
+
+use serde::Deserialize;
+
+use wildcity_twin::ingest;
+
+use super::grant::{Grant, Role, TokenLimits};
+use super::tokens::{Secret, Token, Tokens};
+use crate::limits;
+
+/// Why a file of tokens cannot be used. The message contains no token.
+#[derive(Debug, thiserror::Error)]
+#[error("{location}: {reason}")]
+pub struct TokensError {
+    /// The location in the file, as `tokens[2].hash`.
+    pub location: String,
+    /// What is wrong, and what is expected.
+    pub reason: String,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    tokens: Vec<Entry>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Entry {
+    name: String,
+    role: Role,
+    token: Option<String>,
+    hash: Option<String>,
+    twins: Option<BTreeSet<String>>,
+    #[serde(default)]
+    limits: TokenLimits,
+}
+
+/// Bytes of the shortest token that is accepted: 16 characters of base64 have 96 bits, too many to guess.
+const MIN_TOKEN_BYTES: usize = 16;
+
+impl Tokens {
+    /// Reads a file, as [`Self::parse`] does, and notes its path: a running server reads it again at SIGHUP.
+    ///
+    /// # Errors
+    /// The file cannot be read, is larger than [`limits::TOKENS_FILE_BYTES`], or has an entry that cannot be used.
+    pub fn read(path: &Path) -> Result<Self, TokensError> {
+        let text = ingest::read_whole(path, limits::TOKENS_FILE_BYTES).map_err(|error| {
+            TokensError { location: "the file".to_owned(), reason: error.to_string() }
+        })?;
+        Ok(Self { file: Some(path.to_owned()), ..Self::parse(&text)? })
+    }
+
+    /// Parses a file of tokens: `{"tokens": [{"name", "role", "token" or "hash", "twins", "limits"}]}`, where
+    /// `hash` is `blake3:` or `sha-256:` and the hash of the token in hex.
+    ///
+    /// # Errors
+    /// Names the first entry that cannot be used.
+    pub fn parse(text: &[u8]) -> Result<Self, TokensError> {
+        let wrong =
+            |location: String, reason: &str| TokensError { location, reason: reason.to_owned() };
+        let file: File = serde_json::from_slice(text).map_err(|error| {
+            // serde's message could quote a token that is in the wrong place.
+            let location = format!("line {}, column {}", error.line(), error.column());
+            wrong(location, "not {\"tokens\": [{\"name\", \"role\", \"token\" or \"hash\", ..}]}")
+        })?;
+        if file.tokens.is_empty() {
+            return Err(wrong("tokens".to_owned(), "there is none: no client could connect"));
+        }
+        let mut tokens: Vec<Token> = Vec::with_capacity(file.tokens.len());
+        for (index, entry) in file.tokens.into_iter().enumerate() {
+            let Entry { name, role, token, hash, twins, limits } = entry;
+            // A session belongs to the name of a token, so that names are unique.
+            if name.is_empty() || tokens.iter().any(|other| other.grant.name == name) {
+                let reason = "a name is not empty, and belongs to one token only";
+                return Err(wrong(format!("tokens[{index}].name"), reason));
+            }
+            if name.len() > limits::TOKEN_NAME_BYTES {
+                let bytes = name.len();
+                let most = limits::TOKEN_NAME_BYTES;
+                let reason = format!("a name of {bytes} bytes; choose one of at most {most}");
+                return Err(wrong(format!("tokens[{index}].name"), &reason));
+            }
+            let secret = match (token, hash) {
+                (Some(token), None) if token.len() >= MIN_TOKEN_BYTES => {
+                    Secret::OfToken(blake3::hash(token.as_bytes()))
+                }
+                (Some(_), None) => {
+                    let reason = format!("a token has at least {MIN_TOKEN_BYTES} characters");
+                    return Err(wrong(format!("tokens[{index}].token"), &reason));
+                }
+                (None, Some(hash)) => Secret::parse(&hash).ok_or_else(|| {
+                    let reason = "expected blake3: or sha-256: and 64 hex digits";
+                    wrong(format!("tokens[{index}].hash"), reason)
+                })?,
+                _ => {
+                    let reason = "expected either token or hash";
+                    return Err(wrong(format!("tokens[{index}]"), reason));
+                }
+            };
+            let grant = Grant { name, role, twins, limits };
+            tokens.push(Token { grant: Arc::new(grant), secret });
+        }
+        Ok(Self { tokens, file: None })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A reader of the documentation must replace what is said there of a token.
+    #[test]
+    fn the_examples_of_the_documentation_are_no_tokens() {
+        let page = include_str!("../../../docs/operators.md");
+        let examples: Vec<&str> = page.split("```json\n{\"tokens\"").skip(1).collect();
+        assert_eq!(examples.len(), 2);
+        for example in examples {
+            let text = format!("{{\"tokens\"{}", example.split("```").next().unwrap());
+            let file: serde_json::Value = serde_json::from_str(&text).unwrap();
+            for entry in file["tokens"].as_array().unwrap() {
+                let one = serde_json::json!({ "tokens": [entry] }).to_string();
+                let error = Tokens::parse(one.as_bytes()).unwrap_err();
+                assert!(error.location.starts_with("tokens[0]."), "{error}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_file_of_tokens_is_refused_without_repeating_them() {
+        let with_name = |bytes: usize| {
+            let name = "n".repeat(bytes);
+            format!(
+                r#"{{"tokens": [{{"name": "{name}", "role": "push", "token": "secretsecretsecret"}}]}}"#
+            )
+        };
+        assert!(Tokens::parse(with_name(255).as_bytes()).is_ok());
+        let long_name = with_name(256);
+        for (text, location) in [
+            (r#"{"tokens": []}"#, "tokens"),
+            (
+                r#"{"tokens": [{"name": "a", "role": "king", "token": "secretsecretsecret"}]}"#,
+                "line",
+            ),
+            (r#"{"tokens": ["secretsecretsecret"]}"#, "line"),
+            (
+                r#"{"tokens": [{"name": "a", "role": "drive", "token": "secret"}]}"#,
+                "tokens[0].token",
+            ),
+            (r#"{"tokens": [{"name": "a", "role": "drive"}]}"#, "tokens[0]"),
+            (
+                r#"{"tokens": [{"name": "", "role": "drive", "token": "secretsecretsecret"}]}"#,
+                "tokens[0].name",
+            ),
+            (
+                r#"{"tokens": [{"name": "a", "role": "drive", "token": "secretsecretsecret"},
+                    {"name": "a", "role": "push", "token": "secretsecretsecrets"}]}"#,
+                "tokens[1].name",
+            ),
+            (r#"{"tokens": [{"name": "a", "role": "drive", "hash": "secret"}]}"#, "tokens[0].hash"),
+            (long_name.as_str(), "tokens[0].name"),
+        ] {
+            let error = Tokens::parse(text.as_bytes()).unwrap_err().to_string();
+            assert!(error.starts_with(location) && !error.contains("secret"), "{error}");
+        }
+    }
+}

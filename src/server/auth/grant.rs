@@ -1,0 +1,150 @@
+//! What a client may do: roles, twins, and what a token may have at once.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use serde::Deserialize;
+
+use crate::fault::Fault;
+
+/// What the holder of a token may do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Role {
+    /// Read the metrics, and nothing else.
+    Metrics,
+    /// Open sessions.
+    Drive,
+    /// Open sessions, upload and push.
+    Push,
+    /// Everything.
+    Admin,
+}
+
+/// What a client may do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Grant {
+    /// Name of the token; empty on a server without tokens.
+    pub(crate) name: String,
+    pub(super) role: Role,
+    /// Names of the twins that it may use; all twins if there is no list.
+    pub(super) twins: Option<BTreeSet<String>>,
+    pub(crate) limits: TokenLimits,
+}
+
+/// What a token may have at once; without a value, as much as the server allows to all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(crate) struct TokenLimits {
+    /// Sessions, connected or waiting to be resumed.
+    pub(crate) sessions: Option<usize>,
+    /// WebSocket connections, those of watchers too.
+    pub(crate) connections: Option<usize>,
+    /// Pushes and edits that wait or run.
+    pub(crate) pushes: Option<usize>,
+    /// Bytes of uploads.
+    pub(crate) upload_bytes: Option<u64>,
+}
+
+impl Grant {
+    /// The grant of every client of a server without tokens.
+    pub(crate) fn everything() -> Arc<Self> {
+        let limits = TokenLimits::default();
+        Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
+    }
+
+    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`] that of
+    /// [`Role::Drive`].
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`] if the token has another role.
+    pub(crate) fn require(&self, role: Role) -> Result<(), Fault> {
+        if self.role.includes(role) {
+            return Ok(());
+        }
+        let needs = role.name();
+        let reason = format!("its role is {}, not {needs}", self.role.name());
+        Err(Fault::Forbidden { field: "authorization", reason })
+    }
+
+    /// Requires any role but [`Role::Metrics`].
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`] if the token may read metrics alone.
+    pub(crate) fn require_more_than_metrics(&self) -> Result<(), Fault> {
+        if self.role != Role::Metrics {
+            return Ok(());
+        }
+        let reason = "its role is metrics: it may GET /metrics alone".to_owned();
+        Err(Fault::Forbidden { field: "authorization", reason })
+    }
+
+    /// Requires access to a twin.
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`] if the token may not use the twin.
+    pub(crate) fn require_twin(&self, twin: &str) -> Result<(), Fault> {
+        if self.allows_twin(twin) {
+            return Ok(());
+        }
+        Err(Fault::Forbidden {
+            field: "twin",
+            reason: format!("it does not include twin {twin:?}"),
+        })
+    }
+
+    /// Requires access to all twins: for changes of what all twins share.
+    ///
+    /// # Errors
+    /// [`Fault::Forbidden`] if the token is limited to some twins.
+    pub(crate) fn require_all_twins(&self) -> Result<(), Fault> {
+        if self.allows_all_twins() {
+            return Ok(());
+        }
+        let reason = "it is limited to some twins, and all twins share the assets of actors";
+        Err(Fault::Forbidden { field: "authorization", reason: reason.to_owned() })
+    }
+
+    /// Whether the token is not limited to some twins.
+    pub(crate) fn allows_all_twins(&self) -> bool {
+        self.twins.is_none()
+    }
+
+    /// Whether the token may use the twin. Lists of twins leave out those that it may not use.
+    pub(crate) fn allows_twin(&self, twin: &str) -> bool {
+        self.twins.as_ref().is_none_or(|twins| twins.contains(twin))
+    }
+}
+
+impl Role {
+    fn includes(self, role: Self) -> bool {
+        self == role || self == Self::Admin || (self == Self::Push && role == Self::Drive)
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Metrics => "metrics",
+            Self::Drive => "drive",
+            Self::Push => "push",
+            Self::Admin => "admin",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn admin_includes_all_roles_and_push_includes_drive() {
+        use Role::{Admin, Drive, Metrics, Push};
+        for (role, included) in [
+            (Metrics, [true, false, false, false]),
+            (Drive, [false, true, false, false]),
+            (Push, [false, true, true, false]),
+            (Admin, [true, true, true, true]),
+        ] {
+            assert_eq!([Metrics, Drive, Push, Admin].map(|other| role.includes(other)), included);
+        }
+    }
+}

@@ -1,0 +1,14 @@
+//! Bearer tokens: each has a role and the twins that it may use.
+//!
+//! A server without tokens listens on a loopback address only, and every client may do everything.
+
+mod file;
+mod grant;
+mod tokens;
+
+pub use file::TokensError;
+pub use grant::Role;
+pub use tokens::Tokens;
+
+pub(crate) use grant::Grant;
+pub(crate) use tokens::CurrentTokens;
