@@ -47,7 +47,8 @@ pub use engine::{Engine, EngineSettings, LatestPin, PUSHES};
 pub use episode::{EgoHistory, Episode, EpisodeSummary, Outcome};
 pub use error::SessionError;
 pub use observe::buffer::ObservationBuffer;
-pub use observe::encode::{Encoding, jpeg, png};
+pub use observe::encode::{Encoding, png};
+pub use observe::jpeg::jpeg;
 pub use observe::layout::HEADER_PREFIX_BYTES;
 pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,

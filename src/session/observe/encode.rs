@@ -6,6 +6,7 @@ use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
 use serde::{Deserialize, Serialize};
 
+use super::jpeg::jpeg;
 use super::trust::Trust;
 use crate::repair::status::ImageRepair;
 
@@ -86,22 +87,6 @@ pub(crate) fn hashed(rgb8: &[u8]) -> EncodedImage {
     let started = Instant::now();
     let hash = blake3::hash(rgb8);
     EncodedImage { took: started.elapsed(), ..EncodedImage::of(hash) }
-}
-
-/// A JPEG file, 4:2:0, of `[height, width, 3]` pixels.
-///
-/// # Errors
-/// A side is longer than JPEG's 65,535 px, or `rgb8` has another length.
-pub fn jpeg(rgb8: &[u8], width: u32, height: u32, quality: u8) -> Result<Vec<u8>, String> {
-    let side = |px| u16::try_from(px).map_err(|_| format!("{px} px is beyond JPEG"));
-    // Street scenes take an eighth of the pixels' bytes at quality 90.
-    let mut file = Vec::with_capacity(rgb8.len() / 8);
-    let mut encoder = jpeg_encoder::Encoder::new(&mut file, quality);
-    encoder.set_sampling_factor(jpeg_encoder::SamplingFactor::F_2_2);
-    encoder
-        .encode(rgb8, side(width)?, side(height)?, jpeg_encoder::ColorType::Rgb)
-        .map_err(|error| error.to_string())?;
-    Ok(file)
 }
 
 /// A PNG file of `[height, width, 3]` pixels.

@@ -30,6 +30,7 @@ pub(crate) mod buffer;
 pub(crate) mod builder;
 pub(crate) mod encode;
 pub(crate) mod frame_history;
+pub(crate) mod jpeg;
 pub(crate) mod layout;
 pub(crate) mod observation;
 pub(crate) mod schedule;
