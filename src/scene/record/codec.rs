@@ -1,10 +1,6 @@
-//! Encoding of the values of one field to bytes, and back.
-
-use std::f32::consts::SQRT_2;
+//! Encoding of the values of one field to bytes. `decoder` has the way back.
 
 use half::f16;
-
-use crate::chunk::LANES;
 
 /// The encoding of a field.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -43,13 +39,10 @@ const THIN_M: f32 = 1e-5;
 
 /// The grid of a part: value = (first + k) step.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Grid {
+pub(super) struct Grid {
     first: i32,
     step: f32,
 }
-
-/// Receives decoded values of 16 Gaussians: index of the lane group, column within the field, values.
-pub(super) type Put<'a> = &'a mut dyn FnMut(usize, usize, &[f32; LANES]);
 
 impl Measure {
     /// Range of transformed values that a grid may span; values outside are clamped. Scales up to 2.9 km; opacities
@@ -73,8 +66,9 @@ impl Measure {
         }
     }
 
+    /// The value of a transformed one.
     #[inline(always)]
-    fn value(self, measure: f32) -> f32 {
+    pub(super) fn value(self, measure: f32) -> f32 {
         match self {
             Self::Plain => measure,
             Self::Logarithm => (measure.exp() - THIN_M).max(0.0),
@@ -172,90 +166,6 @@ impl Code {
         }
         clamped
     }
-
-    /// Passes the values of `count` Gaussians to `put`, column by column, 16 at a time. Lanes after the last
-    /// Gaussian hold unspecified values.
-    pub(super) fn decode(
-        self,
-        measure: Measure,
-        columns: usize,
-        grid: &[u8],
-        planes: &[u8],
-        count: usize,
-        put: Put<'_>,
-    ) {
-        let mut planes = planes;
-        let mut take = |bytes: usize| {
-            let (own, rest) = planes.split_at(bytes * count);
-            planes = rest;
-            own
-        };
-        match self {
-            Self::Float => {
-                for column in 0..columns {
-                    let own = take(4);
-                    blocks::<4>(own, count, |block, codes| {
-                        put(block, column, &codes.map(f32::from_bits));
-                    });
-                }
-            }
-            Self::Half => {
-                for column in 0..columns {
-                    let own = take(2);
-                    blocks::<2>(own, count, |block, codes| {
-                        let half = |code| measure.value(f16::from_bits(code as u16).to_f32());
-                        put(block, column, &codes.map(half));
-                    });
-                }
-            }
-            Self::Rotation(bits) => {
-                let bytes = self.planes(columns);
-                let [a, b, c] = [0, 1, 2].map(|k: usize| widen(take(bytes[k]), bytes[k], count));
-                for (block, codes) in a.iter().zip(b.iter().zip(&c)).enumerate() {
-                    let (a, (b, c)) = codes;
-                    let mut quats = [[0.0; LANES]; 4];
-                    for lane in 0..LANES {
-                        let quat = from_smallest_three([a[lane], b[lane], c[lane]], bits);
-                        for (column, q) in quats.iter_mut().zip(quat) {
-                            column[lane] = q;
-                        }
-                    }
-                    for (column, values) in quats.iter().enumerate() {
-                        put(block, column, values);
-                    }
-                }
-            }
-            Self::Steps(bits) | Self::Binary(bits) => {
-                let grid = Grid::read(grid);
-                let value = |code: u32| measure.value(grid.at(code));
-                let curved = matches!(measure, Measure::Logarithm | Measure::Opacity);
-                // With more values than codes, a table avoids computing the same transcendental repeatedly.
-                let table: Vec<f32> = if curved && columns * count > 1 << bits {
-                    (0..1 << bits).map(value).collect()
-                } else {
-                    Vec::new()
-                };
-                let all = (1_u32 << bits) - 1;
-                for column in 0..columns {
-                    let bytes = bits.div_ceil(8) as usize;
-                    let own = take(bytes);
-                    let mut each = |block, codes: [u32; LANES]| {
-                        let values = if table.is_empty() {
-                            codes.map(value)
-                        } else {
-                            codes.map(|code| table[(code & all) as usize])
-                        };
-                        put(block, column, &values);
-                    };
-                    match bytes {
-                        1 => blocks::<1>(own, count, &mut each),
-                        2 => blocks::<2>(own, count, &mut each),
-                        _ => blocks::<3>(own, count, &mut each),
-                    }
-                }
-            }
-        }
-    }
 }
 
 impl Grid {
@@ -287,12 +197,14 @@ impl Grid {
         number.clamp(0.0, f64::from((1_u32 << bits) - 1)) as u32
     }
 
+    /// The value of a code.
     #[inline(always)]
-    fn at(self, code: u32) -> f32 {
+    pub(super) fn at(self, code: u32) -> f32 {
         self.first.wrapping_add(code as i32) as f32 * self.step
     }
 
-    fn read(bytes: &[u8]) -> Self {
+    /// Reads a grid as [`Code::encode`] wrote it: 8 bytes.
+    pub(super) fn read(bytes: &[u8]) -> Self {
         let word = |at: usize| [bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]];
         Self { first: i32::from_le_bytes(word(0)), step: f32::from_le_bytes(word(4)) }
     }
@@ -315,64 +227,8 @@ fn smallest_three(quat: [f32; 4], bits: u32) -> [u32; 3] {
     codes
 }
 
-#[inline(always)]
-fn from_smallest_three(codes: [u32; 3], bits: u32) -> [f32; 4] {
-    let half = ((1_u32 << (bits - 1)) - 1) as f32;
-    let step = 1.0 / (SQRT_2 * half);
-    let largest = codes[0] >> bits & 3;
-    let [a, b, c] =
-        [codes[0] & ((1 << bits) - 1), codes[1], codes[2]].map(|code| (code as f32 - half) * step);
-    let d = (1.0 - a * a - b * b - c * c).max(0.0).sqrt();
-    match largest {
-        0 => [d, a, b, c],
-        1 => [a, d, b, c],
-        2 => [a, b, d, c],
-        _ => [a, b, c, d],
-    }
-}
-
 fn write_planes(planes: &mut Vec<u8>, codes: &[u32], bytes: usize) {
     for byte in 0..bytes {
         planes.extend(codes.iter().map(|code| (code >> (8 * byte)) as u8));
     }
-}
-
-/// Recombines the `BYTES` byte planes of one column, 16 values at a time, padded with zeros.
-#[inline(always)]
-fn blocks<const BYTES: usize>(
-    planes: &[u8],
-    count: usize,
-    mut each: impl FnMut(usize, [u32; LANES]),
-) {
-    let plane = |byte: usize| &planes[byte * count..(byte + 1) * count];
-    for block in 0..count.div_ceil(LANES) {
-        let run = block * LANES..count.min((block + 1) * LANES);
-        let mut codes = [0; LANES];
-        for byte in 0..BYTES {
-            let own = &plane(byte)[run.clone()];
-            match <&[u8; LANES]>::try_from(own) {
-                Ok(own) => {
-                    for (code, &own) in codes.iter_mut().zip(own) {
-                        *code |= u32::from(own) << (8 * byte);
-                    }
-                }
-                Err(_) => {
-                    for (code, &own) in codes.iter_mut().zip(own) {
-                        *code |= u32::from(own) << (8 * byte);
-                    }
-                }
-            }
-        }
-        each(block, codes);
-    }
-}
-
-fn widen(planes: &[u8], bytes: usize, count: usize) -> Vec<[u32; LANES]> {
-    let mut codes = vec![[0; LANES]; count.div_ceil(LANES)];
-    let mut each = |block: usize, own| codes[block] = own;
-    match bytes {
-        1 => blocks::<1>(planes, count, &mut each),
-        _ => blocks::<2>(planes, count, &mut each),
-    }
-    codes
 }

@@ -30,7 +30,7 @@ use bincode::{Decode, Encode};
 use glam::DVec3;
 
 use crate::limits;
-use wildcity_scene::chunk::{Chunk, LANES, Lanes, columns};
+use wildcity_scene::chunk::Chunk;
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_scene::record::{Clamped, PART_GAUSSIANS, RecordFormat};
@@ -208,7 +208,6 @@ pub(super) fn unpack(
     record: RecordFormat,
 ) -> Result<Chunk, String> {
     let count = section.count as usize;
-    let width = columns(sh_degree);
     let mut lanes = Vec::new();
     let mut rest = bytes;
     for start in (0..count).step_by(PART_GAUSSIANS) {
@@ -219,11 +218,8 @@ pub(super) fn unpack(
         rest = &after[length..];
         let raw = zstd::bulk::decompress(part, record.part_bytes(sh_degree, here));
         let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
-        let first = lanes.len();
-        // Exactly this much, because growth in larger steps would take memory that the budget does not count.
-        lanes.reserve_exact(here.div_ceil(LANES) * width);
-        lanes.resize(first + here.div_ceil(LANES) * width, Lanes([0.0; LANES]));
-        record.decode(&raw, sh_degree, here, &mut lanes[first..])?;
+        // It grows by exactly this much, because larger steps would take memory that the budget does not count.
+        record.decode(&raw, sh_degree, here, &mut lanes)?;
     }
     if !rest.is_empty() {
         return Err(format!("{} bytes are left over", rest.len()));
