@@ -1,0 +1,119 @@
+//! Cameras of rigs, as `get_available_cameras` lists them.
+
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::json::{Intrinsics, WindshieldFields};
+use wildcity_scene::geometry::camera::{
+    FThetaReference, Lens, ShutterDirection, WindshieldReference,
+};
+use wildcity_scene::rig::RigCamera;
+
+use super::logical_id;
+use super::polynomial::fitted;
+use crate::scene::pose_to_wire;
+use crate::wire::sensorsim as wire;
+
+/// A camera of a rig, as `get_available_cameras` lists it.
+pub fn available(camera: &RigCamera) -> wire::AvailableCamera {
+    let RigCamera { name, camera: intrinsics, rig_from_camera, shutter, .. } = camera;
+    let shutter_type = match shutter.map(|shutter| shutter.direction) {
+        None => wire::ShutterType::Global,
+        Some(ShutterDirection::TopToBottom) => wire::ShutterType::RollingTopToBottom,
+        Some(ShutterDirection::BottomToTop) => wire::ShutterType::RollingBottomToTop,
+        Some(ShutterDirection::LeftToRight) => wire::ShutterType::RollingLeftToRight,
+        Some(ShutterDirection::RightToLeft) => wire::ShutterType::RollingRightToLeft,
+    };
+    let spec = wire::CameraSpec {
+        temporary_camera_spec: String::new(),
+        camera_param: Some(param(intrinsics)),
+        logical_id: logical_id(name),
+        resolution_h: intrinsics.height_px,
+        resolution_w: intrinsics.width_px,
+        shutter_type: shutter_type.into(),
+        external_distortion: Intrinsics::of(intrinsics).windshield.map(windshield_to_wire),
+    };
+    wire::AvailableCamera {
+        intrinsics: Some(spec),
+        // Called `rig_to_camera` there, and rig_from_camera by its value: the runtime multiplies it to the
+        // ego's pose from the right.
+        rig_to_camera: Some(pose_to_wire(rig_from_camera)),
+        logical_id: logical_id(name),
+    }
+}
+
+fn param(camera: &Camera) -> wire::CameraParam {
+    let pinhole = camera.pinhole;
+    match &camera.lens {
+        Lens::Pinhole => wire::CameraParam::OpencvPinhole(wire::OpenCvPinholeCameraParam {
+            principal_point_x: pinhole.cx,
+            principal_point_y: pinhole.cy,
+            focal_length_x: pinhole.fx,
+            focal_length_y: pinhole.fy,
+            radial_coeffs: vec![0.0; 6],
+            tangential_coeffs: vec![0.0; 2],
+            thin_prism_coeffs: vec![0.0; 4],
+        }),
+        Lens::OpenCv(lens) => wire::CameraParam::OpencvPinhole(wire::OpenCvPinholeCameraParam {
+            principal_point_x: pinhole.cx,
+            principal_point_y: pinhole.cy,
+            focal_length_x: pinhole.fx,
+            focal_length_y: pinhole.fy,
+            radial_coeffs: lens.k().to_vec(),
+            tangential_coeffs: lens.p().to_vec(),
+            thin_prism_coeffs: lens.s().to_vec(),
+        }),
+        Lens::Fisheye(lens) => wire::CameraParam::OpencvFisheye(wire::OpenCvFisheyeCameraParam {
+            principal_point_x: pinhole.cx,
+            principal_point_y: pinhole.cy,
+            focal_length_x: pinhole.fx,
+            focal_length_y: pinhole.fy,
+            radial_coeffs: lens.k().to_vec(),
+            max_angle: lens.max_angle_rad().unwrap_or_else(|| lens.limit_rad()),
+        }),
+        Lens::FTheta(lens) => {
+            let end_rad = lens.limit_rad();
+            let end_px = lens.radius_px(end_rad);
+            let [linear_c, linear_d, linear_e] = lens.linear_cde();
+            // AlpaSim's rectifier and scorers read only the polynomial from angles, whichever is exact.
+            let (reference, forward, backward) = match lens.reference() {
+                FThetaReference::AngleToPixel => (
+                    wire::PolynomialType::AngleToPixeldist,
+                    lens.polynomial(),
+                    fitted(end_px, &|px| lens.angle_rad(px)),
+                ),
+                FThetaReference::PixelToAngle => (
+                    wire::PolynomialType::PixeldistToAngle,
+                    fitted(end_rad, &|rad| lens.radius_px(rad)),
+                    lens.polynomial(),
+                ),
+            };
+            wire::CameraParam::Ftheta(wire::FthetaCameraParam {
+                principal_point_x: pinhole.cx - 0.5,
+                principal_point_y: pinhole.cy - 0.5,
+                reference_poly: reference.into(),
+                pixeldist_to_angle_poly: backward.to_vec(),
+                angle_to_pixeldist_poly: forward.to_vec(),
+                max_angle: lens.max_angle_rad(),
+                linear_cde: Some(wire::LinearCde { linear_c, linear_d, linear_e }),
+            })
+        }
+    }
+}
+
+fn windshield_to_wire(fields: WindshieldFields) -> wire::ExternalDistortion {
+    let WindshieldFields { reference, horizontal, vertical } = fields;
+    let model = match reference {
+        WindshieldReference::Forward => wire::BivariateWindshieldModelParameters {
+            reference_poly: wire::ReferencePolynomial::Forward.into(),
+            horizontal_poly: horizontal,
+            vertical_poly: vertical,
+            ..Default::default()
+        },
+        WindshieldReference::Backward => wire::BivariateWindshieldModelParameters {
+            reference_poly: wire::ReferencePolynomial::Backward.into(),
+            horizontal_poly_inverse: horizontal,
+            vertical_poly_inverse: vertical,
+            ..Default::default()
+        },
+    };
+    wire::ExternalDistortion::BivariateWindshield(model)
+}
