@@ -169,3 +169,35 @@ impl ObjectAssets {
         self.0.lock().retain(|_, (_, drawn)| drawn.elapsed() < limits::SCENE_IDLE);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use wildcity_twin::residency::Cache;
+    use wildcity_twin::store::Catalog;
+
+    /// Where there is no room, assets that no request draws give way, and only those.
+    #[test]
+    fn assets_that_no_request_draws_make_room() {
+        let shape = ObjectShape::of_track("7@4x2x1").unwrap();
+        let asset = shape.box_asset().unwrap().unwrap();
+        let dir = tempfile::tempdir().unwrap();
+        let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), Some(2 * asset.bytes()));
+        let assets = ObjectAssets::default();
+        let load = |key: &str| assets.load(key, || Ok(cache.hold_actor(key, asset.clone())?));
+        let drawn = load("drawn").unwrap();
+        drop(load("idle").unwrap());
+        let third = load("third").unwrap();
+        let known = |key: &str| assets.known(key).is_some();
+        assert!(known("drawn") && !known("idle") && known("third"));
+        assert_eq!(cache.stats().reserved_bytes, 2 * asset.bytes());
+
+        // All that is in memory is drawn: the request is refused, and nothing is lost.
+        let refused = load("fourth").unwrap_err();
+        assert!(refused.to_string().contains("memory"), "{refused}");
+        assert!(known("drawn") && known("third") && !known("fourth"));
+        drop((drawn, third));
+        load("fourth").unwrap();
+        assert!(known("fourth") && !known("drawn") && !known("third"));
+    }
+}
