@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ VAE: dict[str, Any] = {
     "in_channels": 3,
     "out_channels": 3,
     "latent_channels": 4,
-    "layers_per_block": 2,
+    "layers_per_block": 1,
     "norm_num_groups": 4,
     "scaling_factor": 0.18215,
     "gamma": 1.0,
@@ -39,7 +40,7 @@ UNET: dict[str, Any] = {
     "flip_sin_to_cos": True,
     "freq_shift": 0,
     "in_channels": 4,
-    "layers_per_block": 2,
+    "layers_per_block": 1,
     "norm_eps": 1e-05,
     "norm_num_groups": 4,
     "out_channels": 4,
@@ -60,23 +61,24 @@ ADAPTED = ("conv1", "conv2", "conv_in", "conv_shortcut", "conv", "conv_out", "to
 """Ends of the decoder's layers that have an adapter: with the skip convolutions, those of src/model.py of nv-tlabs/Difix3D."""
 
 
-def write_folder(path: Path, seed: int = 1) -> Path:
-    """Configurations, tensors, tokenizer and text encoder."""
+def write_folder(path: Path, seed: int = 1, changes: Mapping[str, dict[str, Any]] | None = None) -> Path:
+    """Configurations, tensors, tokenizer and text encoder. changes: keys of the configurations of `vae` and `unet`."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    for part, config in (("vae", VAE), ("unet", UNET), ("scheduler", SCHEDULER)):
+    vae, unet = (config | (changes or {}).get(part, {}) for part, config in (("vae", VAE), ("unet", UNET)))
+    for part, config in (("vae", vae), ("unet", unet), ("scheduler", SCHEDULER)):
         (path / part).mkdir(parents=True)
         name = "scheduler_config.json" if part == "scheduler" else "config.json"
         (path / part / name).write_text(json.dumps(config))
-    model = Difix(VaeConfig.read(VAE), UnetConfig.read(UNET), Step.read(SCHEDULER), True)
+    model = Difix(VaeConfig.read(vae), UnetConfig.read(unet), Step.read(SCHEDULER), True)
     save_file(adapted(dict(model.vae.state_dict()), generator), path / "vae" / "diffusion_pytorch_model.safetensors")
-    unet = {name: perturbed(name, values, generator) for name, values in model.unet.state_dict().items()}
-    save_file(unet, path / "unet" / "diffusion_pytorch_model.safetensors")
+    tensors = {name: perturbed(values, generator) for name, values in model.unet.state_dict().items()}
+    save_file(tensors, path / "unet" / "diffusion_pytorch_model.safetensors")
     write_text_encoder(path)
     return path
 
 
-def perturbed(name: str, values: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def perturbed(values: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Normalizations begin as 1 and 0 everywhere, which hides a weight that is not used."""
     if values.dim() == 1:
         values = values + 0.2 * torch.randn(values.shape, generator=generator)
@@ -88,7 +90,7 @@ def adapted(tensors: dict[str, torch.Tensor], generator: torch.Generator) -> dic
     stored = {}
     for name, values in tensors.items():
         layer, kind = name.rsplit(".", 1)
-        values = perturbed(name, values, generator)
+        values = perturbed(values, generator)
         has_adapter = "decoder" in name and (layer.endswith(ADAPTED) or "skip_conv" in layer)
         if not has_adapter:
             stored[name] = values

@@ -168,11 +168,9 @@ def _bytes(tensor: Any) -> int:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without the warnings of the tracer: that it is the older of two, and that shapes become constants (they do not)."""
+    """Without the warnings of the tracer: that it is the older of two, and that checks of shapes are not in the graph."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        warnings.simplefilter("ignore", UserWarning)
-        warnings.simplefilter("ignore", RuntimeWarning)
+        warnings.simplefilter("ignore")
         yield
 
 
