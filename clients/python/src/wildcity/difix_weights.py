@@ -70,7 +70,8 @@ def load(path: Path, with_reference: bool, dtype: torch.dtype) -> Difix:
         message = f"{embedding.shape[2]} values a token; cross_attention_dim of unet/config.json is {unet.context}"
         raise ExportError("text_encoder", message)
     model.prompt = embedding.to(dtype)
-    return model.eval().requires_grad_(False)
+    model.eval().requires_grad_(False)
+    return model
 
 
 def prompt_embedding(path: Path) -> Tensor:

@@ -163,7 +163,8 @@ def _write_graph(model: Difix, folder: Path, name: str, external_above: int) -> 
 
 def _bytes(tensor: Any) -> int:
     """Bytes of a tensor of the graph, without a copy."""
-    return tensor.ByteSize()  # type: ignore[no-any-return]
+    count: int = tensor.ByteSize()
+    return count
 
 
 @contextlib.contextmanager
