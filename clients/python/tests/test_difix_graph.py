@@ -144,6 +144,7 @@ def oracle(weights: Path) -> Callable[..., torch.Tensor]:
             latent = scheduler.step(noise, scheduler.timesteps[0], latent).prev_sample
             decoder = vae.decoder
             y = decoder.mid_block(decoder.conv_in(vae.post_quant_conv(latent / vae.config.scaling_factor)))
+            held = [skip * config["gamma"] for skip in held]
             y = decoder.up_blocks[0](y + decoder.skip_conv_1(held[3]))
             y = decoder.up_blocks[1](y + decoder.skip_conv_2(held[2]))
             y = decoder.up_blocks[2](y + decoder.skip_conv_3(held[1]))
@@ -184,8 +185,8 @@ def test_the_modules_equal_diffusers(has_reference: bool, weights: Path) -> None
     assert (theirs.abs() < 0.99).float().mean() > 0.5 and theirs.std() > 0.1
 
 
-def test_two_layers_and_an_upcast_attention_equal_diffusers(tmp_path: Path) -> None:
-    changes = {"vae": {"layers_per_block": 2}, "unet": {"layers_per_block": 2, "upcast_attention": True}}
+def test_two_layers_half_of_the_skips_and_an_upcast_attention_equal_diffusers(tmp_path: Path) -> None:
+    changes = {"vae": {"layers_per_block": 2, "gamma": 0.5}, "unet": {"layers_per_block": 2, "upcast_attention": True}}
     folder = difix_doubles.write_folder(tmp_path / "weights", changes=changes)
     image, reference = images(1, 64, 64)
     model = difix_weights.load(folder, True, torch.float32)
@@ -275,6 +276,20 @@ def test_weights_beside_the_graph_give_the_same_bits(weights: Path, exported: Pa
     feed = {"image": image.numpy(), "reference": reference.numpy()}
     assert (session(beside).run(None, feed)[0] == session(exported).run(None, feed)[0]).all()
     done = check(at_8192_pixels(beside), "--size", "64x64")
+    assert done.returncode == 0, done.stderr
+
+
+def test_fused_attention_computes_the_same(weights: Path, exported: Path, tmp_path: Path) -> None:
+    import onnx
+
+    fused = export_difix.export(weights, tmp_path / "difix_ref.onnx", dtype="f32", providers=["cpu"], attention="fused")
+    nodes = [node.op_type for node in onnx.load(tmp_path / "difix_ref.onnx").graph.node]
+    # Three levels with one attention down and two up, and one in the middle.
+    assert nodes.count("MultiHeadAttention") == 10
+    image, reference = images(2, 64, 128)
+    feed = {"image": image.numpy(), "reference": reference.numpy()}
+    assert np.abs(session(fused).run(None, feed)[0] - session(exported).run(None, feed)[0]).max() < TOLERANCE
+    done = check(at_8192_pixels(fused), "--size", "64x64")
     assert done.returncode == 0, done.stderr
 
 

@@ -16,6 +16,7 @@ The two networks are SD-Turbo's: Rombach et al. 2022, version 2.1.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -62,6 +63,12 @@ class Difix(nn.Module):
         decoded: Tensor = self.vae.decode(clean, skips)
         return decoded.clamp(-1.0, 1.0)
 
+    def fuse_attention(self) -> None:
+        """Self-attention of the denoiser becomes one operator of onnxruntime in the graph."""
+        for module in self.modules():
+            if isinstance(module, TransformerBlock):
+                module.attn1.fused = True
+
     def _check(self, image: Tensor, reference: Tensor | None) -> None:
         """What a graph cannot say: sizes, and whether there is a reference."""
         if (reference is not None) != self.with_reference:
@@ -82,7 +89,8 @@ class Vae(nn.Module):
 
     def __init__(self, config: VaeConfig) -> None:
         super().__init__()
-        self.scale, self.gamma = config.scale, config.gamma
+        self.scale = config.scale
+        self.gamma = config.gamma
         self.encoder = Encoder(config)
         self.decoder = Decoder(config)
         self.quant_conv = nn.Conv2d(8, 8, 1)
@@ -201,7 +209,9 @@ class Unet(nn.Module):
 
     def __init__(self, config: UnetConfig, views: int) -> None:
         super().__init__()
-        widths, layers, groups = config.widths, config.layers, config.groups
+        widths = config.widths
+        layers = config.layers
+        groups = config.groups
         time_width = 4 * widths[0]
 
         def resnet(before: int, width: int) -> Resnet:
@@ -214,7 +224,9 @@ class Unet(nn.Module):
         self.register_buffer("time", sinusoids(TIMESTEP, widths[0]), persistent=False)
         self.time_embedding = TimeEmbedding(widths[0], time_width)
         self.down_blocks = nn.ModuleList()
-        before, skips = widths[0], [widths[0]]
+        before = widths[0]
+        # Channels of what each block leaves for its counterpart on the way up.
+        skips = [widths[0]]
         for level, width in enumerate(widths):
             block = Level()
             block.resnets = nn.ModuleList(resnet(before if layer == 0 else width, width) for layer in range(layers))
@@ -258,8 +270,9 @@ class Unet(nn.Module):
             for down in block.downsamplers:
                 x = down(x)
                 skips.append(x)
-        first, last = self.mid_block.resnets
-        x = last(self.mid_block.attentions[0](first(x, time), prompt), time)
+        x = self.mid_block.resnets[0](x, time)
+        x = self.mid_block.attentions[0](x, prompt)
+        x = self.mid_block.resnets[1](x, time)
         for block in self.up_blocks:
             for layer, resnet in enumerate(block.resnets):
                 x = resnet(torch.cat([x, skips.pop()], 1), time)
@@ -356,7 +369,10 @@ class Attention(nn.Module):
 
     def __init__(self, width: int, heads: int, context: int, has_bias: bool = False, upcast: bool = False) -> None:
         super().__init__()
-        self.heads, self.upcast = heads, upcast
+        self.heads = heads
+        self.upcast = upcast
+        # Of self-attention, which has as many scores as pairs of places; set by `Difix.fuse_attention`.
+        self.fused = False
         self.to_q = nn.Linear(width, width, bias=has_bias)
         self.to_k = nn.Linear(context, width, bias=has_bias)
         self.to_v = nn.Linear(context, width, bias=has_bias)
@@ -364,19 +380,47 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor, context: Tensor) -> Tensor:
         """x: [n, tokens, width]; context: [n or 1, its tokens, context]. Returns the shape of x."""
-        q, k, v = (self._split(values) for values in (self.to_q(x), self.to_k(context), self.to_v(context)))
+        q = self.to_q(x)
+        k = self.to_k(context)
+        v = self.to_v(context)
+        if self.fused and torch.jit.is_tracing():
+            attended = Fused.apply(q, k, v, self.heads)
+        else:
+            attended = self._plain(q, k, v)
+        result: Tensor = self.to_out[0](attended)
+        return result
+
+    def _plain(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """All scores at once."""
+        q = self._split(q)
+        k = self._split(k)
+        v = self._split(v)
         kind = v.dtype
         if self.upcast:
-            q, k = q.float(), k.float()
+            q = q.float()
+            k = k.float()
         # Half of the scale on either side, so that no product leaves the range of f16.
-        root = (x.shape[2] // self.heads) ** -0.25
+        root = q.shape[3] ** -0.25
         weights = ((q * root) @ (k * root).transpose(2, 3)).softmax(-1).to(kind)
-        attended: Tensor = self.to_out[0]((weights @ v).transpose(1, 2).flatten(2))
-        return attended
+        return (weights @ v).transpose(1, 2).flatten(2)
 
     def _split(self, x: Tensor) -> Tensor:
         """[n, tokens, width] to [n, heads, tokens, width / heads]."""
         return x.reshape(x.shape[0], -1, self.heads, x.shape[2] // self.heads).transpose(1, 2)
+
+
+class Fused(torch.autograd.Function):
+    """The operator MultiHeadAttention of onnxruntime, which does not keep the scores. It is not part of ONNX's opset 17."""
+
+    @staticmethod
+    def symbolic(graph: Any, q: Any, k: Any, v: Any, heads: int) -> Any:
+        """The operator divides by the root of a head's width itself."""
+        return graph.op("com.microsoft::MultiHeadAttention", q, k, v, num_heads_i=heads).setType(q.type())
+
+    @staticmethod
+    def forward(_: Any, q: Tensor, k: Tensor, v: Tensor, heads: int) -> Tensor:
+        """Only its shape and type are used, while tracing."""
+        return torch.zeros_like(q)
 
 
 class Transformer(nn.Module):
@@ -402,7 +446,8 @@ class TransformerBlock(nn.Module):
 
     def __init__(self, config: UnetConfig, level: int, views: int) -> None:
         super().__init__()
-        width, heads = config.widths[level], config.heads[level]
+        width = config.widths[level]
+        heads = config.heads[level]
         self.views = views
         self.norm1 = nn.LayerNorm(width)
         self.attn1 = Attention(width, heads, width, upcast=config.upcast)

@@ -51,9 +51,12 @@ def export(
     dtype: str = "f16",
     name: str | None = None,
     providers: Sequence[str] = ("cuda",),
+    attention: str = "plain",
     external_above: int = EXTERNAL_ABOVE_BYTES,
 ) -> Path:
     """Writes the graph and, last, its manifest: `out` with the suffix .json, whose path is returned.
+
+    attention: "plain" has operators of ONNX only; "fused" has onnxruntime's MultiHeadAttention.
 
     Raises `ExportError` if something in the folder is not what Difix has, or a file cannot be written. Then the files
     at `out` are as they were.
@@ -69,6 +72,8 @@ def export(
         raise ExportError("PyTorch", f"{error}; pip install 'wildcity[difix]'") from error
     kind = {"f16": torch.float16, "f32": torch.float32}[dtype]
     model = difix_weights.load(difix_weights.folder(weights), reference, kind)
+    if attention == "fused":
+        model.fuse_attention()
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as part:
             written = _write_graph(model, Path(part), out.name, external_above)
@@ -148,6 +153,7 @@ def _write_graph(model: Difix, folder: Path, name: str, external_above: int) -> 
             input_names=inputs,
             output_names=["repaired"],
             dynamic_axes={port: axes for port in [*inputs, "repaired"]},
+            custom_opsets={"com.microsoft": 1},
         )
         graph = onnx.load(os.path.join(traced, "graph.onnx"))
     graph.doc_string = LICENCE
@@ -183,6 +189,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", required=True, help="the .onnx file; the manifest is written beside it")
     parser.add_argument("--no-reference", action="store_true", help="for nvidia/difix, which sees the image alone")
     parser.add_argument("--dtype", choices=["f16", "f32"], default="f16", help="[default: f16]")
+    parser.add_argument(
+        "--attention", choices=["plain", "fused"], default="plain", help="fused: an operator of onnxruntime [default: plain]"
+    )
     parser.add_argument("--name", help="what sessions ask for [default: difix-ref, or difix]")
     parser.add_argument("--providers", default="cuda", help="of the manifest, with commas [default: cuda]")
     chosen = parser.parse_args(arguments)
@@ -194,6 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
             dtype=chosen.dtype,
             name=chosen.name,
             providers=chosen.providers.split(","),
+            attention=chosen.attention,
         )
     except ExportError as error:
         print(f"error: {error}", file=sys.stderr)
