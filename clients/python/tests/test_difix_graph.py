@@ -312,6 +312,22 @@ def test_f16(weights: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_the_command_compares_the_graph_with_the_modules(
+    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "difix.onnx"
+    command = ["--weights", str(weights), "--out", str(out), "--no-reference", "--dtype", "f32", "--compare"]
+    monkeypatch.setitem(export_difix.LARGEST_DIFFERENCE, "f32", 1e-9)
+    assert export_difix.main(command) == 1
+    assert "error: --compare: " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    monkeypatch.undo()
+    assert export_difix.main(command) == 0
+    printed = capsys.readouterr()
+    assert printed.out == f"{tmp_path / 'difix.json'}\n"
+    assert float(printed.err.split("PyTorch: ")[1].split()[0]) < TOLERANCE
+
+
 # --- What is refused
 
 

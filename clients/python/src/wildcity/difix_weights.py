@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from .difix_config import PROMPT, TIMESTEP, ExportError, Step, UnetConfig, VaeConfig, read_json
-from .difix_graph import Difix, sinusoids
+from .difix_graph import Difix
+from .difix_unet import sinusoids
 
 __all__ = ["folder", "load", "merge_adapters", "prompt_embedding"]
 

@@ -34,6 +34,9 @@ OPSET = 17
 EXTERNAL_ABOVE_BYTES = 2_000_000_000
 """A file of the ONNX format ends at 2 GiB. Larger weights are in a second file."""
 
+LARGEST_DIFFERENCE = {"f32": 1e-3, "f16": 0.1}
+"""Between graph and modules, of values from -1 to 1. Both round, in another order."""
+
 MULTIPLE = 64
 """Sides of images, in pixels: `difix_config.image_multiple` of SD-Turbo."""
 
@@ -52,11 +55,13 @@ def export(
     name: str | None = None,
     providers: Sequence[str] = ("cuda",),
     attention: str = "plain",
+    compare: bool = False,
     external_above: int = EXTERNAL_ABOVE_BYTES,
 ) -> Path:
     """Writes the graph and, last, its manifest: `out` with the suffix .json, whose path is returned.
 
     attention: "plain" has operators of ONNX only; "fused" has onnxruntime's MultiHeadAttention.
+    compare: runs the graph in onnxruntime on the processor and refuses it if it differs from PyTorch.
 
     Raises `ExportError` if something in the folder is not what Difix has, or a file cannot be written. Then the files
     at `out` are as they were.
@@ -77,6 +82,13 @@ def export(
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as part:
             written = _write_graph(model, Path(part), out.name, external_above)
+            if compare:
+                difference = _difference(model, written[0])
+                print(f"largest difference from PyTorch: {difference:.2e} of values from -1 to 1", file=sys.stderr)
+                # A NaN is refused, too.
+                if not difference <= LARGEST_DIFFERENCE[dtype]:
+                    message = f"{difference:.2e} from PyTorch; at most {LARGEST_DIFFERENCE[dtype]}. Try another version"
+                    raise ExportError("--compare", f"{message} of PyTorch ({torch.__version__} is here)")
             content = manifest(
                 [(path.name, blake3(path)) for path in written],
                 reference=reference,
@@ -173,6 +185,23 @@ def _bytes(tensor: Any) -> int:
     return count
 
 
+def _difference(model: Difix, graph: Path) -> float:
+    """The largest difference between the modules and the graph, of two images of another size than the traced one."""
+    import numpy as np
+    import onnxruntime
+    import torch
+
+    random = np.random.default_rng(1)
+    shape = (2, 3, model.multiple, 2 * model.multiple)
+    session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
+    kind = np.float16 if model.prompt.dtype == torch.float16 else np.float32
+    feed = {port.name: random.uniform(-1, 1, shape).astype(kind) for port in session.get_inputs()}
+    (found,) = session.run(None, feed)
+    with torch.no_grad():
+        expected = model(*(torch.from_numpy(values) for values in feed.values())).numpy()
+    return float(np.abs(found.astype(np.float32) - expected.astype(np.float32)).max())
+
+
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Without the warnings of the tracer: that it is the older of two, and that checks of shapes are not in the graph."""
@@ -192,6 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--attention", choices=["plain", "fused"], default="plain", help="fused: an operator of onnxruntime [default: plain]"
     )
+    parser.add_argument("--compare", action="store_true", help="run the graph on the processor, beside PyTorch")
     parser.add_argument("--name", help="what sessions ask for [default: difix-ref, or difix]")
     parser.add_argument("--providers", default="cuda", help="of the manifest, with commas [default: cuda]")
     chosen = parser.parse_args(arguments)
@@ -204,6 +234,7 @@ def main(arguments: list[str] | None = None) -> int:
             name=chosen.name,
             providers=chosen.providers.split(","),
             attention=chosen.attention,
+            compare=chosen.compare,
         )
     except ExportError as error:
         print(f"error: {error}", file=sys.stderr)
