@@ -35,6 +35,7 @@ class Difix(nn.Module):
         self.unet = Unet(unet, 2 if with_reference else 1)
         self.step = step
         self.with_reference = with_reference
+        self.has_fused_attention = False
         self.multiple = image_multiple(vae, unet)
         # A constant of the graph, not a tensor of the folder.
         self.register_buffer("prompt", torch.zeros(1, 77, unet.context), persistent=False)
@@ -61,6 +62,7 @@ class Difix(nn.Module):
 
     def fuse_attention(self) -> None:
         """Self-attention of the denoiser becomes one operator of onnxruntime in the graph."""
+        self.has_fused_attention = True
         for module in self.modules():
             if isinstance(module, TransformerBlock):
                 module.attn1.fused = True

@@ -81,15 +81,21 @@ def prompt_embedding(path: Path) -> Tensor:
     As diffusers does for Stable Diffusion: padded to the longest prompt (77 tokens), the last hidden state.
     """
     from transformers import CLIPTextModel, CLIPTokenizer
+    from transformers.utils import logging
 
     for part in ("tokenizer", "text_encoder"):
         if not (path / part).is_dir():
             raise ExportError(part, f"no such folder in {path}")
+    had_bar = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
     try:
         tokenizer = CLIPTokenizer.from_pretrained(path / "tokenizer", local_files_only=True)
         encoder = CLIPTextModel.from_pretrained(path / "text_encoder", local_files_only=True, dtype=torch.float32)
     except Exception as error:  # Of many kinds, by version of transformers.
         raise ExportError("text_encoder", f"transformers cannot read it: {error}") from error
+    finally:
+        if had_bar:
+            logging.enable_progress_bar()
     length = encoder.config.max_position_embeddings
     tokens = tokenizer(PROMPT, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
     with torch.no_grad():
