@@ -148,6 +148,9 @@ def test_the_configurations_of_sd_turbo() -> None:
     assert unet.attends == (True, True, True, False) and not unet.upcast
     assert image_multiple(vae, unet) == export_difix.MULTIPLE == 64
     assert UnetConfig.read(UNET | {"attention_head_dim": 8}).heads == (8, 8, 8, 8)
+    # Keys that diffusers adds, and null where it means false.
+    added = {"dual_cross_attention": None, "num_class_embeds": None, "mid_block_scale_factor": 1.0, "sample_size": 64}
+    assert UnetConfig.read(UNET | added) == unet
 
 
 @pytest.mark.parametrize(

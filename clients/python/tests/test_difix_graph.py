@@ -236,16 +236,24 @@ def test_the_graph_without_reference(weights: Path, alone: Path) -> None:
 def test_the_reference_counts_and_other_images_of_the_batch_do_not(exported: Path) -> None:
     image, reference = (values.numpy() for values in images(2, 64, 64))
     graph = session(exported)
+
+    def turned(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """Other colours in the last corner of the first image."""
+        changed = values.copy()
+        changed[0, :, 48:, 48:] *= -1
+        return changed
+
     before = graph.run(None, {"image": image, "reference": reference})[0]
-    changed = reference.copy()
-    # Far from the first pixel: attention carries it there.
-    changed[0, :, 48:, 48:] *= -1
-    after = graph.run(None, {"image": image, "reference": changed})[0]
-    assert np.abs(after[0, :, :16, :16] - before[0, :, :16, :16]).max() > TOLERANCE
-    assert (after[1] == before[1]).all()
-    # The image is repaired, not its reference.
-    swapped = graph.run(None, {"image": reference, "reference": image})[0]
-    assert np.abs(swapped - before).mean() > 10 * np.abs(after - before).mean()
+    with_reference = graph.run(None, {"image": image, "reference": turned(reference)})[0]
+    with_image = graph.run(None, {"image": turned(image), "reference": reference})[0]
+    # Far from what changed: attention carries it there.
+    assert np.abs(with_reference[0, :, :16, :16] - before[0, :, :16, :16]).max() > TOLERANCE
+    assert (with_reference[1] == before[1]).all() and (with_image[1] == before[1]).all()
+    # Where it changed: the image is repaired, not its reference.
+    corner = np.s_[0, :, 48:, 48:]
+    by_image = np.abs(with_image[corner] - before[corner]).mean()
+    by_reference = np.abs(with_reference[corner] - before[corner]).mean()
+    assert by_image > 10 * by_reference
 
 
 def test_the_program_checks_the_exported_graph(exported: Path) -> None:
@@ -406,6 +414,35 @@ def test_an_incomplete_folder_is_refused(weights: Path, tmp_path: Path, capsys: 
         assert export_difix.main(["--weights", str(wrong), "--out", str(tmp_path / "difix.onnx")]) == 1
         assert "error: --weights: " in capsys.readouterr().err
     assert not list(tmp_path.glob("*difix*"))
+
+
+def test_a_repository_is_downloaded_only_if_no_folder_has_its_name(
+    weights: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import huggingface_hub
+
+    asked: list[str] = []
+
+    def download(repository: str, allow_patterns: list[str]) -> str:
+        asked.append(repository)
+        if repository != "nvidia/difix_ref":
+            raise OSError("no such repository")
+        assert "unet/*.safetensors" in allow_patterns
+        return str(weights)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", download)
+    monkeypatch.chdir(tmp_path)
+    assert difix_weights.folder("nvidia/difix_ref") == weights
+    assert "downloading nvidia/difix_ref from huggingface.co" in capsys.readouterr().err
+    with pytest.raises(ExportError, match="no such repository"):
+        difix_weights.folder("nvidia/difux")
+    for path in ("difix_ref", "./nvidia/difix_ref", "/nvidia/difix_ref", "a/b/c"):
+        with pytest.raises(ExportError, match="no such folder"):
+            difix_weights.folder(path)
+    assert asked == ["nvidia/difix_ref", "nvidia/difux"]
+    (tmp_path / "nvidia" / "difix_ref").mkdir(parents=True)
+    assert difix_weights.folder("nvidia/difix_ref") == Path("nvidia/difix_ref")
+    assert len(asked) == 2
 
 
 def test_adapters_are_added_as_peft_adds_them() -> None:
