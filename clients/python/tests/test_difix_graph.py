@@ -436,7 +436,7 @@ def test_a_repository_is_downloaded_only_if_no_folder_has_its_name(
     assert "downloading nvidia/difix_ref from huggingface.co" in capsys.readouterr().err
     with pytest.raises(ExportError, match="no such repository"):
         difix_weights.folder("nvidia/difux")
-    for path in ("difix_ref", "./nvidia/difix_ref", "/nvidia/difix_ref", "a/b/c"):
+    for path in ("difix_ref", "./nvidia/difix_ref", "/nvidia/difix_ref", "../difix_ref", "a/b/c"):
         with pytest.raises(ExportError, match="no such folder"):
             difix_weights.folder(path)
     assert asked == ["nvidia/difix_ref", "nvidia/difux"]
