@@ -30,6 +30,7 @@ import peft  # noqa: E402
 import torch  # noqa: E402
 from safetensors.torch import load_file, save_file  # noqa: E402
 from wildcity import difix_weights  # noqa: E402
+from wildcity.difix_blocks import Attention  # noqa: E402
 from wildcity.difix_graph import Difix  # noqa: E402
 
 Session = onnxruntime.InferenceSession
@@ -336,10 +337,20 @@ def test_the_command_compares_the_graph_with_the_modules(
     assert float(printed.err.split("PyTorch: ")[1].split()[0]) < TOLERANCE
 
 
+def test_upcast_scores_do_not_leave_the_range_of_f16() -> None:
+    tokens = torch.ones(1, 3, 8).half()
+    for upcast in (True, False):
+        attention = Attention(8, 1, 8, upcast=upcast).half()
+        for layer in (attention.to_q, attention.to_k):
+            torch.nn.init.constant_(layer.weight, 40.0)
+        # 8 products of 320 and 320, divided by the root of 8: 290,000.
+        assert attention(tokens, tokens).isfinite().all() == upcast
+
+
 # --- What is refused
 
 
-@pytest.mark.parametrize(("height", "width"), [(72, 136), (64, 32), (0, 64)])
+@pytest.mark.parametrize(("height", "width"), [(72, 136), (96, 64), (64, 96), (0, 64)])
 def test_sides_must_be_multiples_of_64(height: int, width: int, weights: Path, exported: Path) -> None:
     model = difix_weights.load(weights, True, torch.float32)
     image = torch.zeros(1, 3, height, width)

@@ -5,8 +5,8 @@
 
 `--weights` is a folder in the layout of diffusers, as nvidia/difix_ref and nvidia/difix have it: tokenizer, text_encoder, unet,
 vae, scheduler. A name of a repository that is no folder here is downloaded from huggingface.co. The weights may be used
-non-commercially only; wildcity has none. Needs `pip install 'wildcity[difix]'` (PyTorch), no GPU, and 8 GB of memory
-(f32: 16 GB).
+non-commercially only; wildcity has none. Needs `pip install 'wildcity[difix]'` (PyTorch), no GPU, and for f16
+10 GB of memory.
 """
 
 from __future__ import annotations
