@@ -21,7 +21,8 @@ pub enum AugmentError {
     NoDrive,
     /// More samples than one round may have.
     #[error(
-        "the round would have {samples} samples; at most {limit} are made: raise --every, or give fewer --offsets or --cameras"
+        "the round would have {samples} samples; at most {limit} are made: raise --every, or give fewer --offsets or \
+         --cameras"
     )]
     Samples {
         /// Their number.
@@ -31,7 +32,8 @@ pub enum AugmentError {
     },
     /// A camera's lens has no name in transforms.json and COLMAP.
     #[error(
-        "camera {camera:?} has {lens}, which transforms.json and COLMAP cannot describe: leave --lenses away, and pinholes of the lenses' fields are drawn"
+        "camera {camera:?} has {lens}, which transforms.json and COLMAP cannot describe: leave --lenses away, and pinholes \
+         of the lenses' fields are drawn"
     )]
     Lens {
         /// The camera.
@@ -41,7 +43,8 @@ pub enum AugmentError {
     },
     /// Cameras of different models.
     #[error(
-        "camera {camera:?} is {model}, and others are {other}, but a transforms.json has one camera_model: choose cameras by --cameras, or leave --lenses away"
+        "camera {camera:?} is {model}, and others are {other}, but a transforms.json has one camera_model: choose cameras \
+         by --cameras, or leave --lenses away"
     )]
     MixedLenses {
         /// The camera.
@@ -52,7 +55,10 @@ pub enum AugmentError {
         other: &'static str,
     },
     /// A folder that was made with something else.
-    #[error("{} was made with another {field}: {there} there, {here} now. Give another --out or --round, or delete the folder", dir.display())]
+    #[error(
+        "{} was made with another {field}: {there} there, {here} here. Give another --out or --round, or delete the folder",
+        dir.display()
+    )]
     MadeOtherwise {
         /// The folder.
         dir: PathBuf,
@@ -64,7 +70,10 @@ pub enum AugmentError {
         here: String,
     },
     /// A folder with files, but without augment.json.
-    #[error("{} has files, but no augment.json: give an empty folder as --out, or one that `wildcity augment` made", dir.display())]
+    #[error(
+        "{} has files, but no augment.json: give an empty folder as --out, or one that `wildcity augment` made",
+        dir.display()
+    )]
     NotOurs {
         /// The folder.
         dir: PathBuf,

@@ -1,9 +1,9 @@
 //! The folder of a round: samples renamed into place, and a run that continues after them.
 //!
 //! Each file is written under a temporary name and renamed. A sample whose files are all there gets a line in
-//! `samples.partial.jsonl`. augment.json is written at the beginning, without the samples that are still to be drawn, and
-//! at the end, with all of them. So a run that was killed at any time leaves a folder that says what it was made with,
-//! and the next one trusts those samples whose files have the hashes that are on record.
+//! `samples.partial.jsonl`. augment.json is written at the beginning, without the samples that are still to be
+//! drawn, and at the end, with all of them. So a run that was killed at any time leaves a folder that says what it was
+//! made with, and the next one trusts those samples whose files have the hashes that are on record.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
@@ -29,7 +29,7 @@ pub struct Folder {
     header: Header,
     samples: BTreeMap<String, Sample>,
     journal: File,
-    /// Whether samples of an earlier run were refused since a file of theirs is missing or differs.
+    /// Samples of earlier runs of which a file is missing or differs.
     damaged: usize,
     /// Unlocked when it is dropped, or when the process ends.
     _lock: File,
@@ -47,7 +47,6 @@ struct Record<'a> {
 
 #[derive(Deserialize)]
 struct ReadRecord {
-    format: String,
     #[serde(flatten)]
     header: Header,
     samples: Vec<Sample>,
@@ -198,10 +197,7 @@ fn read_record(path: &Path) -> Result<ReadRecord, AugmentError> {
     if json["format"] != FORMAT {
         return Err(damaged(format!("its format is {}, and not {FORMAT:?}", json["format"])));
     }
-    let record: ReadRecord =
-        serde_json::from_value(json).map_err(|error| damaged(error.to_string()))?;
-    debug_assert_eq!(record.format, FORMAT);
-    Ok(record)
+    serde_json::from_value(json).map_err(|error| damaged(error.to_string()))
 }
 
 /// The samples of a run that did not end. Its last line may be cut.

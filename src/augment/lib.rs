@@ -11,8 +11,9 @@
 //! points        Gaussians as COLMAP's points
 //! ```
 //!
-//! Nothing here renders: `wildcity augment` draws the views through a server, as any agent would. The idea of rounds, in
-//! which the views move away from the drive and the newest ones are trained on, is that of Difix3D+ (Wu et al. 2025).
+//! Nothing here renders: `wildcity augment` draws the views through a server, as any agent would. The idea of
+//! rounds, in which the views move away from the drive and the newest ones are trained on, is that of Difix3D+ (Wu et
+//! al. 2025).
 
 mod cameras;
 mod colmap;

@@ -22,7 +22,8 @@ pub(crate) const CONVENTIONS: [(&str, &str); 7] = [
     ),
     (
         "depth",
-        "PNG, 16 bits, millimetres up to 65 m, 0 for none: camera z, of fisheye lenses the distance; as rendered, not repaired",
+        "PNG, 16 bits, millimetres up to 65 m, 0 for none: camera z, of fisheye lenses the distance; as rendered, not \
+         repaired",
     ),
     (
         "world_from_camera",
@@ -96,8 +97,8 @@ pub struct Header {
     pub version: u64,
     /// Offsets of this round, in metres, positive to the left of the drive.
     pub offsets_m: Vec<f64>,
-    /// From the axes of the twin's capture to those of the twin, as eight numbers of `wildcity twin align`; `None` if the
-    /// version does not say it.
+    /// From the axes of the twin's capture to those of the twin, as eight numbers of `wildcity twin align`; `None` if
+    /// the version does not say it.
     pub world_from_capture: Option<String>,
 }
 

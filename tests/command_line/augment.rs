@@ -21,7 +21,8 @@ use crate::root::root;
 use crate::versions::files;
 use crate::wildcity;
 
-/// A short street, and the same one spoiled, with a pinhole to the front and a fisheye with a rolling shutter to the left.
+/// A short street, and the same one spoiled, with a pinhole to the front and a fisheye with a rolling shutter to the
+/// left.
 fn twins(dir: &Path) {
     let preset = Rig::preset("vehicle6").unwrap();
     let mounted = |name: &str, camera| {

@@ -31,14 +31,14 @@ use super::{output, placement, progress};
 
 /// Draw views beside a twin's recorded drives, repair them, and write them as training data.
 ///
-/// A twin is right on its drives and less so beside them. This command draws the twin beside its drives, lets a model
-/// repair the images, and writes them with masks, depth and poses, so that a trainer can learn from them as from recorded
-/// images, but with less weight. The twin that is trained so is right farther away from its drives.
+/// A twin is right on its drives and less so beside them. This command draws the twin beside its drives, lets
+/// a model repair the images, and writes them with masks, depth and poses, so that a trainer can learn from
+/// them as from recorded images, but with less weight. The twin that is trained so is right farther away.
 ///
 /// A model repairs what is nearly right. So the views move away from the drives in rounds: round N draws at
-/// min(0.5 m x N, OFFSET) for each OFFSET of --offsets, to the left and to the right of the drive, every --every metres,
-/// with the heading of the drive and all cameras. Train on a round, push the twin, and draw the next round from it. Each
-/// round has a folder of its own, DIR/round_N:
+/// min(0.5 m x N, OFFSET) for each OFFSET of --offsets, to the left and to the right of the drive, every
+/// --every metres, with the heading of the drive and all cameras. Train on a round, push the twin, and draw
+/// the next round from it. Each round has a folder of its own, DIR/round_N:
 ///
 ///   images/           what to train on: repaired, or as rendered without --repair
 ///   rendered/         the same before the repair
@@ -48,8 +48,8 @@ use super::{output, placement, progress};
 ///   sparse/0          the same as a COLMAP model, with Gaussians as points
 ///   augment.json      what all of it was made with, and the hash of each file
 ///
-/// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. A run that was interrupted is
-/// continued by the same command. docs/augmentation.md explains how to train with it.
+/// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. A run that was
+/// interrupted is continued by the same command. docs/augmentation.md explains how to train with it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES, verbatim_doc_comment)]
 pub(super) struct Augment {
@@ -78,13 +78,13 @@ pub(super) struct Augment {
     side: Option<u32>,
 
     /// Keep the lenses of the rig. Without it each lens is replaced by a pinhole of its field, up to 100° across.
-    /// transforms.json and COLMAP can describe pinholes, OpenCV lenses with k1, k2, p1 and p2, and OpenCV fisheyes; other
-    /// lenses and windshields are refused.
+    /// transforms.json and COLMAP can describe pinholes, OpenCV lenses with k1, k2, p1 and p2, and OpenCV fisheyes;
+    /// other lenses and windshields are refused.
     #[arg(long)]
     lenses: bool,
 
     /// Most points of the COLMAP model: opaque Gaussians within 100 m of a view, chosen at random.
-    #[arg(long, value_name = "N", default_value_t = limits::POINTS, value_parser = clap::value_parser!(u32).range(0..=i64::from(limits::MOST_POINTS)))]
+    #[arg(long, value_name = "N", default_value_t = limits::POINTS, value_parser = clap::value_parser!(u32).range(0..=MOST_POINTS))]
     points: u32,
 
     /// Seed of the choice of the points.
@@ -114,6 +114,9 @@ Examples:
   wildcity augment street --repair model.json --offsets 1,3,5 --every 2m --round 1 --out augmented
   wildcity augment street --offsets 3 --round 6 --side 720 --cameras front,front_left,front_right --out plain
   wildcity eval street --axes identity --images augmented/round_1/transforms.json";
+
+/// [`limits::MOST_POINTS`], as clap takes it.
+const MOST_POINTS: i64 = limits::MOST_POINTS as i64;
 
 /// [`ColmapForm`] on the command line.
 #[derive(Clone, Copy, Debug, Default, clap::ValueEnum)]
@@ -151,19 +154,14 @@ impl Augment {
         let dir = self.out.join(format!("round_{}", job.plan.round()));
         output::create_dir(&self.out)?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-        // Beside the folder: records of sessions, which are of no use afterwards.
-        let scratch = self.out.join(format!(".server_round_{}", job.plan.round()));
-        let drawn = runtime.block_on(async {
-            let running = wildcity_server::start(self.server(&scratch, &models)?).await?;
+        // For the records of the two sessions, which are of no use afterwards.
+        let scratch = tempfile::tempdir().context("cannot create a temporary directory")?;
+        runtime.block_on(async {
+            let running = wildcity_server::start(self.server(scratch.path(), &models)?).await?;
             let drawn = self.draw(&running.url(), &catalog, &job, &models, &dir).await;
             running.stop().await;
             drawn
-        });
-        if scratch.is_dir() {
-            std::fs::remove_dir_all(&scratch)
-                .with_context(|| format!("cannot remove {}", scratch.display()))?;
-        }
-        drawn
+        })
     }
 
     fn job(&self, catalog: &Catalog) -> anyhow::Result<Job> {

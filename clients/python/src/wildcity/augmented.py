@@ -1,8 +1,8 @@
 """Views that `wildcity augment` wrote, as a data set of a trainer.
 
-`AugmentedViews` is a map data set as PyTorch knows them: it has a length, and an item is a dict of numpy arrays, of which
-`torch.utils.data.DataLoader` makes tensors. It does not need PyTorch. docs/augmentation.md of the project shows a
-training loop.
+`AugmentedViews` is a map data set as PyTorch knows them: it has a length, and an item is a dict of numpy arrays, of
+which `torch.utils.data.DataLoader` makes tensors. It does not need PyTorch. docs/augmentation.md of the project shows
+a training loop.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ class AugmentedViews:
 
     An item has `image` uint8 [h, w, 3], `mask` bool [h, w] (which pixels count), `depth` float32 [h, w] (metres, 0 for
     none: z, of a fisheye the distance), `K` float64 [3, 3] (pixels, centres at 0.5), `world_from_camera` and
-    `camera_from_world` float64 [4, 4] (the twin's axes; camera x right, y down, z forward), `weight` and `trust` float32;
-    with lenses also `distortion`. Images of cameras of different sizes do not fit into one batch: choose `cameras`, or
+    `camera_from_world` float64 [4, 4] (the twin's axes; camera x right, y down, z forward), `weight` and `trust`
+    float32; with lenses also `distortion`. Images of cameras of different sizes do not fit into one batch: choose `cameras`, or
     take a batch size of 1.
     """
 
