@@ -32,8 +32,8 @@ pub enum AugmentError {
     },
     /// A camera's lens has no name in transforms.json and COLMAP.
     #[error(
-        "camera {camera:?} has {lens}, which transforms.json and COLMAP cannot describe: leave --lenses away, and pinholes \
-         of the lenses' fields are drawn"
+        "camera {camera:?} has {lens}, which transforms.json and COLMAP cannot describe: leave --lenses away, and \
+         pinholes of the lenses' fields are drawn"
     )]
     Lens {
         /// The camera.
@@ -43,8 +43,8 @@ pub enum AugmentError {
     },
     /// Cameras of different models.
     #[error(
-        "camera {camera:?} is {model}, and others are {other}, but a transforms.json has one camera_model: choose cameras \
-         by --cameras, or leave --lenses away"
+        "camera {camera:?} is {model}, and others are {other}, but a transforms.json has one camera_model: choose \
+         cameras by --cameras, or leave --lenses away"
     )]
     MixedLenses {
         /// The camera.
@@ -56,7 +56,8 @@ pub enum AugmentError {
     },
     /// A folder that was made with something else.
     #[error(
-        "{} was made with another {field}: {there} there, {here} here. Give another --out or --round, or delete the folder",
+        "{} was made with another {field}: {there} there, {here} here. Give another --out or --round, or delete the \
+         folder",
         dir.display()
     )]
     MadeOtherwise {

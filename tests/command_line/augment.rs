@@ -8,11 +8,12 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 use wildcity_generate::{Spoil, StreetSettings};
-use wildcity_scene::Rig;
+use wildcity_scene::appearance::Exposure;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole, Shutter, ShutterDirection};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::{Gaussians, Rig};
 use wildcity_twin::store::{Catalog, NewVersion};
 
 use crate::in_folder::{done, refused};
@@ -21,8 +22,8 @@ use crate::root::root;
 use crate::versions::files;
 use crate::wildcity;
 
-/// A short street, and the same one spoiled, with a pinhole to the front and a fisheye with a rolling shutter to the
-/// left.
+/// A short street, and the same one spoiled, with a pinhole to the front and a dark fisheye with a rolling shutter to
+/// the left.
 fn twins(dir: &Path) {
     let preset = Rig::preset("vehicle6").unwrap();
     let mounted = |name: &str, camera| {
@@ -35,6 +36,7 @@ fn twins(dir: &Path) {
     let lens = Lens::Fisheye(Fisheye::new([-0.01, 0.0, 0.0, 0.0], None));
     let mut left = mounted("left", Camera { lens, ..Camera::from_pinhole(160, 120, pinhole) });
     left.shutter = Some(Shutter { direction: ShutterDirection::TopToBottom, duration_us: 30_000 });
+    left.appearance.exposure = Some(Exposure::new(None, Some([0.5; 3]), [0.0; 3]).unwrap());
     let rig = Rig { name: "two".to_owned(), cameras: vec![front, left] };
 
     let settings = StreetSettings {
@@ -45,7 +47,7 @@ fn twins(dir: &Path) {
     };
     let street = wildcity_generate::street(&settings).unwrap();
     let catalog = Catalog::open(&dir.join("twins")).unwrap();
-    let commit = |name, gaussians: &_| {
+    let commit = |name: &str, gaussians: &Gaussians| {
         let new = NewVersion {
             rig: Some(rig.clone()),
             trajectories: vec![street.trajectory.clone()],
@@ -175,9 +177,8 @@ fn what_is_missing_or_damaged_is_drawn_again_and_other_sets_are_refused() {
     assert!(said.contains("another options.side_px: none there, 90 here"), "{said}");
     let catalog = Catalog::open(&at.join("twins")).unwrap();
     let worn = catalog.version("worn", None).unwrap();
-    let mut gaussians = wildcity_scene::Gaussians::default();
-    let all = &|_: &_| true;
-    catalog.visit_full_detail(&worn, all, &mut |section| gaussians = section).unwrap();
+    let mut gaussians = Gaussians::default();
+    catalog.visit_full_detail(&worn, &|_| true, &mut |section| gaussians = section).unwrap();
     let new = NewVersion {
         rig: worn.manifest.rig.clone(),
         trajectories: worn.manifest.trajectories.clone(),
