@@ -207,7 +207,7 @@ impl Augment {
         let mut studio = Studio::open(url, &job.version, &job.cameras, model).await?;
         let header = self.header(catalog, job, &studio);
         let bar = progress::count("checking");
-        let mut folder = Folder::open(dir, header, &mut progress::show(&bar))?;
+        let folder = Folder::open(dir, header, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         let kept = folder.count();
         if folder.damaged() > 0 {
