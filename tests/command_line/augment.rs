@@ -63,7 +63,7 @@ fn twins(dir: &Path) {
 const COMMON: [&str; 6] = ["--twins", "twins", "--backend", "cpu", "--threads", "2"];
 
 fn arguments<'a>(twin: &'a str, out: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let fixed = ["augment", twin, "--offsets", "0.4,3", "--every", "30m", "--out", out];
+    let fixed = ["augment", twin, "--offsets", "0.4,3", "--every", "25m", "--out", out];
     [&fixed[..], &COMMON, more].concat()
 }
 
@@ -168,7 +168,7 @@ fn what_is_missing_or_damaged_is_drawn_again_and_other_sets_are_refused() {
     fs::write(&damaged, bytes).unwrap();
     fs::remove_file(round.join("transforms.json")).unwrap();
     let said = augment(at, "street", "out", &[]);
-    assert!(said.contains("14 from an earlier run"), "{said}");
+    assert!(said.contains("30 from an earlier run"), "{said}");
     assert!(contents(&round) == whole, "the same bytes");
 
     let said = refused(at, &arguments("worn", "out", &[]));
@@ -189,7 +189,7 @@ fn what_is_missing_or_damaged_is_drawn_again_and_other_sets_are_refused() {
     assert!(said.contains("another version_hash") && said.contains("--round"), "{said}");
     assert!(contents(&round) == whole, "a refusal changes nothing");
     let said = augment(at, "street@1", "out", &[]);
-    assert!(said.contains("16 from an earlier run"), "{said}");
+    assert!(said.contains("32 from an earlier run"), "{said}");
 }
 
 #[test]

@@ -38,20 +38,12 @@ use super::{output, placement, progress};
 /// A model repairs what is nearly right. So the views move away from the drives in rounds: round N draws at
 /// min(0.5 m x N, OFFSET) for each OFFSET of --offsets, to the left and to the right of the drive, every
 /// --every metres, with the heading of the drive and all cameras. Train on a round, push the twin, and draw
-/// the next round from it. Each round has a folder of its own, DIR/round_N:
-///
-///   images/           what to train on: repaired, or as rendered without --repair
-///   rendered/         the same before the repair
-///   masks/            255 where the opacity is at least 1/2 and within the lens' field
-///   depth/            16-bit PNG in millimetres up to 65 m, 0 for none
-///   transforms.json   cameras, poses and weights for nerfstudio and for `wildcity eval`
-///   sparse/0          the same as a COLMAP model, with Gaussians as points
-///   augment.json      what all of it was made with, and the hash of each file
+/// the next round from it. Each round has a folder of its own, DIR/round_N.
 ///
 /// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. A run that was
 /// interrupted is continued by the same command. docs/augmentation.md explains how to train with it.
 #[derive(Debug, clap::Args)]
-#[command(after_long_help = EXAMPLES, verbatim_doc_comment)]
+#[command(after_long_help = EXAMPLES)]
 pub(super) struct Augment {
     /// The twin: NAME, or NAME@NUMBER for an older version.
     #[arg(value_name = "TWIN")]
@@ -110,6 +102,15 @@ pub(super) struct Augment {
 }
 
 const EXAMPLES: &str = "\
+In DIR/round_N:
+  images/          what to train on: repaired, or as rendered without --repair
+  rendered/        the same before the repair
+  masks/           255 where the opacity is at least 1/2 and within the lens' field
+  depth/           16-bit PNG in millimetres up to 65 m, 0 for none
+  transforms.json  cameras, poses and weights, for nerfstudio and `wildcity eval`
+  sparse/0         the same as a COLMAP model, with Gaussians as points
+  augment.json     what all of it was made with, and the hash of each file
+
 Examples:
   wildcity augment street --repair model.json --offsets 1,3,5 --every 2m --round 1 --out augmented
   wildcity augment street --offsets 3 --round 6 --side 720 --cameras front,front_left,front_right --out plain
