@@ -32,7 +32,7 @@ pub use error::AugmentError;
 pub use folder::Folder;
 pub use maps::{counted, depth_mm, mask_png, millimetres_png, rgb_png};
 pub use plan::{Place, Plan};
-pub use points::{Point, PointSample};
+pub use points::{Point, PointSample, Surroundings};
 pub use record::{
     Header, MadeWith, Options, RepairedWith, Sample, SampleFiles, SampleRepair, weight,
 };

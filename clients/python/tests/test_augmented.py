@@ -112,13 +112,13 @@ def test_depth_of_one_view_lands_on_the_pixels_of_the_other(
         # The rig moved 1 m to the right.
         assert abs(np.linalg.norm(poses[left][:3, 3] - poses[right][:3, 3]) - 1) < 1e-9
         share, difference = reprojected(one, (intrinsics, poses), left, right)
-        assert share > 0.8 and difference < 12, (left, share, difference)
-        # A pose that is wrong by 10 cm, or an axis by 1 degree, is seen.
+        assert share > 0.75 and difference <= 2, (left, share, difference)
+        # A pose that is wrong by 10 cm is seen.
         moved = dict(poses)
         moved[right] = poses[right].copy()
         moved[right][:3, 3] += [0.07, -0.07, 0.05]
-        worse, _ = reprojected(one, (intrinsics, moved), left, right)
-        assert worse < share - 0.02, (left, share, worse)
+        worse, greater = reprojected(one, (intrinsics, moved), left, right)
+        assert worse < share - 0.02 and greater > difference, (left, share, worse, greater)
 
 
 def test_both_sources_and_the_record_have_the_same_poses(folder: Path) -> None:

@@ -15,8 +15,8 @@ use tokio::task::spawn_blocking;
 
 use wildcity_augment::{
     AugmentError, CameraModel, ColmapForm, ColmapModel, Folder, Header, MadeWith, Options, Place,
-    Plan, Point, PointSample, Sample, SampleFiles, TrainingCamera, counted, depth_mm, limits,
-    mask_png, millimetres_png, rgb_png, transforms, weight,
+    Plan, Point, PointSample, Sample, SampleFiles, Surroundings, TrainingCamera, counted, depth_mm,
+    limits, mask_png, millimetres_png, rgb_png, transforms, weight,
 };
 use wildcity_repair::Models;
 use wildcity_scene::geometry::Bounds;
@@ -303,16 +303,13 @@ impl Augment {
     }
 
     fn sampled_points(&self, catalog: &Catalog, job: &Job) -> anyhow::Result<Vec<Point>> {
-        let mut sample = PointSample::new(self.seed, self.points as usize);
-        // Places are close together, so every tenth is near enough to those between.
-        let at_m: Vec<_> =
-            job.places.iter().step_by(10).map(|place| place.world_from_rig.position_m).collect();
-        let is_near = |bounds: &Bounds| {
-            at_m.iter().any(|at_m| bounds.distance_m(*at_m) <= limits::POINT_REACH_M)
-        };
+        let near = Surroundings::of(&job.places);
+        let mut sample = PointSample::new(self.seed, self.points as usize, near.clone());
         if self.points > 0 {
-            catalog
-                .visit_full_detail(&job.version, &is_near, &mut |section| sample.add(&section))?;
+            let is_near = |bounds: &Bounds| near.meet(bounds);
+            catalog.visit_full_detail(&job.version, &is_near, &mut |section| {
+                sample.add(&section);
+            })?;
         }
         Ok(sample.into_points())
     }
