@@ -8,6 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
 use std::io::{BufRead, BufReader, Read, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -31,8 +32,7 @@ pub struct Folder {
     journal: File,
     /// Samples of earlier runs of which a file is missing or differs.
     damaged: usize,
-    /// Unlocked when it is dropped, or when the process ends.
-    _lock: File,
+    _lock: Lock,
 }
 
 #[derive(Serialize)]
@@ -69,7 +69,7 @@ impl Folder {
         if !had_record && !is_empty(dir)? {
             return Err(AugmentError::NotOurs { dir: dir.to_owned() });
         }
-        let lock = locked(dir)?;
+        let lock = Lock::take(dir)?;
         let mut found = BTreeMap::new();
         if had_record {
             let read = read_record(&record)?;
@@ -153,11 +153,8 @@ impl Folder {
     /// It cannot be written.
     pub fn finish(self, samples: &[Sample]) -> Result<(), AugmentError> {
         write_record(&self.dir, &self.header, true, &samples.iter().collect::<Vec<_>>())?;
-        for name in [JOURNAL, LOCK] {
-            let path = self.dir.join(name);
-            fs::remove_file(&path).map_err(AugmentError::file(&path))?;
-        }
-        Ok(())
+        let path = self.dir.join(JOURNAL);
+        fs::remove_file(&path).map_err(AugmentError::file(&path))
     }
 }
 
@@ -166,13 +163,38 @@ fn hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-fn locked(dir: &Path) -> Result<File, AugmentError> {
-    let path = dir.join(LOCK);
-    let lock = File::create(&path).map_err(AugmentError::file(&path))?;
-    match lock.try_lock() {
-        Ok(()) => Ok(lock),
-        Err(TryLockError::WouldBlock) => Err(AugmentError::InUse { dir: dir.to_owned() }),
-        Err(TryLockError::Error(cause)) => Err(AugmentError::File { path, cause }),
+/// The right to write to a folder: a locked file, which is removed at the end. The system unlocks it when the process
+/// ends in another way.
+#[derive(Debug)]
+struct Lock {
+    path: PathBuf,
+    _file: File,
+}
+
+impl Lock {
+    fn take(dir: &Path) -> Result<Self, AugmentError> {
+        let path = dir.join(LOCK);
+        let in_use = || AugmentError::InUse { dir: dir.to_owned() };
+        let file = File::create(&path).map_err(AugmentError::file(&path))?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => return Err(in_use()),
+            Err(TryLockError::Error(cause)) => return Err(AugmentError::File { path, cause }),
+        }
+        // Another run may have removed the file between the two, and then a third one has a new file.
+        let inode = |metadata: fs::Metadata| metadata.ino();
+        let own = file.metadata().map(inode).map_err(AugmentError::file(&path))?;
+        match fs::metadata(&path).map(inode) {
+            Ok(there) if there == own => Ok(Self { path, _file: file }),
+            _ => Err(in_use()),
+        }
+    }
+}
+
+impl Drop for Lock {
+    fn drop(&mut self) {
+        // If it stays, the next run locks it.
+        let _ = fs::remove_file(&self.path);
     }
 }
 
@@ -374,6 +396,7 @@ mod tests {
         let said = refused(&|header| header.made_with.options.every_m = 3.0);
         assert!(said.contains("another options.every_m: 2.0 there, 3.0 here"), "{said}");
         assert_eq!(fs::read(dir.path().join(RECORD)).unwrap(), before);
+        assert!(!dir.path().join(LOCK).exists() && !dir.path().join(JOURNAL).exists());
         // The number of a version is not its content.
         let mut same = header();
         same.version = 9;
