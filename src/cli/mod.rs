@@ -14,6 +14,7 @@ use std::process::ExitCode;
 
 mod actor;
 mod alpasim;
+mod augment;
 mod backend_options;
 mod bench;
 mod bisect;
@@ -86,6 +87,7 @@ enum Command {
     Render(render::Render),
     Eval(Box<eval::Eval>),
     Repair(repair::Repair),
+    Augment(Box<augment::Augment>),
     Drive(drive::Drive),
     Alpasim(alpasim::Alpasim),
     Replay(replay::Replay),
@@ -120,6 +122,7 @@ pub fn main() -> ExitCode {
         Command::Render(command) => command.run(),
         Command::Eval(command) => command.run(),
         Command::Repair(command) => command.run(),
+        Command::Augment(command) => command.run(),
         Command::Drive(command) => command.run(),
         Command::Alpasim(command) => command.run(),
         Command::Replay(command) => command.run(),

@@ -38,6 +38,7 @@ mod support;
 mod versions;
 
 mod actor;
+mod augment;
 mod bench_actors;
 mod bench_drive;
 mod bench_gpu;

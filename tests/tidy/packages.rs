@@ -34,11 +34,12 @@ const CRATES: &[(&str, &[&str])] = &[
 ];
 
 /// Files that may open files: those of a twin only `store/local`; the others scenes and settings of the
-/// user, episodes, uploads, scenarios, pictures, and how much memory there is.
+/// user, training data, episodes, uploads, scenarios, pictures, and how much memory there is.
 const FILES: &[&str] = &[
     "src/twin/store/local",
     "src/twin/residency/budget.rs",
     "src/twin/ingest",
+    "src/augment/folder.rs",
     "src/session/record",
     "src/session/scenario/load.rs",
     "src/episode",

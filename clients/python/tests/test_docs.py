@@ -22,6 +22,7 @@ PAGES = [
     "docs/agents.md",
     "docs/alpamayo.md",
     "docs/alpasim.md",
+    "docs/augmentation.md",
     "docs/evaluation.md",
     "docs/gym.md",
     "docs/operators.md",

@@ -17,6 +17,7 @@ from .assets import (
     actors,
     push_actor,
 )
+from .augmented import AugmentedError, AugmentedSample, AugmentedViews
 from .errors import (
     BadFrame,
     Code,
@@ -92,6 +93,9 @@ __all__ = [
     "ActorLevel",
     "ActorList",
     "ActorProvenance",
+    "AugmentedError",
+    "AugmentedSample",
+    "AugmentedViews",
     "AxisNoise",
     "BadFrame",
     "Camera",
