@@ -52,7 +52,7 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
                 (not_compared(report))
                 (by_offset)
                 (confidence)
-                @if let Some(repair) = &report.repair { (super::repair::page::section(repair)) }
+                @if let Some(repair) = &report.repair { (super::repair::section(repair)) }
                 (worst_windows(&report.settings))
                 @if !report.stress.rows.is_empty() { (stress(report)) }
                 (feature_table(report))

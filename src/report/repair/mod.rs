@@ -14,13 +14,14 @@
 mod below;
 mod flicker;
 mod measure;
-pub(super) mod page;
+mod page;
 mod row;
 mod stations;
 
 pub use below::{Below, BelowError, Gains, RecommendedBelow, recommend_below};
 pub use flicker::flicker;
 pub use measure::{RepairBenchmark, RepairSubject, Truth, measure};
+pub use page::section;
 pub use row::{ImageKind, RepairMs, RepairRow, RepairedModel, Sample};
 pub use stations::{FRAME_M, RepairSampling};
 

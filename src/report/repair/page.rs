@@ -8,7 +8,7 @@ use super::row::{ImageKind, RepairRow};
 use super::stations::FRAME_M;
 
 /// The section.
-pub(crate) fn section(report: &RepairReport) -> Markup {
+pub fn section(report: &RepairReport) -> Markup {
     html! {
         h2 { "Repair: error against run time" }
         (introduction(report))
