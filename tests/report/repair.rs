@@ -26,6 +26,8 @@ use crate::onnx_doubles as doubles;
 use crate::onnx_models::Folder;
 use crate::reported::{drive, rig};
 
+const STORAGE: StorageOptions = StorageOptions { record: RecordFormat::F32, levels: false };
+
 /// A street, a spoiled copy of it, and the same with images of the street as recorded ones.
 struct Twins {
     _dir: tempfile::TempDir,
@@ -46,7 +48,7 @@ impl Twins {
                 profile: RenderProfile { tau_px: 0.0, ..RenderProfile::DEFAULT },
                 rig: Some(rig()),
                 trajectories: vec![drive()],
-                storage: StorageOptions { record: RecordFormat::F32, levels: false },
+                storage: STORAGE,
                 ..NewVersion::of(name, gaussians, Provenance::of("test".to_owned()))
             };
             catalog.commit(new, &mut |_, _| {}).unwrap();
@@ -86,7 +88,7 @@ impl Twins {
 /// Gives the worn twin what the cameras of the street saw on its drive, every 2 m.
 fn record(catalog: &Catalog, truth: &Arc<Resident>) {
     let base = catalog.version("worn", None).unwrap();
-    let mut commit = catalog.begin("worn", CommitKind::Import, StorageOptions::default()).unwrap();
+    let mut commit = catalog.begin("worn", CommitKind::Import, STORAGE).unwrap();
     let mut views = Vec::new();
     for step in 0..20 {
         let station_m = 2.0 * f64::from(step);

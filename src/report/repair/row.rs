@@ -53,7 +53,7 @@ pub struct Sample {
     pub render_ms: f64,
     /// Time to repair it.
     pub repair_ms: RepairMs,
-    /// In dB, against the true image; [`EXACT_DB`] at most.
+    /// In dB, against the true image; 110 at most.
     pub psnr_db: Option<f64>,
     /// More PSNR than the rendered image has.
     pub gain_db: Option<f64>,
@@ -67,7 +67,7 @@ pub struct Sample {
 
 /// The PSNR of equal images, so that differences of PSNR stay numbers: 8 bits of 360 x 232 pixels that differ by one
 /// step in one value have 102 dB.
-pub const EXACT_DB: f64 = 110.0;
+pub(super) const EXACT_DB: f64 = 110.0;
 
 /// A model of the section.
 #[derive(Clone, Debug, Serialize)]
