@@ -62,6 +62,7 @@ mod remote;
 mod repair;
 mod replay;
 mod report;
+mod report_repair;
 mod rig;
 mod route;
 mod scenario;
