@@ -347,7 +347,7 @@ fn feature_table(report: &Report) -> Markup {
                 }
             }
         }
-        p { (feature_costs::NOT_IN_THIS_BUILD) }
+        p { (feature_costs::WITHOUT_REPAIR) }
     }
 }
 
