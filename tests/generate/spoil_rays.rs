@@ -89,12 +89,13 @@ fn eye_m(mean_m: DVec3, direction: DVec3) -> Option<DVec3> {
 }
 
 /// Whether a place is one that the cameras saw a Gaussian from: the side cameras are 0.3 m beside the middle, and
-/// they were behind it by 4 m and 0.8 times its distance from the drive, to a keyframe.
+/// they were behind it by 4 m and 0.8 times its distance from the drive: at the next keyframe after that, from the keyframe
+/// that is nearest to it, 0.5 m from the next.
 fn saw(eye_m: DVec3, mean_m: DVec3, within_m: f64) -> bool {
     let distance_m = DVec3::new(0.0, mean_m.y, mean_m.z - EYE_M).length();
     let before_m = 4.0 + 0.8 * distance_m;
     let off_m = eye_m - DVec3::new(mean_m.x - before_m, 0.3, EYE_M);
-    off_m.x.abs() <= 0.5 + within_m && off_m.y.abs() <= within_m
+    off_m.x.abs() <= 0.75 + within_m && off_m.y.abs() <= within_m
 }
 
 #[test]
@@ -209,6 +210,10 @@ fn twice_the_amount_is_twice_the_damage_and_another_seed_another_one() {
         compared += 1;
     }
     assert!(compared > COUNT / 2, "{compared}");
+    let is_lost = |one: &Changed| one.after.is_empty();
+    let lost_alike = whole.iter().zip(&other).filter(|(a, b)| is_lost(a) && is_lost(b)).count();
+    // 2 % of 2 % of them by chance: 2.4.
+    assert!(lost_alike < 15, "{lost_alike} are lost with either seed");
     let moved_alike = whole.iter().zip(&other).filter(|(a, b)| {
         let both = a.moved_m().zip(b.moved_m());
         both.is_some_and(|(a, b)| a.distance(b) < 1e-6 && a.length() > 1e-3)

@@ -12,7 +12,7 @@ use wildcity_repair::Model;
 use wildcity_repair::reference::ReferenceCache;
 use wildcity_report::ReportError;
 use wildcity_report::repair::{
-    ImageKind, RepairBenchmark, RepairReport, RepairRow, RepairSampling, measure,
+    FRAME_M, ImageKind, RepairBenchmark, RepairReport, RepairRow, RepairSampling, flicker, measure,
 };
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
@@ -71,6 +71,16 @@ impl Twins {
         truth: Option<&Arc<Resident>>,
         models: &[Arc<Model>],
     ) -> Result<RepairReport, ReportError> {
+        self.measured_at(&[1.0, 3.0], resident, truth, models)
+    }
+
+    fn measured_at(
+        &self,
+        offsets_m: &[f64],
+        resident: &Arc<Resident>,
+        truth: Option<&Arc<Resident>>,
+        models: &[Arc<Model>],
+    ) -> Result<RepairReport, ReportError> {
         let benchmark = RepairBenchmark {
             resident,
             catalog: &self.catalog,
@@ -79,7 +89,7 @@ impl Twins {
             cameras: &rig().cameras,
             models,
             references: &ReferenceCache::default(),
-            sampling: RepairSampling::new(4, &[1.0, 3.0], 360),
+            sampling: RepairSampling::new(4, offsets_m, 360),
         };
         measure(&benchmark, &mut |_, _| {})
     }
@@ -252,6 +262,20 @@ fn psnr_and_flicker_are_those_of_the_poses_beside_the_drive() {
             }
         }
     }
+    // Without bringing the earlier image into the view, the difference is that of other places.
+    let mut unmoved = 0.0;
+    for station in 0..4 {
+        let station_m = drive().length_m() * (f64::from(station) + 0.5) / 4.0;
+        let [now, before] = [0.0, FRAME_M].map(|back_m| {
+            let pose = drive().at_station(station_m - back_m);
+            drawn(&twins.truth, &View::of_rig(&rig().cameras, pose))
+        });
+        for (now, before) in now.iter().zip(&before) {
+            unmoved += flicker(now, before, &vec![1.0; 120 * 80]).unwrap() / 8.0;
+        }
+    }
+    let true_flicker = rows(&report, "rendered")[0].true_flicker.unwrap();
+    assert!(true_flicker < 0.6 * unmoved, "{true_flicker} of {unmoved}");
     for (row, sum_db) in rows(&report, "rendered").iter().zip(sums_db) {
         let psnr_db = row.psnr_db.unwrap();
         assert!((psnr_db - sum_db / 8.0).abs() < 1e-9, "{psnr_db} dB, not {}", sum_db / 8.0);
@@ -292,8 +316,11 @@ fn a_second_run_gives_the_same_but_for_its_times() {
 #[test]
 fn a_model_that_fails_or_does_not_fit_is_named() {
     let twins = Twins::new();
-    let (_a, broken) = model("broken", &doubles::nan_where_bright(), json!({}));
-    let refused = twins.measured(&twins.worn, None, &[broken]).unwrap_err();
+    let inputs = json!([{"name": "image", "role": "rgb"}, {"name": "trust", "role": "trust"}]);
+    let (_a, broken) = model("broken", &doubles::nan_if_doubtful(), json!({"inputs": inputs}));
+    let models = [broken];
+    twins.measured_at(&[1.0], &twins.worn, None, &models).unwrap();
+    let refused = twins.measured_at(&[1.0, 5.0], &twins.worn, None, &models).unwrap_err();
     assert!(matches!(refused, ReportError::Repair { .. }), "{refused}");
     assert!(refused.to_string().contains("\"broken\" failed on an image of the camera"));
     let fixed = json!({"size": {"fixed": [64, 64], "fit": "pad"}});
