@@ -80,14 +80,11 @@ def matrix(pose):
 class Street:
     """A street as it is and spoiled, drawn by a server."""
 
-    def __init__(self, server, client, seed):
+    def __init__(self, server, seed):
         import wildcity
-        from wildcity.protocol import ImagePart
 
-        parts = {camera: ImagePart(size=SIZE) for camera in CAMERAS}
-        outputs = wildcity.Outputs(cameras=CAMERAS, encoding="raw", depth=True, opacity=True, images=parts)
-        twins = [f"{kind}{seed}" for kind in ("true", "spoiled")]
-        self.sessions = [client.open(twin, session=twin, outputs=outputs) for twin in twins]
+        self.url = server.url
+        self.twins = [f"{kind}{seed}" for kind in ("true", "spoiled")]
         self.drive = wildcity.recorded_drive(f"true{seed}", "log", every_m=RECORDED_M, server=server.http)
         recorded = [recorded.pose for recorded in self.drive.poses]
         self.recorded = []
@@ -96,24 +93,28 @@ class Street:
                 image.depth = drawn.depth
             self.recorded.append(true)
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        for session in self.sessions:
-            session.close()
-
     def draw(self, which, poses):
-        """The images of a pose in the order of the cameras, for each pose."""
-        session, drawn = self.sessions[which], []
-        for first in range(0, len(poses), 8):
-            part = poses[first : first + 8]
-            for pose, view in zip(part, session.observe(part).views):
-                images = []
-                for camera in session.opened.cameras:
-                    depth = np.where(view.opacity[camera.name] >= 0.5, view.depth[camera.name], 0.0)
-                    images.append(Image(np.array(view.images[camera.name]), depth, camera, pose))
-                drawn.append(images)
+        """The images of a pose in the order of the cameras, for each pose.
+
+        Each call has its own connection: a server drops clients that are silent for minutes, while they warp or train.
+        """
+        import wildcity
+        from wildcity.protocol import ImagePart
+
+        parts = {camera: ImagePart(size=SIZE) for camera in CAMERAS}
+        outputs = wildcity.Outputs(cameras=CAMERAS, encoding="raw", depth=True, opacity=True, images=parts)
+        drawn = []
+        with wildcity.connect(self.url) as client:
+            session = client.open(self.twins[which], session=self.twins[which], outputs=outputs)
+            for first in range(0, len(poses), 8):
+                part = poses[first : first + 8]
+                for pose, view in zip(part, session.observe(part).views):
+                    images = []
+                    for camera in session.opened.cameras:
+                        depth = np.where(view.opacity[camera.name] >= 0.5, view.depth[camera.name], 0.0)
+                        images.append(Image(np.array(view.images[camera.name]), depth, camera, pose))
+                    drawn.append(images)
+            session.close()
         return drawn
 
     def beside(self, station_m, offset_m, yaw=0.0):
@@ -418,23 +419,22 @@ def main():
         with wildcity.serve(twins, backend="cpu") as server:
             if options.steps:
                 arrays = []
-                with wildcity.connect(server.url) as client:
-                    for seed in TRAINED:
-                        print(f"drawing street {seed}", flush=True)
-                        with Street(server, client, seed) as street:
-                            rng = np.random.default_rng(seed)
-                            stations_m = rng.uniform(10.0, street.drive.length_m - 10.0, options.views)
-                            offsets_m = rng.uniform(-1.0, 6.0, options.views)
-                            arrays += street.views(stations_m, offsets_m, rng.uniform(-0.1, 0.1, options.views))[0]
+                for seed in TRAINED:
+                    print(f"drawing street {seed}", flush=True)
+                    street = Street(server, seed)
+                    rng = np.random.default_rng(seed)
+                    stations_m = rng.uniform(10.0, street.drive.length_m - 10.0, options.views)
+                    offsets_m = rng.uniform(-1.0, 6.0, options.views)
+                    arrays += street.views(stations_m, offsets_m, rng.uniform(-0.1, 0.1, options.views))[0]
                 print(f"wrote {write(train(arrays, options.steps), options.out)} bytes", flush=True)
             repair = repairer(options.out / "repair.onnx")
             for seed in UNSEEN:
-                with wildcity.connect(server.url) as client, Street(server, client, seed) as street:
-                    print("a street that it has not seen, PSNR in dB\noffset  valid  rendered  warped  repaired")
-                    for offset_m, valid, *scores in gains(street, repair):
-                        print("{:4.0f} m {:7.2f} {:9.2f} {:7.2f} {:9.2f}".format(offset_m, valid, *scores), flush=True)
-                    rendered, repaired, true = flicker(street, repair)
-                    print(f"flicker at 3 m: rendered {rendered:.4f}, repaired {repaired:.4f}, true {true:.4f}")
+                street = Street(server, seed)
+                print("a street that it has not seen, PSNR in dB\noffset  valid  rendered  warped  repaired")
+                for offset_m, valid, *scores in gains(street, repair):
+                    print("{:4.0f} m {:7.2f} {:9.2f} {:7.2f} {:9.2f}".format(offset_m, valid, *scores), flush=True)
+                rendered, repaired, true = flicker(street, repair)
+                print(f"flicker at 3 m: rendered {rendered:.4f}, repaired {repaired:.4f}, true {true:.4f}")
 
 
 if __name__ == "__main__":

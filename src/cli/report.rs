@@ -3,6 +3,7 @@
 use std::fs;
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, bail, ensure};
 
@@ -13,6 +14,7 @@ use wildcity_report::confidence::confidence_by_offset;
 use wildcity_report::measure::{Benchmark, ReferenceImages};
 use wildcity_report::measurement::{Measurement, normalize_machine_speed};
 use wildcity_report::recommend::{Goal, Recommendation, recommend};
+use wildcity_report::repair::{self, RepairBenchmark, RepairReport, RepairSampling};
 use wildcity_report::sample_points::{SamplePoint, Sampling, sample_points};
 use wildcity_report::settings::{SettingList, Skipped, TwinFeatures, settings_to_compare};
 use wildcity_report::{Report, ReportError, Subject, feature_costs, page};
@@ -23,6 +25,7 @@ use wildcity_twin::residency::{Cache, Resident};
 
 use super::backend_options::HardwareOptions;
 use super::directories::{TwinVersion, Twins};
+use super::repair_options::RepairOptions;
 use super::rig::rig_of;
 use super::stress::{BackendName, candidate};
 use super::{demo, output, progress};
@@ -99,6 +102,24 @@ pub(super) struct Command {
     no_stress: bool,
 
     #[command(flatten)]
+    repair: RepairOptions,
+
+    /// Distances beside the drive at which --repair is measured, in metres; the drive itself always is.
+    #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = [1.0, 3.0, 5.0], value_parser = offset_m)]
+    #[arg(requires = "repair", allow_negative_numbers = true)]
+    offsets: Vec<f64>,
+
+    /// Twin that shows what is true, for --repair on a twin that was spoiled: NAME, or NAME@NUMBER. Without it nobody
+    /// knows what is true beside a drive, and only times and flicker are measured.
+    #[arg(long, value_name = "TWIN", requires = "repair")]
+    truth: Option<TwinVersion>,
+
+    /// Longest side of the images that --repair is measured with, in pixels.
+    #[arg(long, value_name = "PX", default_value_t = 360, requires = "repair")]
+    #[arg(value_parser = clap::value_parser!(u32).range(16..=8192))]
+    repair_side: u32,
+
+    #[command(flatten)]
     hardware: HardwareOptions,
 }
 
@@ -107,6 +128,7 @@ Examples:
   wildcity report
   wildcity report street --at-least-db 40 --out report
   wildcity report street --rig alpamayo2
+  wildcity report worn --repair street-net.json --truth street --offsets 1,3,5
   wildcity report street --backend gpu --at-most-ms 20 && \\
     wildcity serve --backend gpu --profile wildcity-report/profile.json";
 
@@ -137,6 +159,13 @@ fn at_most_ms(text: &str) -> Result<Goal, String> {
     match text.parse() {
         Ok(ms) if ms > 0.0 && f64::is_finite(ms) => Ok(Goal::AtMostMs(ms)),
         _ => Err("expected milliseconds above 0, for example 20".to_owned()),
+    }
+}
+
+fn offset_m(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(offset_m) if (0.0..=100.0).contains(&offset_m) => Ok(offset_m),
+        _ => Err("expected 0 to 100 m, for example 3".to_owned()),
     }
 }
 
@@ -194,6 +223,9 @@ impl Command {
         for Skipped { what, reason } in &report.skipped {
             writeln!(out, "not compared: {what} ({reason})")?;
         }
+        for recommended in report.repair.iter().flat_map(|repair| &repair.below) {
+            writeln!(out, "{}", recommended.text())?;
+        }
         if let Some(recommendation) = &report.recommendation {
             print_recommendation(&mut out, recommendation, &profile)?;
         }
@@ -210,7 +242,10 @@ impl Command {
         let points = sample_points(manifest, &rig.cameras, sampling);
         let names: Vec<String> = backends.iter().map(|backend| backend.name().to_owned()).collect();
 
-        // 2. Errors and times of all settings.
+        // 2. Repair, which can fail early.
+        let repair = self.measure_repair(&resident, &*backends[0], &rig)?;
+
+        // 3. Errors and times of all settings.
         let benchmark = Benchmark {
             resident: &resident,
             backends: &backends,
@@ -222,7 +257,7 @@ impl Command {
         compared.skipped.extend(absent);
         let Compared { measurements, skipped, reference_ms, exact_rays_ms } = compared;
 
-        // 3. The setting for the goal.
+        // 4. The setting for the goal.
         let goal = self.at_least_db.or(self.at_most_ms);
         let recommended = goal.map(|goal| recommend(goal, &measurements, &names)).transpose();
         let (recommendation, unmet_reason) = match recommended {
@@ -230,7 +265,7 @@ impl Command {
             Err(error) => (None, Some(error.to_string())),
         };
 
-        // 4. Trust, extreme scenes, and features.
+        // 5. Trust, extreme scenes, and features.
         let confidence = confidence_by_offset(&resident, &*backends[0], &points)?;
         let stress = self.stress()?;
         let feature_costs =
@@ -262,7 +297,48 @@ impl Command {
             unmet_reason,
             stress,
             feature_costs,
+            repair,
         })
+    }
+
+    /// What the models of --repair gain and cost; none without models.
+    fn measure_repair(
+        &self,
+        resident: &Arc<Resident>,
+        backend: &dyn Backend,
+        rig: &Rig,
+    ) -> anyhow::Result<Option<RepairReport>> {
+        let models = self.repair.models()?;
+        if models.names().next().is_none() {
+            return Ok(None);
+        }
+        let catalog = self.twins.catalog()?;
+        let truth = self.truth.as_ref().map(|TwinVersion { name, number }| {
+            Cache::new(self.twins.catalog()?)
+                .open(name, *number)
+                .with_context(|| format!("--truth {name}"))
+        });
+        let truth = truth.transpose()?;
+        let loaded = models.names().map(|name| models.get(name));
+        let loaded = loaded.collect::<Result<Vec<_>, _>>()?;
+        let sampling = RepairSampling::new(self.stations, &self.offsets, self.repair_side);
+        let benchmark = RepairBenchmark {
+            resident,
+            catalog: &catalog,
+            truth: truth.as_ref(),
+            backend,
+            cameras: &rig.cameras,
+            models: &loaded,
+            references: models.references(),
+            sampling,
+        };
+        let bar = progress::count("repair");
+        let report = repair::measure(&benchmark, &mut |done, all| {
+            bar.set_length(all as u64);
+            bar.set_position(done as u64);
+        })?;
+        bar.finish_and_clear();
+        Ok(Some(report))
     }
 
     /// Opens the backends of `--backend`; at least one must be there.

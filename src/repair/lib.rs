@@ -54,7 +54,7 @@ pub use manifest::{
     Dtype, Fit, Input, InputRole, Layout, Manifest, Merge, ModelFile, Output, OutputRole, Provider,
     Size, Unit,
 };
-pub use model::{LoadOptions, Model, Repaired};
+pub use model::{LoadOptions, Model, RepairTimes, Repaired};
 pub use models::Models;
 pub use onnx::is_loaded;
 pub use select::{Decision, Selection};

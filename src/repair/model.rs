@@ -1,7 +1,7 @@
 //! A model that is loaded, checked and ready.
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::error::RepairError;
 use crate::files;
@@ -64,6 +64,17 @@ pub struct Repaired {
     pub rendered_hash: blake3::Hash,
     /// BLAKE3 of the repaired image.
     pub hash: blake3::Hash,
+}
+
+/// How long the parts of a repair took.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RepairTimes {
+    /// From images and maps to the inputs of the graph: their sizes and ranges.
+    pub fit: Duration,
+    /// The graph, for all tiles.
+    pub run: Duration,
+    /// From its output to an image of 8 bits, and the hashes.
+    pub merge: Duration,
 }
 
 /// A model that is loaded, checked and ready. It runs one image at a time.
@@ -181,6 +192,15 @@ impl Model {
     /// # Errors
     /// `Input`, `Shape`, `NotFinite`, `TimedOut`, `Withdrawn`, `Run`, `Tiles`.
     pub fn repair(&self, view: &View<'_>) -> Result<Repaired, RepairError> {
+        self.repair_timed(view).map(|(repaired, _)| repaired)
+    }
+
+    /// Repairs an image, and tells how long the parts of it took.
+    ///
+    /// # Errors
+    /// As [`Model::repair`].
+    pub fn repair_timed(&self, view: &View<'_>) -> Result<(Repaired, RepairTimes), RepairError> {
+        let started = Instant::now();
         view.check()?;
         let manifest = self.manifest();
         let size = [view.rendered.height, view.rendered.width];
@@ -194,6 +214,7 @@ impl Model {
         let scale = manifest.output().scale as usize;
         let channels = manifest.output().role.channels();
         let mut output = Planes::zeros(channels, inputs[0].height * scale, inputs[0].width * scale);
+        let fitted_at = Instant::now();
         for window in &windows {
             let tile: Vec<Planes> = inputs.iter().map(|planes| planes.crop(window.seen)).collect();
             let returned = self.runner.run(&tile, &scalars)?;
@@ -203,13 +224,20 @@ impl Model {
             let within = Rect { top: used.top - seen.top, left: used.left - seen.left, ..used };
             output.paste(&returned, within, used.top, used.left);
         }
+        let run_at = Instant::now();
         let is_image = |input: &Input| matches!(input.role, InputRole::Rgb | InputRole::Luma);
         let at = self.runner.pixel_inputs().position(is_image).unwrap_or(0);
         let seen = inputs[at].crop(fitted.content);
         let output = output.crop(fitted.content.scaled(scale));
         let image = merge::merge(manifest, view, seen, output);
         let hash = image.hash();
-        Ok(Repaired { image, rendered_hash: view.rendered.hash(), hash })
+        let repaired = Repaired { image, rendered_hash: view.rendered.hash(), hash };
+        let times = RepairTimes {
+            fit: fitted_at - started,
+            run: run_at - fitted_at,
+            merge: run_at.elapsed(),
+        };
+        Ok((repaired, times))
     }
 
     /// The tiles of an image that fits, or the image.

@@ -5,8 +5,11 @@
 //! `transparent`. A caller that prints an error, with `{:#}` or `to_string`, then says each thing once.
 
 use wildcity_render::RenderError;
+use wildcity_repair::RepairError;
 use wildcity_scene::geometry::CameraError;
 use wildcity_scene::profile::ProfileError;
+use wildcity_scene::rig::RigError;
+use wildcity_session::SessionError;
 use wildcity_twin::residency::ResidencyError;
 
 /// Why a report cannot be made, or a setting cannot be recommended.
@@ -36,6 +39,27 @@ pub enum ReportError {
         /// The plotter's message.
         reason: String,
     },
+    /// A model cannot be used, or recorded images cannot be read.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+    /// The cameras cannot be scaled.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// A model fails.
+    #[error("the repair model {model:?} failed on an image of the camera {camera:?}: {cause}")]
+    Repair {
+        /// Name of the model.
+        model: String,
+        /// Name of the camera.
+        camera: String,
+        /// What the model says.
+        cause: Box<RepairError>,
+    },
+    /// Repair is measured beside a drive.
+    #[error(
+        "--repair: the twin has no recorded drive, so there is nothing beside it; leave --repair out"
+    )]
+    NoDrive,
     /// There are no sample points.
     #[error("there are no sample points to measure at: give at least 2 --stations")]
     NoSamplePoints,

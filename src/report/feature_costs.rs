@@ -90,9 +90,9 @@ pub const COLUMNS: [&str; 11] = [
     "read back, B per pixel",
 ];
 
-/// What this build does not have at all.
-pub const NOT_IN_THIS_BUILD: &str =
-    "This build does not repair images: it has no code, library, buffer, or pipeline for it.";
+/// What the table does not have: repair.
+pub const WITHOUT_REPAIR: &str = "Repair adds nothing here: a model gets the finished images of sessions that ask for it, and its \
+     library is loaded with the first of them.";
 
 /// A feature: its name, and how it changes the base step.
 struct Feature {

@@ -11,6 +11,7 @@
 //! recommend       the Pareto front, and the setting for a wanted error or time
 //! confidence      trust in the images, over the distance from the recorded drive
 //! feature_costs   memory and GPU work of one step, with each feature of a scene and without
+//! repair          what repair gains beside the drive, and what it costs
 //! plots, page     the HTML page
 //! ```
 //!
@@ -26,6 +27,7 @@ pub mod measurement;
 pub mod page;
 mod plots;
 pub mod recommend;
+pub mod repair;
 mod report;
 pub mod sample_points;
 pub mod setting;

@@ -52,6 +52,7 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
                 (not_compared(report))
                 (by_offset)
                 (confidence)
+                @if let Some(repair) = &report.repair { (super::repair::section(repair)) }
                 (worst_windows(&report.settings))
                 @if !report.stress.rows.is_empty() { (stress(report)) }
                 (feature_table(report))
@@ -346,7 +347,7 @@ fn feature_table(report: &Report) -> Markup {
                 }
             }
         }
-        p { (feature_costs::NOT_IN_THIS_BUILD) }
+        p { (feature_costs::WITHOUT_REPAIR) }
     }
 }
 

@@ -6,6 +6,7 @@ use super::confidence::Confidence;
 use super::feature_costs::FeatureCounts;
 use super::measurement::Measurement;
 use super::recommend::{Goal, Recommendation, pareto_front};
+use super::repair::RepairReport;
 use super::sample_points::{OFFSETS_M, Sampling};
 use super::settings::Skipped;
 use wildcity_scene::RenderProfile;
@@ -50,6 +51,9 @@ pub struct Report {
     /// Memory and GPU work of one step, with each feature and without.
     #[serde(rename = "needed")]
     pub feature_costs: Vec<FeatureCounts>,
+    /// What repair gains and costs, if models were given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repair: Option<RepairReport>,
 }
 
 /// The twin of a report, and how it is rendered.

@@ -97,7 +97,7 @@ fn along(drive: &Trajectory, cameras: &[RigCamera], sampling: Sampling) -> Vec<S
 }
 
 /// Length of a drive over its duration; 0 if it takes no time.
-fn mean_speed_m_per_us(drive: &Trajectory) -> f64 {
+pub(super) fn mean_speed_m_per_us(drive: &Trajectory) -> f64 {
     let ends = drive.keyframes.first().zip(drive.keyframes.last());
     let duration_us = ends.map_or(0, |(first, last)| last.time_us - first.time_us);
     if duration_us > 0 { drive.length_m() / duration_us as f64 } else { 0.0 }

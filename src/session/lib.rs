@@ -72,7 +72,9 @@ pub use record::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
     ReplayedImage, WrongValue,
 };
+pub use repair::offline::{OfflineRepair, OfflineView, ViewReferences};
 pub use repair::references::ReferenceSource;
+pub use repair::rendered_image::RenderedImage;
 pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
 pub use scenario::{

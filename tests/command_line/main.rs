@@ -63,6 +63,7 @@ mod remote;
 mod repair;
 mod replay;
 mod report;
+mod report_repair;
 mod rig;
 mod route;
 mod scenario;

@@ -9,6 +9,7 @@ mod drive;
 mod pictures;
 mod scenarios;
 mod spoil;
+mod spoil_rays;
 
 use std::sync::LazyLock;
 

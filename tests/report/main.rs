@@ -6,6 +6,12 @@ mod data;
 mod gpu;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/onnx_doubles.rs"]
+mod onnx_doubles;
+#[path = "../support/onnx_models.rs"]
+mod onnx_models;
+#[path = "../support/onnx_protobuf.rs"]
+mod onnx_protobuf;
 #[path = "../support/reported.rs"]
 mod reported;
 #[path = "../support/root.rs"]
@@ -18,4 +24,5 @@ mod skies;
 mod streets;
 
 mod needed;
+mod repair;
 mod settings;

@@ -82,10 +82,15 @@ impl Check {
             let sample = Sample::new(pattern(width, height));
             let peak = Peak::start();
             let start = Instant::now();
-            match model.repair(&sample.view()) {
-                Ok(_) => {
+            match model.repair_timed(&sample.view()) {
+                Ok((_, times)) => {
                     let seconds = start.elapsed().as_secs_f64();
                     writeln!(out, "{size:<12} {seconds:>8.3} s {:>12}", peak.text())?;
+                    let [fit, run, merge] =
+                        [times.fit, times.run, times.merge].map(|part| part.as_secs_f64());
+                    let parts =
+                        format!("its inputs; {run:.3} s its graph; {merge:.3} s its output");
+                    writeln!(out, "{:<12} {fit:>8.3} s of that for {parts}", "")?;
                 }
                 Err(error) => writeln!(out, "{size:<12} {error}")?,
             }

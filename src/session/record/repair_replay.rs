@@ -15,16 +15,16 @@ use wildcity_scene::{Manifest, RenderProfile};
 use wildcity_twin::residency::Resident;
 use wildcity_twin::store::Catalog;
 
-use super::format::{EpisodeHeader, profile_hash};
+use super::format::EpisodeHeader;
 use super::repairs::RecordedRepair;
 use super::replay_report::{ProvenanceChange, ReplayError};
 use crate::observe::trust::TrainingCoverage;
-use crate::repair::drawn::{self, Beside, CameraRays, Sight};
+use crate::repair::drawn::{Beside, CameraRays, Sight};
+use crate::repair::offline::ReferenceSupply;
 use crate::repair::references::{ReferenceView, ReferenceViews};
 use crate::repair::rendered_image::RenderedImage;
 use crate::repair::session_repair;
 use crate::repair::status::RepairState;
-use crate::viewpoint::viewpoints;
 
 /// The repair of an episode that is replayed.
 pub(super) struct RepairReplay<'a> {
@@ -237,19 +237,10 @@ impl<'a> RepairReplay<'a> {
         view: &ReferenceView,
         Drawing { resident, profile, backend }: Drawing<'_>,
     ) -> Result<Arc<Reference>, String> {
-        let key = view.key(&resident.version.hash, &profile_hash(profile));
-        if let Some(known) = self.models.references().get(&key) {
-            return Ok(known);
-        }
-        let read = drawn::read(self.catalog, &resident.version, view);
-        let image = read.map_err(|error| error.to_string())?;
-        let scene = resident.scene(&viewpoints(&[view.view()]), profile);
-        let scene = scene.map_err(|error| error.to_string())?;
-        let projection = references.projection(&view.camera);
-        let drawn = drawn::draw(view, image, projection, &scene, profile, backend);
-        let reference = Arc::new(drawn.map_err(|error| error.to_string())?);
-        self.models.references().insert(key, reference.clone());
-        Ok(reference)
+        let Self { models, catalog, .. } = *self;
+        let cache = models.references();
+        let supply = ReferenceSupply { resident, profile, backend, catalog, cache };
+        supply.reference(references, view).map_err(|error| error.to_string())
     }
 }
 

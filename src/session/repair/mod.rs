@@ -11,6 +11,7 @@
 //! A model may see recorded images beside the rendered one. `references` says which, `drawn` reads or draws them.
 
 pub(crate) mod drawn;
+pub(crate) mod offline;
 pub(crate) mod references;
 pub(crate) mod rendered_image;
 pub(crate) mod session_repair;

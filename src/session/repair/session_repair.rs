@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use wildcity_repair::reference::Rays;
-use wildcity_repair::{Image, InputRole, Model, Models, RepairError, Selection, View};
+use wildcity_repair::{Image, InputRole, Model, Models, RepairError, RepairTimes, Selection, View};
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::RigCamera;
 
@@ -50,16 +50,7 @@ impl SessionRepair {
             RepairError::Unknown { name, known } => SessionError::UnknownRepair { name, known },
             other => unavailable(other.to_string()),
         })?;
-        let scale = model.manifest().outputs[0].scale;
-        if scale != 1 {
-            return Err(unavailable(format!(
-                "its output is {scale} times as large as its input; sessions take models of scale 1"
-            )));
-        }
-        for RigCamera { name, camera, .. } in cameras {
-            let checked = model.check_size(camera.width_px as usize, camera.height_px as usize);
-            checked.map_err(|error| unavailable(format!("camera {name:?}: {error}")))?;
-        }
+        check_cameras(&model, cameras)?;
         let timeout_ms = model.manifest().timeout_ms;
         if Duration::from_millis(timeout_ms) >= deadline {
             let must = format!(
@@ -106,23 +97,7 @@ impl SessionRepair {
         views: Option<&ReferenceViews>,
         cameras: &[RigCamera],
     ) -> Result<(), SessionError> {
-        let refused = |reason: String| {
-            let name = self.model.manifest().name.clone();
-            Err(SessionError::RepairUnavailable { name, reason })
-        };
-        let Some(views) = views else {
-            return refused(
-                "it needs images of a recorded drive, and the twin has none".to_owned(),
-            );
-        };
-        let is_missing = |camera: &&RigCamera| !views.has_camera(&camera.name);
-        match cameras.iter().find(is_missing).filter(|_| self.needs_reference()) {
-            None => Ok(()),
-            Some(RigCamera { name, .. }) => refused(format!(
-                "it needs a recorded image of each camera, and the twin has none of {name:?}; `wildcity twin views` \
-                 adds images, outputs.cameras leaves cameras out"
-            )),
-        }
+        check_references(&self.model, views, cameras)
     }
 
     /// Whether the model needs normals.
@@ -146,6 +121,55 @@ pub(crate) fn needs_warped(model: &Model) -> bool {
     model.needs(InputRole::ReferenceWarped) || model.needs(InputRole::ReferenceValid)
 }
 
+/// Checks that a model can repair the images of some cameras.
+///
+/// # Errors
+/// [`SessionError::RepairUnavailable`].
+pub(crate) fn check_cameras(model: &Model, cameras: &[RigCamera]) -> Result<(), SessionError> {
+    let unavailable = |reason: String| {
+        let name = model.manifest().name.clone();
+        SessionError::RepairUnavailable { name, reason }
+    };
+    let scale = model.manifest().outputs[0].scale;
+    if scale != 1 {
+        return Err(unavailable(format!(
+            "its output is {scale} times as large as its input; sessions take models of scale 1"
+        )));
+    }
+    for RigCamera { name, camera, .. } in cameras {
+        let checked = model.check_size(camera.width_px as usize, camera.height_px as usize);
+        checked.map_err(|error| unavailable(format!("camera {name:?}: {error}")))?;
+    }
+    Ok(())
+}
+
+/// Checks that each camera has an image for the role `reference`, if a model needs one, and that there are images at all.
+///
+/// # Errors
+/// [`SessionError::RepairUnavailable`].
+pub(crate) fn check_references(
+    model: &Model,
+    views: Option<&ReferenceViews>,
+    cameras: &[RigCamera],
+) -> Result<(), SessionError> {
+    let refused = |reason: String| {
+        let name = model.manifest().name.clone();
+        Err(SessionError::RepairUnavailable { name, reason })
+    };
+    let Some(views) = views else {
+        return refused("it needs images of a recorded drive, and the twin has none".to_owned());
+    };
+    let is_missing = |camera: &&RigCamera| !views.has_camera(&camera.name);
+    let missing = cameras.iter().find(is_missing);
+    match missing.filter(|_| model.needs(InputRole::Reference)) {
+        None => Ok(()),
+        Some(RigCamera { name, .. }) => refused(format!(
+            "it needs a recorded image of each camera, and the twin has none of {name:?}; `wildcity twin views` \
+             adds images, outputs.cameras leaves cameras out"
+        )),
+    }
+}
+
 /// The repaired pixels of a camera's image: black outside of the lens' field, with the camera's overlay.
 pub(crate) fn repair(
     model: &Model,
@@ -153,6 +177,16 @@ pub(crate) fn repair(
     rendered: &RenderedImage,
     beside: &Beside,
 ) -> Result<Vec<u8>, RepairError> {
+    repair_timed(model, camera, rendered, beside).map(|(repaired, _)| repaired)
+}
+
+/// The same, and how long the parts of it took.
+pub(crate) fn repair_timed(
+    model: &Model,
+    camera: &RigCamera,
+    rendered: &RenderedImage,
+    beside: &Beside,
+) -> Result<(Vec<u8>, RepairTimes), RepairError> {
     let RenderedImage { rgb8, depth_m, opacity, normals, trust } = rendered;
     let width = camera.camera.width_px as usize;
     let height = camera.camera.height_px as usize;
@@ -178,7 +212,8 @@ pub(crate) fn repair(
         reference_valid: beside.warped.as_ref().map(|(_, valid)| &valid[..]),
         ..View::new(&image)
     };
-    let mut repaired = model.repair(&view)?.image.rgb8;
+    let (repaired, times) = model.repair_timed(&view)?;
+    let mut repaired = repaired.image.rgb8;
     if let Some(overlay) = &camera.appearance.overlay {
         let alphas = overlay.rgba8().chunks_exact(4).map(|pixel| u32::from(pixel[3]));
         let pixels = repaired.chunks_exact_mut(3).zip(rgb8.chunks_exact(3));
@@ -189,7 +224,7 @@ pub(crate) fn repair(
             }
         }
     }
-    Ok(repaired)
+    Ok((repaired, times))
 }
 
 /// All x, then all y, then all z.

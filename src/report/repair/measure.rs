@@ -1,0 +1,381 @@
+//! Renders views beside the drive, repairs them, and compares them with the true ones.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::Serialize;
+
+use wildcity_render::compare::flip::flip;
+use wildcity_render::compare::psnr::psnr_db_u8;
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_repair::reference::{Projection, Rays, ReferenceCache, opaque_depth};
+use wildcity_repair::{InputRole, Model};
+use wildcity_scene::Trajectory;
+use wildcity_scene::appearance::Appearance;
+use wildcity_scene::rig::RigCamera;
+use wildcity_session::{
+    OfflineRepair, OfflineView, ReferenceSource, RenderedImage, TrainingCoverage, ViewReferences,
+};
+use wildcity_twin::residency::Resident;
+use wildcity_twin::store::Catalog;
+
+use super::RepairReport;
+use super::below::{Gains, recommend_below};
+use super::flicker::FlickerPair;
+use super::row::{EXACT_DB, ImageKind, RepairMs, RepairRow, RepairedModel, Sample};
+use super::stations::{RepairSampling, RepairStation};
+use crate::error::ReportError;
+
+/// Index of the rendered image among the kinds, and of the warped one. The models come after them.
+const RENDERED: usize = 0;
+const WARPED: usize = 1;
+const FIRST_MODEL: usize = 2;
+
+/// What is measured.
+pub struct RepairBenchmark<'a> {
+    /// The twin.
+    pub resident: &'a Arc<Resident>,
+    /// Where it is stored, with its recorded images.
+    pub catalog: &'a Catalog,
+    /// The twin that shows what is true; none if nobody knows.
+    pub truth: Option<&'a Arc<Resident>>,
+    /// What renders.
+    pub backend: &'a dyn Backend,
+    /// The cameras.
+    pub cameras: &'a [RigCamera],
+    /// The models.
+    pub models: &'a [Arc<Model>],
+    /// Recorded images in memory.
+    pub references: &'a ReferenceCache,
+    /// The poses, and the size of the images.
+    pub sampling: RepairSampling,
+}
+
+/// What was measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct RepairSubject {
+    /// The poses, and the size of the images.
+    pub sampling: RepairSampling,
+    /// Cameras of a pose.
+    pub cameras: usize,
+    /// Width and height of the first camera's images.
+    pub size_px: [u32; 2],
+    /// What models compare with: `recorded` images, or the twin `rendered` on its drive.
+    pub references: &'static str,
+    /// How many of them were read and drawn, and the mean time of one in milliseconds. They stay in memory.
+    pub read: usize,
+    /// See `read`.
+    pub read_ms: f64,
+    /// What is true; none if nobody knows.
+    pub truth: Option<Truth>,
+    /// The models, in the order of the rows.
+    pub models: Vec<RepairedModel>,
+}
+
+/// The twin that shows what is true.
+#[derive(Clone, Debug, Serialize)]
+pub struct Truth {
+    /// Its name.
+    pub twin: String,
+    /// Number of its version.
+    pub version: u64,
+    /// Hash of the version.
+    pub version_hash: String,
+}
+
+/// Measures repair. Calls `progress` with the number of poses that are done, and with all.
+///
+/// # Errors
+/// A model does not fit, or fails; or a twin cannot be read or rendered.
+pub fn measure(
+    benchmark: &RepairBenchmark<'_>,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<RepairReport, ReportError> {
+    let drive = benchmark.resident.version.manifest.trajectories.first();
+    let drive = drive.ok_or(ReportError::NoDrive)?;
+    let cameras = benchmark.sampling.cameras(benchmark.cameras)?;
+    let mut bench = Bench::new(benchmark, &cameras)?;
+    let samples = bench.samples(drive, progress)?;
+    let subject = bench.subject();
+
+    let models = subject.models.iter().map(|model| (ImageKind::Model, model.name.clone()));
+    let mut kinds = vec![
+        (ImageKind::Rendered, "rendered".to_owned()),
+        (ImageKind::Warped, "warped".to_owned()),
+    ];
+    kinds.extend(models);
+    let mut rows = Vec::new();
+    for (offset, offset_m) in benchmark.sampling.offsets_m.iter().enumerate() {
+        let of = |kind: usize| -> Vec<&Sample> {
+            samples.iter().filter(|one| (one.offset, one.kind) == (offset, kind)).collect()
+        };
+        let rendered = of(RENDERED);
+        for (index, (kind, name)) in kinds.iter().enumerate() {
+            rows.push(RepairRow::new(*offset_m, *kind, name.clone(), &of(index), &rendered));
+        }
+    }
+    let mut below = Vec::new();
+    if benchmark.truth.is_some() {
+        for (index, model) in subject.models.iter().enumerate() {
+            let gains = |for_selection: bool| -> Vec<Gains> {
+                let own = |one: &&Sample| {
+                    (one.kind, one.for_selection) == (FIRST_MODEL + index, for_selection)
+                };
+                let of = |one: &Sample| Some(Gains { trust: one.trust, gain_db: one.gain_db? });
+                samples.iter().filter(own).filter_map(of).collect()
+            };
+            below.push(recommend_below(model.name.clone(), &gains(true), &gains(false)));
+        }
+    }
+    Ok(RepairReport { subject, rows, below })
+}
+
+/// What stays the same from pose to pose.
+struct Bench<'a> {
+    given: &'a RepairBenchmark<'a>,
+    cameras: &'a [RigCamera],
+    offline: OfflineRepair<'a>,
+    coverage: TrainingCoverage,
+    /// By camera.
+    optics: Vec<(Arc<Projection>, Rays)>,
+    read: usize,
+    read_ms: f64,
+}
+
+/// The images of a camera in one frame.
+struct Shown {
+    /// By kind.
+    rgb8: Vec<Vec<u8>>,
+    /// By kind.
+    repair_ms: Vec<RepairMs>,
+    covered: f64,
+}
+
+impl<'a> Bench<'a> {
+    fn new(given: &'a RepairBenchmark<'a>, cameras: &'a [RigCamera]) -> Result<Self, ReportError> {
+        let RepairBenchmark { resident, catalog, backend, references, .. } = *given;
+        let coverage = TrainingCoverage::new(&resident.version.manifest);
+        let coverage = coverage.ok_or(ReportError::NoDrive)?;
+        let offline = OfflineRepair::new(resident, catalog, backend, cameras, references)?;
+        given.models.iter().try_for_each(|model| offline.check(model))?;
+        let optics = |camera: &RigCamera| {
+            (Arc::new(Projection::of(&camera.camera)), Rays::of(&camera.camera))
+        };
+        let optics = cameras.iter().map(optics).collect();
+        Ok(Self { given, cameras, offline, coverage, optics, read: 0, read_ms: 0.0 })
+    }
+
+    fn subject(&self) -> RepairSubject {
+        let model = |model: &Arc<Model>| {
+            let manifest = model.manifest();
+            RepairedModel {
+                name: manifest.name.clone(),
+                version: manifest.version.clone(),
+                licence: manifest.licence.clone(),
+                repair_hash: model.repair_hash().to_hex().to_string(),
+                provider: model.provider().name(),
+                deterministic: model.is_deterministic(),
+            }
+        };
+        let truth = |truth: &Arc<Resident>| Truth {
+            twin: truth.version.manifest.twin.clone(),
+            version: truth.version.number,
+            version_hash: truth.version.hash.clone(),
+        };
+        let size_px = self.cameras.first().map(|camera| camera.camera);
+        RepairSubject {
+            sampling: self.given.sampling.clone(),
+            cameras: self.cameras.len(),
+            size_px: size_px.map_or([0; 2], |camera| [camera.width_px, camera.height_px]),
+            references: match self.offline.source() {
+                Some(ReferenceSource::Recorded) => "recorded",
+                Some(ReferenceSource::Rendered) | None => "rendered",
+            },
+            read: self.read,
+            read_ms: self.read_ms / self.read.max(1) as f64,
+            truth: self.given.truth.map(truth),
+            models: self.given.models.iter().map(model).collect(),
+        }
+    }
+
+    fn samples(
+        &mut self,
+        drive: &Trajectory,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Vec<Sample>, ReportError> {
+        let stations = self.given.sampling.stations(drive, self.cameras);
+        let mut samples = Vec::new();
+        for (done, station) in stations.iter().enumerate() {
+            progress(done, stations.len());
+            self.add_station(station, &mut samples)?;
+        }
+        Ok(samples)
+    }
+
+    fn add_station(
+        &mut self,
+        station: &RepairStation,
+        samples: &mut Vec<Sample>,
+    ) -> Result<(), ReportError> {
+        let resident = self.given.resident;
+        // The earlier frame first: it reads what the other one needs, and that is timed.
+        let (mut before, _) = self.rendered(resident, &station.views[1])?;
+        let (mut now, render_ms) = self.rendered(resident, &station.views[0])?;
+        let mut truths = [Vec::new(), Vec::new()];
+        if let Some(truth) = self.given.truth {
+            for (images, views) in truths.iter_mut().zip(&station.views) {
+                *images = self.rendered(truth, views)?.0;
+            }
+        }
+        let [true_now, true_before] = truths;
+        for camera in 0..self.cameras.len() {
+            let frames = [&mut now[camera], &mut before[camera]];
+            for (frame, image) in frames.into_iter().enumerate() {
+                let pose = &station.world_from_rig[frame];
+                let view = &station.views[frame][camera];
+                image.trust = self.coverage.trust(pose, view, &image.opacity).value;
+            }
+            let [now, before] = [&now[camera], &before[camera]];
+            let shown = self.shown(station, 0, camera, now)?;
+            let shown_before = self.shown(station, 1, camera, before)?;
+            let views = [0, 1].map(|frame| &station.views[frame][camera]);
+            let flicker = |images: [&RenderedImage; 2], pixels: [&[u8]; 2]| {
+                let depth_m = images.map(|image| opaque_depth(&image.depth_m, &image.opacity));
+                let (projection, rays) = &self.optics[camera];
+                let depth_m = [&depth_m[0][..], &depth_m[1][..]];
+                FlickerPair { views, depth_m, projection, rays }.of(pixels)
+            };
+            let truth = true_now.get(camera).zip(true_before.get(camera));
+            let true_flicker =
+                truth.and_then(|(now, before)| flicker([now, before], [&now.rgb8, &before.rgb8]));
+            let true_rgb8 = truth.map(|(now, _)| &now.rgb8[..]);
+            let size_px = [views[0].camera.width_px, views[0].camera.height_px];
+            let rendered_db = true_rgb8.map(|truth| psnr_db(&now.rgb8, truth));
+            for kind in 0..shown.rgb8.len() {
+                let pixels = &shown.rgb8[kind];
+                let psnr_db = true_rgb8.map(|truth| psnr_db(pixels, truth));
+                samples.push(Sample {
+                    offset: station.offset,
+                    kind,
+                    for_selection: station.for_selection,
+                    trust: now.trust,
+                    covered: shown.covered,
+                    render_ms: render_ms / self.cameras.len() as f64,
+                    repair_ms: shown.repair_ms[kind],
+                    psnr_db,
+                    gain_db: psnr_db.zip(rendered_db).map(|(own, rendered)| own - rendered),
+                    flip: true_rgb8.map(|truth| mean_flip(pixels, truth, size_px)),
+                    flicker: flicker([now, before], [pixels, &shown_before.rgb8[kind]]),
+                    true_flicker,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Renders all cameras of a twin, and tells how many milliseconds that took.
+    fn rendered(
+        &self,
+        resident: &Arc<Resident>,
+        views: &[View],
+    ) -> Result<(Vec<RenderedImage>, f64), ReportError> {
+        let needs_normals = |model: &Arc<Model>| model.needs(InputRole::Normals);
+        let needs_normals = self.given.models.iter().any(needs_normals);
+        let profile = &resident.version.manifest.profile;
+        let scene = resident.scene(&wildcity_session::viewpoints(views), profile)?;
+        let empty = |view: &View| {
+            let pixels = view.camera.pixels();
+            RenderedImage {
+                rgb8: vec![0; 3 * pixels],
+                depth_m: vec![0.0; pixels],
+                opacity: vec![0.0; pixels],
+                normals: vec![0.0; if needs_normals { 3 * pixels } else { 0 }],
+                trust: 0.0,
+            }
+        };
+        let mut images: Vec<RenderedImage> = views.iter().map(empty).collect();
+        let exposures =
+            |camera: &RigCamera| Appearance { exposure: camera.appearance.exposure, overlay: None };
+        let exposures: Vec<Appearance> = self.cameras.iter().map(exposures).collect();
+        let targets = images.iter_mut().zip(&exposures).map(|(image, appearance)| Target {
+            rgb8: Some(&mut image.rgb8),
+            depth_m: Some(&mut image.depth_m),
+            opacity: Some(&mut image.opacity),
+            normals: needs_normals.then_some(&mut image.normals[..]),
+            appearance: Some(appearance),
+            ..Target::default()
+        });
+        let mut targets: Vec<Target<'_>> = targets.collect();
+        let frame = Frame { scene: &scene, profile, views };
+        let started = Instant::now();
+        self.given.backend.render(&frame, &mut targets, &|_, _| {})?;
+        let ms = 1e3 * started.elapsed().as_secs_f64();
+        drop(targets);
+        Ok((images, ms))
+    }
+
+    /// An image of all kinds.
+    fn shown(
+        &mut self,
+        station: &RepairStation,
+        frame: usize,
+        camera: usize,
+        rendered: &RenderedImage,
+    ) -> Result<Shown, ReportError> {
+        let view = &station.views[frame][camera];
+        let world_from_rig = &station.world_from_rig[frame];
+        let of = OfflineView { camera, view, world_from_rig, rendered };
+        let needs_nearest = |model: &Arc<Model>| model.needs(InputRole::Reference);
+        let needs_nearest = self.given.models.iter().any(needs_nearest);
+        let beside = self.offline.references(&of, needs_nearest)?;
+        self.read += beside.read_count;
+        self.read_ms += 1e3 * beside.read.as_secs_f64();
+        let warp = 1e3 * beside.warp.as_secs_f64();
+        let (warped, covered) = over(rendered, &beside);
+        let mut rgb8 = vec![rendered.rgb8.clone(), warped];
+        debug_assert_eq!((RENDERED, WARPED, FIRST_MODEL), (0, 1, rgb8.len()));
+        let mut repair_ms = vec![RepairMs::default(), RepairMs { warp, ..RepairMs::default() }];
+        for model in self.given.models {
+            let repaired = self.offline.repaired(model, &of, &beside);
+            let (pixels, times) = repaired.map_err(|cause| ReportError::Repair {
+                model: model.manifest().name.clone(),
+                camera: self.cameras[camera].name.clone(),
+                cause: Box::new(cause),
+            })?;
+            let roles = [InputRole::ReferenceWarped, InputRole::ReferenceValid];
+            let is_warped = roles.into_iter().any(|role| model.needs(role));
+            repair_ms.push(RepairMs {
+                warp: if is_warped { warp } else { 0.0 },
+                model: 1e3 * (times.fit + times.run).as_secs_f64(),
+                merge: 1e3 * times.merge.as_secs_f64(),
+            });
+            rgb8.push(pixels);
+        }
+        Ok(Shown { rgb8, repair_ms, covered })
+    }
+}
+
+/// The recorded images where they cover a rendered one, else that; and the share that they cover.
+fn over(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>, f64) {
+    let mut rgb8 = rendered.rgb8.clone();
+    let Some((warped, valid)) = beside.warped() else { return (rgb8, 0.0) };
+    let pixels = rgb8.chunks_exact_mut(3).zip(warped.rgb8.chunks_exact(3)).zip(valid);
+    let mut covered = 0;
+    for ((own, recorded), _) in pixels.filter(|(_, valid)| **valid > 0.0) {
+        own.copy_from_slice(recorded);
+        covered += 1;
+    }
+    (rgb8, f64::from(covered) / valid.len().max(1) as f64)
+}
+
+/// In dB, and at most [`EXACT_DB`].
+fn psnr_db(rgb8: &[u8], truth: &[u8]) -> f64 {
+    psnr_db_u8(rgb8.iter().zip(truth)).min(EXACT_DB)
+}
+
+fn mean_flip(rgb8: &[u8], truth: &[u8], size_px: [u32; 2]) -> f64 {
+    let [image, truth] = [rgb8, truth]
+        .map(|rgb8| rgb8.iter().map(|byte| f32::from(*byte) / 255.0).collect::<Vec<_>>());
+    let errors = flip(&image, &truth, size_px);
+    errors.iter().map(|error| f64::from(*error)).sum::<f64>() / errors.len().max(1) as f64
+}

@@ -1,0 +1,225 @@
+//! A row of the repair section: what a kind of image has at one distance from the drive.
+
+use serde::Serialize;
+
+use wildcity_render::compare::json_numbers::serialize_number;
+
+use crate::statistics::quantile;
+
+/// What is shown of a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ImageKind {
+    /// The twin as it is rendered.
+    Rendered,
+    /// The recorded images in the view where there are some, else the rendered one; no model.
+    Warped,
+    /// The rendered image, repaired by a model.
+    Model,
+}
+
+/// Times of one image, in milliseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct RepairMs {
+    /// To choose recorded images and bring them into the view.
+    pub warp: f64,
+    /// The model: its inputs, and its graph.
+    pub model: f64,
+    /// From its output to an image of 8 bits.
+    pub merge: f64,
+}
+
+impl RepairMs {
+    /// The sum.
+    pub fn total(&self) -> f64 {
+        self.warp + self.model + self.merge
+    }
+}
+
+/// One image of one kind.
+#[derive(Clone, Copy, Debug)]
+pub struct Sample {
+    /// Index of the distance from the drive.
+    pub offset: usize,
+    /// 0 rendered, 1 warped, then the models.
+    pub kind: usize,
+    /// Whether thresholds are selected by it; others verify them.
+    pub for_selection: bool,
+    /// Of the rendered image.
+    pub trust: f64,
+    /// Share of the pixels that recorded images cover.
+    pub covered: f64,
+    /// Time to render it: that of the step over the number of cameras.
+    pub render_ms: f64,
+    /// Time to repair it.
+    pub repair_ms: RepairMs,
+    /// In dB, against the true image; 110 at most.
+    pub psnr_db: Option<f64>,
+    /// More PSNR than the rendered image has.
+    pub gain_db: Option<f64>,
+    /// Mean FLIP.
+    pub flip: Option<f64>,
+    /// [`super::flicker`]; none if the earlier image shows nothing of this one.
+    pub flicker: Option<f64>,
+    /// That of the true images.
+    pub true_flicker: Option<f64>,
+}
+
+/// The PSNR of equal images, so that differences of PSNR stay numbers: 8 bits of 360 x 232 pixels that differ by one
+/// step in one value have 102 dB.
+pub(super) const EXACT_DB: f64 = 110.0;
+
+/// A model of the section.
+#[derive(Clone, Debug, Serialize)]
+pub struct RepairedModel {
+    /// Of its manifest.
+    pub name: String,
+    /// Of its manifest.
+    pub version: String,
+    /// Of its manifest.
+    pub licence: String,
+    /// BLAKE3 of all that decides its bytes.
+    pub repair_hash: String,
+    /// What computes.
+    pub provider: &'static str,
+    /// Whether it repeats its bytes.
+    pub deterministic: bool,
+}
+
+/// Means over all images of a kind at one distance; times are medians.
+#[derive(Clone, Debug, Serialize)]
+pub struct RepairRow {
+    /// Lateral distance from the drive, in metres.
+    pub offset_m: f64,
+    /// What is shown.
+    pub kind: ImageKind,
+    /// `rendered`, `warped`, or the model's name.
+    pub name: String,
+    /// How many images.
+    pub images: usize,
+    /// Of the rendered images.
+    pub trust: f64,
+    /// Share of pixels that recorded images cover.
+    pub covered: f64,
+    /// Time to render an image.
+    pub render_ms: f64,
+    /// Time to repair it, in parts.
+    pub repair_parts_ms: RepairMs,
+    /// Time to repair it.
+    pub repair_ms: f64,
+    /// Against the true images; none without them.
+    pub psnr_db: Option<f64>,
+    /// More than the rendered images. Below 0: it loses.
+    pub gain_db: Option<f64>,
+    /// Images that are worse than rendered.
+    pub worse: Option<usize>,
+    /// FLIP, from 0 to 1.
+    pub flip: Option<f64>,
+    /// Difference between an image and the one before it, brought into its view.
+    #[serde(serialize_with = "serialize_number")]
+    pub flicker: f64,
+    /// That, over the rendered images'. Stable below 1.1.
+    #[serde(serialize_with = "serialize_number")]
+    pub flicker_ratio: f64,
+    /// That of the true images.
+    pub true_flicker: Option<f64>,
+    /// Gain for 100 ms of repair; none for rendered images.
+    pub db_per_100_ms: Option<f64>,
+}
+
+impl RepairRow {
+    /// The row of the samples of a kind at one distance.
+    pub(super) fn new(
+        offset_m: f64,
+        kind: ImageKind,
+        name: String,
+        own: &[&Sample],
+        rendered: &[&Sample],
+    ) -> Self {
+        let median = |of: &dyn Fn(&Sample) -> f64| {
+            quantile(&own.iter().map(|sample| of(sample)).collect::<Vec<f64>>(), 0.5)
+        };
+        let repair_ms = median(&|sample| sample.repair_ms.total());
+        let flicker = mean(own, &|sample| sample.flicker).unwrap_or(f64::NAN);
+        let rendered_flicker = mean(rendered, &|sample| sample.flicker).unwrap_or(f64::NAN);
+        let gain_db = mean(own, &|sample| sample.gain_db);
+        let loses = |sample: &&&Sample| sample.gain_db.is_some_and(|gain_db| gain_db < 0.0);
+        let worse = gain_db.map(|_| own.iter().filter(loses).count());
+        Self {
+            offset_m,
+            kind,
+            name,
+            images: own.len(),
+            trust: mean(own, &|sample| Some(sample.trust)).unwrap_or(f64::NAN),
+            covered: mean(own, &|sample| Some(sample.covered)).unwrap_or(f64::NAN),
+            render_ms: median(&|sample| sample.render_ms),
+            repair_parts_ms: RepairMs {
+                warp: median(&|sample| sample.repair_ms.warp),
+                model: median(&|sample| sample.repair_ms.model),
+                merge: median(&|sample| sample.repair_ms.merge),
+            },
+            repair_ms,
+            psnr_db: mean(own, &|sample| sample.psnr_db),
+            gain_db,
+            worse,
+            flip: mean(own, &|sample| sample.flip),
+            flicker,
+            flicker_ratio: flicker / rendered_flicker,
+            true_flicker: mean(own, &|sample| sample.true_flicker),
+            db_per_100_ms: gain_db
+                .filter(|_| kind != ImageKind::Rendered && repair_ms > 0.0)
+                .map(|gain_db| 100.0 * gain_db / repair_ms),
+        }
+    }
+}
+
+/// The mean of the values that there are; `None` without any.
+fn mean(samples: &[&Sample], of: &dyn Fn(&Sample) -> Option<f64>) -> Option<f64> {
+    let values: Vec<f64> = samples.iter().filter_map(|sample| of(sample)).collect();
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample(gain_db: f64, model_ms: f64, flicker: f64) -> Sample {
+        Sample {
+            offset: 1,
+            kind: 2,
+            for_selection: true,
+            trust: 0.5,
+            covered: 0.75,
+            render_ms: 10.0,
+            repair_ms: RepairMs { warp: 5.0, model: model_ms, merge: 1.0 },
+            psnr_db: Some(20.0 + gain_db),
+            gain_db: Some(gain_db),
+            flip: Some(0.1),
+            flicker: Some(flicker),
+            true_flicker: None,
+        }
+    }
+
+    #[test]
+    fn a_row_has_means_medians_and_the_gain_for_its_time() {
+        let rendered = sample(0.0, 0.0, 0.02);
+        let own = [sample(2.0, 44.0, 0.03), sample(-0.5, 34.0, 0.01), sample(3.0, 500.0, 0.02)];
+        let own: Vec<&Sample> = own.iter().collect();
+        let name = "net".to_owned();
+        let row = RepairRow::new(1.0, ImageKind::Model, name, &own, &[&rendered]);
+        assert_eq!((row.images, row.worse), (3, Some(1)), "a loss is counted");
+        assert!((row.gain_db.unwrap() - 1.5).abs() < 1e-12);
+        assert_eq!((row.repair_ms, row.repair_parts_ms.model), (50.0, 44.0));
+        assert!((row.db_per_100_ms.unwrap() - 3.0).abs() < 1e-12);
+        assert!((row.flicker_ratio - 1.0).abs() < 1e-12);
+        assert_eq!(row.true_flicker, None);
+    }
+
+    #[test]
+    fn without_a_true_image_there_is_no_gain_and_no_loss() {
+        let blind = Sample { psnr_db: None, gain_db: None, flip: None, ..sample(0.0, 1.0, 0.1) };
+        let row = RepairRow::new(1.0, ImageKind::Warped, "warped".into(), &[&blind], &[&blind]);
+        assert_eq!((row.psnr_db, row.gain_db, row.worse), (None, None, None));
+        assert_eq!((row.flip, row.db_per_100_ms), (None, None));
+    }
+}
