@@ -105,7 +105,8 @@ impl Boxes {
         let mut tracks: BTreeMap<String, Vec<Row>> = BTreeMap::new();
         for (at, text) in text.lines().enumerate().filter(|(_, text)| !text.trim().is_empty()) {
             let wrong = |reason: String| BoxesError::Line { line: at + 1, reason };
-            let line: Line = serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
+            let line: Line =
+                serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
             if let Some(side) = line.size.iter().find(|side| !(0.0..=LARGEST_M).contains(*side)) {
                 return Err(wrong(format!("size has {side:?}; 0 to {LARGEST_M} m")));
             }

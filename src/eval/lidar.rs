@@ -59,7 +59,9 @@ pub enum LidarError {
         must: &'static str,
     },
     /// A matrix is no rigid transform.
-    #[error("{name}[{index}] is no pose: {reason}; give rotation and translation in metres, last row 0 0 0 1")]
+    #[error(
+        "{name}[{index}] is no pose: {reason}; give rotation and translation in metres, last row 0 0 0 1"
+    )]
     Pose {
         /// The tensor.
         name: &'static str,
@@ -72,7 +74,9 @@ pub enum LidarError {
     #[error("pose_time_us[{0}] is not after the one before it")]
     Time(usize),
     /// There is no pose to bring points into the world with.
-    #[error("there is no pose of the vehicle: give pose_time_us and world_from_rig in the file, or a twin with a drive")]
+    #[error(
+        "there is no pose of the vehicle: give pose_time_us and world_from_rig in the file, or a twin with a drive"
+    )]
     NoPoses,
 }
 
@@ -414,7 +418,8 @@ fn floats(
 ) -> Result<Option<Vec<f64>>, LidarError> {
     let Ok(tensor) = file.tensor(name) else { return Ok(None) };
     let own = tensor.shape();
-    let agrees = |(own, wanted): (&usize, &Option<usize>)| wanted.is_none_or(|wanted| wanted == *own);
+    let agrees =
+        |(own, wanted): (&usize, &Option<usize>)| wanted.is_none_or(|wanted| wanted == *own);
     let is_shape = own.len() == shape.len() && own.iter().zip(shape).all(agrees);
     let values = match tensor.dtype() {
         Dtype::F64 => wide(tensor.data()),
@@ -423,7 +428,8 @@ fn floats(
     };
     if !is_shape || values.len() != own.iter().product::<usize>() {
         let found = format!("{:?} {own:?}", tensor.dtype());
-        let must = "points_m is [n, 3], rig_from_lidar [4, 4], world_from_rig [m, 4, 4], of f32 or f64";
+        let must =
+            "points_m is [n, 3], rig_from_lidar [4, 4], world_from_rig [m, 4, 4], of f32 or f64";
         return Err(LidarError::Tensor { name, found, must });
     }
     Ok(Some(values))

@@ -7,7 +7,9 @@ use glam::DVec3;
 use wildcity_eval::{ExtrapolatedView, Extrapolation, Reprojection, ViewScores, flicker, jpeg};
 use wildcity_render::View;
 use wildcity_repair::Image;
-use wildcity_repair::reference::{Projection, Rays, Reference, WarpTarget, Warped, opaque_depth, warp};
+use wildcity_repair::reference::{
+    Projection, Rays, Reference, WarpTarget, Warped, opaque_depth, warp,
+};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::RenderedImage;
@@ -30,7 +32,11 @@ impl std::str::FromStr for Offsets {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let must = || format!("expected 1 to {MOST} distances in metres, such as 1,3,5: at most {FARTHEST_M}, not 0");
+        let must = || {
+            format!(
+                "expected 1 to {MOST} distances in metres, such as 1,3,5: at most {FARTHEST_M}, not 0"
+            )
+        };
         let offset = |text: &str| text.trim().parse::<f64>().map_err(|_| must());
         let offsets = text.split(',').map(offset).collect::<Result<Vec<f64>, String>>()?;
         let is_offset = |offset: &f64| *offset != 0.0 && offset.abs() <= FARTHEST_M;
@@ -94,7 +100,8 @@ struct Lens {
 
 impl Beside {
     pub(super) fn new(offsets: &Offsets) -> Self {
-        let line = |offset_m: &f64| Line { offset_m: *offset_m, views: Vec::new(), pictures: Vec::new() };
+        let line =
+            |offset_m: &f64| Line { offset_m: *offset_m, views: Vec::new(), pictures: Vec::new() };
         Self(offsets.0.iter().map(line).collect())
     }
 
@@ -136,7 +143,8 @@ impl Line {
         let moved_m = self.offset_m * place.left();
         let now = draw(tools, image, place, &|pose| moved(pose, moved_m))?;
         let step = place.step_back();
-        let before = step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m)));
+        let before =
+            step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m)));
         let before = before.transpose()?;
 
         // The geometry is that of what was rendered, also for the repaired pixels.
@@ -215,13 +223,7 @@ fn draw(
 }
 
 /// Brings pixels of one view into another by the depths that were rendered of both.
-fn into(
-    lens: &Lens,
-    view: &View,
-    rendered: &RenderedImage,
-    from: &Drawn,
-    rgb8: Vec<u8>,
-) -> Warped {
+fn into(lens: &Lens, view: &View, rendered: &RenderedImage, from: &Drawn, rgb8: Vec<u8>) -> Warped {
     let depth_m = opaque_depth(&rendered.depth_m, &rendered.opacity);
     let [width, height] = [view.camera.width_px, view.camera.height_px].map(|side| side as usize);
     let reference = Reference {

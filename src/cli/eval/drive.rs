@@ -41,7 +41,11 @@ impl Drives {
     ///
     /// A camera of the twin's rig, by its name, says where the rig is. For another camera, the rig has the heading of the
     /// drive, and is as far beside it as the camera.
-    pub(super) fn place(&self, camera_name: &str, world_from_camera: &Pose) -> Option<DrivePlace<'_>> {
+    pub(super) fn place(
+        &self,
+        camera_name: &str,
+        world_from_camera: &Pose,
+    ) -> Option<DrivePlace<'_>> {
         let manifest = &self.version.manifest;
         let cameras = manifest.rig.iter().flat_map(|rig| &rig.cameras);
         let mounted = cameras.into_iter().find(|camera| camera.name == camera_name);

@@ -2,6 +2,8 @@
 
 mod beside;
 mod drive;
+mod labels;
+mod networks;
 mod renderer;
 mod repairer;
 
@@ -11,8 +13,8 @@ use std::path::PathBuf;
 use anyhow::{Context, ensure};
 
 use wildcity_eval::{
-    EvaluatedImage, Evaluation, Extrapolation, Gain, Means, Pair, PairScores, ScoreMeans, Subject,
-    Thumbnails,
+    EvaluatedImage, Evaluation, Extrapolation, Gain, LidarMeans, Means, Pair, PairScores,
+    ScoreMeans, Subject, Thumbnails,
 };
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
@@ -23,6 +25,8 @@ use wildcity_session::RenderedImage;
 
 use self::beside::{Beside, BesideImage, Offsets, OnDrive, Tools};
 use self::drive::Drives;
+use self::labels::{LabelOptions, Labels};
+use self::networks::{FeatureSet, NetworkOptions, Networks};
 use self::renderer::{Maps, Renderer, covered};
 use self::repairer::{PlacedImage, Repairer, RepairerOptions};
 use super::backend_options::BackendOptions;
@@ -102,6 +106,12 @@ pub(super) struct Eval {
     extrapolate: Option<Offsets>,
 
     #[command(flatten)]
+    labels: LabelOptions,
+
+    #[command(flatten)]
+    networks: NetworkOptions,
+
+    #[command(flatten)]
     repairer: RepairerOptions,
 
     #[command(flatten)]
@@ -128,6 +138,17 @@ struct Setup {
     repairer: Option<Repairer>,
     /// Of a twin that has some.
     drives: Option<Drives>,
+    labels: Labels,
+    networks: Networks,
+}
+
+/// Features of all images, if a network computes them.
+#[derive(Default)]
+struct Features {
+    truth: Vec<Vec<f32>>,
+    images: FeatureSet,
+    /// Distance by distance beside the drive.
+    beside: Vec<FeatureSet>,
 }
 
 /// An image that was compared, for what comes after it.
@@ -137,6 +158,7 @@ struct Compared {
     profile: RenderProfile,
     truth: Vec<u8>,
     rendered: RenderedImage,
+    repaired: Option<Vec<u8>>,
     counts: Option<Vec<bool>>,
     camera_name: String,
 }
@@ -165,23 +187,31 @@ impl Eval {
         );
         let maps = Maps {
             depth: self.extrapolate.is_some()
+                || self.labels.needs_depth()
                 || repairer.as_ref().is_some_and(Repairer::needs_depth),
             normals: repairer.as_ref().is_some_and(Repairer::needs_normals),
         };
         let renderer = Renderer { source, own_profile, changes, backend, alignment, maps };
-        let setup = Setup { renderer, repairer, drives };
+        let real: Vec<&RealImage> = images.iter().map(|(image, _)| *image).collect();
+        let labels = self.labels.load(&renderer.source, &renderer.alignment, &real)?;
+        let networks = self.networks.load(&self.repairer.load_options())?;
+        let setup = Setup { renderer, repairer, drives, labels, networks };
         let profile = setup.renderer.profile(None)?;
         output::create_dir(&self.out)?;
         let bar = progress::count("comparing");
         bar.set_length(images.len() as u64);
         let mut evaluated: Vec<EvaluatedImage> = Vec::with_capacity(images.len());
         let mut beside = self.extrapolate.as_ref().map(Beside::new);
+        let mut features = Features::default();
         for (at, (image, camera_name)) in images.iter().enumerate() {
             let about = || format!("image {}", image.name);
             let compared = self.evaluate(&setup, image, camera_name).with_context(about)?;
+            features.add(&setup.networks, &compared).with_context(about)?;
             if let Some(beside) = &mut beside {
                 let is_shown = at == images.len() / 2;
-                self.look_beside(&setup, beside, &compared, image, is_shown).with_context(about)?;
+                let drawn = self.look_beside(&setup, beside, &compared, image, is_shown);
+                let drawn = drawn.with_context(about)?;
+                features.add_beside(&setup.networks, &compared, &drawn).with_context(about)?;
             }
             evaluated.push(compared.scores);
             self.forget_better_pictures(&mut evaluated);
@@ -190,6 +220,10 @@ impl Eval {
         bar.finish_and_clear();
         let mut evaluation = Evaluation::new(self.subject(&setup, profile), evaluated);
         evaluation.extrapolation = beside.map(Beside::finish).unwrap_or_default();
+        evaluation.kid = setup.networks.kid(&features.images, &features.truth)?;
+        for (line, set) in evaluation.extrapolation.iter_mut().zip(&features.beside) {
+            line.kid = setup.networks.kid(set, &features.truth)?;
+        }
         self.write(&evaluation)
     }
 
@@ -211,21 +245,35 @@ impl Eval {
         image: &RealImage,
         camera_name: &str,
     ) -> anyhow::Result<Compared> {
-        let Setup { renderer, repairer, drives } = setup;
+        let Setup { renderer, repairer, drives, labels, networks } = setup;
         let profile = renderer.profile(image.near)?;
         let (truth, camera) = picture::real(&image.file, &image.camera, profile.background)?;
         let size_px = [camera.width_px, camera.height_px];
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
         let mut rendered = renderer.render(&view, &profile)?;
-        let counts = counted(&view, mask);
+        let mut counts = counted(&view, mask);
+        let hidden = labels.hide(image, &view, &renderer.alignment);
+        let moving = hidden.as_ref().map(|(_, share)| *share);
+        if let Some((still, _)) = hidden {
+            if self.save_images {
+                self.save_mask(&image.name, &still, size_px)?;
+            }
+            let counts = counts.get_or_insert_with(|| vec![true; still.len()]);
+            counts.iter_mut().zip(still).for_each(|(counts, still)| *counts &= still);
+        }
         let covered = covered(&rendered);
+        let lpips = |rgb8: &[u8]| networks.lpips(size_px, rgb8, &truth, counts.as_deref());
         let pair = Pair::new(size_px, truth.clone(), rendered.rgb8.clone(), counts.clone())?;
-        let compared = PairScores::of(&pair, self.align_exposure);
+        let mut compared = PairScores::of(&pair, self.align_exposure);
+        compared.scores.lpips = lpips(&rendered.rgb8)?;
         if self.save_images {
             self.save(&image.name, ["rendered", "errors"], &pair, &compared.error_map)?;
         }
         let mut scores = EvaluatedImage::new(image.name.clone(), size_px, covered, &compared);
+        scores.moving = moving;
+        scores.lidar = labels.depth(image, &view, &rendered, counts.as_deref());
+        let mut repaired_rgb8 = None;
         let mut thumbnails =
             Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
         if let Some(repairer) = repairer {
@@ -244,10 +292,17 @@ impl Eval {
                 profile: &profile,
             };
             let repaired = repairer.repair(renderer, &placed)?;
-            let pair = Pair::new(size_px, truth.clone(), repaired, counts.clone())?;
-            let compared = PairScores::of(&pair, self.align_exposure);
+            let pair = Pair::new(size_px, truth.clone(), repaired.clone(), counts.clone())?;
+            let mut compared = PairScores::of(&pair, self.align_exposure);
+            compared.scores.lpips = lpips(&repaired)?;
+            repaired_rgb8 = Some(repaired);
             if self.save_images {
-                self.save(&image.name, ["repaired", "repaired_errors"], &pair, &compared.error_map)?;
+                self.save(
+                    &image.name,
+                    ["repaired", "repaired_errors"],
+                    &pair,
+                    &compared.error_map,
+                )?;
             }
             scores.repaired = Some(compared.scored());
             let with = thumbnails.with_repaired(&pair, &compared.error_map);
@@ -255,7 +310,8 @@ impl Eval {
         }
         scores.thumbnails = Some(thumbnails);
         let camera_name = camera_name.to_owned();
-        Ok(Compared { scores, view, profile, truth, rendered, counts, camera_name })
+        let repaired = repaired_rgb8;
+        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera_name })
     }
 
     /// Draws the views beside the drive that belong to an image.
@@ -266,8 +322,8 @@ impl Eval {
         compared: &Compared,
         image: &RealImage,
         is_shown: bool,
-    ) -> anyhow::Result<()> {
-        let Some(drives) = &setup.drives else { return Ok(()) };
+    ) -> anyhow::Result<Vec<BesideImage>> {
+        let Some(drives) = &setup.drives else { return Ok(Vec::new()) };
         let repairer = setup.repairer.as_ref();
         let tools = Tools { renderer: &setup.renderer, repairer, drives };
         let on_drive = OnDrive {
@@ -282,16 +338,16 @@ impl Eval {
         };
         let drawn = beside.add(tools, &on_drive)?;
         let offsets = self.extrapolate.iter().flat_map(|offsets| &offsets.0);
-        for (offset_m, BesideImage { rendered, repaired }) in offsets.zip(drawn) {
+        for (offset_m, BesideImage { rendered, repaired }) in offsets.zip(&drawn) {
             if self.save_images {
                 let name = format!("{offset_m}m/{}", image.name);
-                self.save_pixels("beside", &name, &rendered, &compared.view)?;
+                self.save_pixels("beside", &name, rendered, &compared.view)?;
                 if let Some(repaired) = repaired {
-                    self.save_pixels("beside_repaired", &name, &repaired, &compared.view)?;
+                    self.save_pixels("beside_repaired", &name, repaired, &compared.view)?;
                 }
             }
         }
-        Ok(())
+        Ok(drawn)
     }
 
     /// Keeps the pictures of the worst images only, so that memory does not grow with the number of images.
@@ -332,6 +388,19 @@ impl Eval {
         self.save_file(folder, name, &file.map_err(anyhow::Error::msg)?)
     }
 
+    /// White where nothing moves, as `--masks` takes it.
+    fn save_mask(
+        &self,
+        name: &str,
+        still: &[bool],
+        [width, height]: [u32; 2],
+    ) -> anyhow::Result<()> {
+        let rgb8: Vec<u8> =
+            still.iter().flat_map(|still| [if *still { 255 } else { 0 }; 3]).collect();
+        let file = wildcity_session::png(&rgb8, width, height);
+        self.save_file("masks", name, &file.map_err(anyhow::Error::msg)?)
+    }
+
     fn save_file(&self, folder: &str, name: &str, png: &[u8]) -> anyhow::Result<()> {
         let path = self.out.join(folder).join(picture::inside(name)).with_extension("png");
         output::create_dir(path.parent().unwrap_or(&self.out))?;
@@ -351,9 +420,9 @@ impl Eval {
             backend: renderer.backend.name(),
             profile,
             repair: setup.repairer.as_ref().map(Repairer::subject),
-            lpips_network: None,
-            boxes: None,
-            lidar: None,
+            lpips_network: setup.networks.lpips_name(),
+            boxes: setup.labels.boxes_subject.clone(),
+            lidar: setup.labels.lidar_subject.clone(),
         }
     }
 
@@ -369,6 +438,19 @@ impl Eval {
         }
         let mut out = io::stdout().lock();
         print_means(&mut out, &evaluation.all)?;
+        if let Some(kid) = &evaluation.kid {
+            let after =
+                kid.repaired.map_or(String::new(), |kid| format!(", repaired {:.5}", kid.mean));
+            writeln!(out, "KID by {}: {:.5}{after}", kid.network, kid.rendered.mean)?;
+        }
+        if let Some((_, skipped)) =
+            evaluation.subject.lidar.as_ref().filter(|(_, skipped)| *skipped > 0)
+        {
+            writeln!(
+                out,
+                "{skipped} LiDAR points were left out: no two poses at most 0.2 s apart are around their time"
+            )?;
+        }
         for one in &evaluation.extrapolation {
             print_beside(&mut out, one)?;
         }
@@ -377,6 +459,37 @@ impl Eval {
         }
         for (name, _) in &files {
             writeln!(out, "{}", self.out.join(name).display())?;
+        }
+        Ok(())
+    }
+}
+
+impl Features {
+    fn add(&mut self, networks: &Networks, compared: &Compared) -> anyhow::Result<()> {
+        let camera = &compared.view.camera;
+        let size_px = [camera.width_px, camera.height_px];
+        self.truth.extend(networks.features(size_px, &compared.truth)?);
+        self.images.rendered.extend(networks.features(size_px, &compared.rendered.rgb8)?);
+        if let Some(repaired) = &compared.repaired {
+            self.images.repaired.extend(networks.features(size_px, repaired)?);
+        }
+        Ok(())
+    }
+
+    fn add_beside(
+        &mut self,
+        networks: &Networks,
+        compared: &Compared,
+        drawn: &[BesideImage],
+    ) -> anyhow::Result<()> {
+        let camera = &compared.view.camera;
+        let size_px = [camera.width_px, camera.height_px];
+        self.beside.resize_with(drawn.len(), FeatureSet::default);
+        for (set, image) in self.beside.iter_mut().zip(drawn) {
+            set.rendered.extend(networks.features(size_px, &image.rendered)?);
+            if let Some(repaired) = &image.repaired {
+                set.repaired.extend(networks.features(size_px, repaired)?);
+            }
         }
         Ok(())
     }
@@ -396,6 +509,13 @@ fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()> {
     if let Some(repaired) = &means.repaired {
         print_scores(out, "repaired", repaired)?;
     }
+    if let Some(lidar) = &means.lidar {
+        let LidarMeans { points, mean_m, median_m, .. } = lidar;
+        writeln!(
+            out,
+            "depth against {points} LiDAR points: mean {mean_m:.3} m, median {median_m:.3} m"
+        )?;
+    }
     if let Some(gain) = &means.gain {
         let Gain { psnr_db, ssim, flip, .. } = gain;
         writeln!(out, "gain: PSNR {psnr_db:+.2} dB, SSIM {ssim:+.4}, FLIP {flip:+.4}")?;
@@ -410,6 +530,9 @@ fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Res
         out,
         "{what}: PSNR {psnr}, SSIM {ssim:.4} (mirrored edges: {ssim_mirrored:.4}), FLIP {flip:.4}"
     )?;
+    if let Some(lpips) = means.lpips {
+        writeln!(out, "  LPIPS {lpips:.4}")?;
+    }
     if let Some(aligned) = &means.aligned {
         let psnr = decibels(aligned.psnr_db);
         writeln!(out, "with aligned exposure: PSNR {psnr}, SSIM {:.4}", aligned.ssim)?;
@@ -419,7 +542,11 @@ fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Res
 
 fn print_beside(out: &mut impl Write, one: &Extrapolation) -> io::Result<()> {
     let Extrapolation { offset_m, trust, covered, .. } = one;
-    writeln!(out, "{offset_m} m beside the drive: trust {trust:.2}, covered {:.1} %", 100.0 * covered)?;
+    writeln!(
+        out,
+        "{offset_m} m beside the drive: trust {trust:.2}, covered {:.1} %",
+        100.0 * covered
+    )?;
     let means = [("rendered", Some(&one.rendered)), ("repaired", one.repaired.as_ref())];
     for (what, means) in means {
         let Some(means) = means else { continue };

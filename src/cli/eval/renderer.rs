@@ -45,7 +45,8 @@ impl Renderer {
         let views = [*view];
         let scene = self.source.scene(&views, profile)?;
         let pixels = view.camera.pixels();
-        let map = |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
+        let map =
+            |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
         let mut image = RenderedImage {
             rgb8: vec![0; 3 * pixels],
             depth_m: map(self.maps.depth, 1),

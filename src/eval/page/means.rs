@@ -93,7 +93,8 @@ fn gains(gain: &Gain, columns: Columns) -> Markup {
 /// The distances of features, if there are some.
 pub(super) fn kid(evaluation: &Evaluation) -> Markup {
     let Some(kid) = &evaluation.kid else { return html! {} };
-    let text = |kid: &Kid| format!("{:.5} (standard deviation {:.5})", kid.mean, kid.standard_deviation);
+    let text =
+        |kid: &Kid| format!("{:.5} (standard deviation {:.5})", kid.mean, kid.standard_deviation);
     let Kid { subsets, subset_size, seed, .. } = kid.rendered;
     html! {
         p {
