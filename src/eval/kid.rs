@@ -10,13 +10,13 @@ use super::mean::mean_of;
 use wildcity_render::compare::json_numbers::serialize_number;
 
 /// Number of subsets, if the sets are larger than one.
-pub const SUBSETS: usize = 100;
+pub(crate) const SUBSETS: usize = 100;
 
 /// Images of each set in a subset, at most.
-pub const SUBSET_SIZE: usize = 1000;
+pub(crate) const SUBSET_SIZE: usize = 1000;
 
 /// Seed of the choice of the subsets.
-pub const SEED: u64 = 2018;
+pub(crate) const SEED: u64 = 2018;
 
 /// The distance of two sets of images.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

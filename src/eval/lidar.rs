@@ -16,13 +16,13 @@ use wildcity_scene::geometry::{Camera, Pose, PoseError};
 use wildcity_scene::trajectory::Keyframe;
 
 /// Poses are interpolated if they are at most so far apart, in microseconds.
-pub const LARGEST_GAP_US: i64 = 200_000;
+pub(crate) const LARGEST_GAP_US: i64 = 200_000;
 
 /// Of points within this distance on the image the nearest counts, in pixels.
-pub const SAME_PX: f64 = 2.0;
+pub(crate) const SAME_PX: f64 = 2.0;
 
 /// Pixels with less opacity have no depth.
-pub const LEAST_OPACITY: f32 = 0.5;
+pub(crate) const LEAST_OPACITY: f32 = 0.5;
 
 /// Limits of the bins of depth, in metres. Points beyond the last do not count.
 pub const BINS_M: [f64; 4] = [0.0, 10.0, 30.0, 80.0];
