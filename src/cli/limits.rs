@@ -26,3 +26,6 @@ pub(super) const REPORT_WINDOW_PX: i64 = 256;
 
 /// Most Gaussians of a street of `wildcity bench gpu`: each takes 200 B while the street is made.
 pub(super) const BENCH_GAUSSIANS: i64 = 100_000_000;
+
+/// Largest file of boxes or LiDAR points: an hour of a LiDAR of 64 rows is 20 GB, of which one reads some minutes.
+pub(super) const LABEL_BYTES: u64 = 4 << 30;

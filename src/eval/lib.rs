@@ -5,7 +5,15 @@
 //! pair            a real image, a rendered one, and the pixels that count
 //! exposure        the best affine change of each channel
 //! scores          PSNR, SSIM and FLIP of a pair, and the map of its errors
-//! evaluation      the scores of all images, their means, CSV
+//! boxes           boxes around what moves, and the pixels that they hide
+//! lidar           points of a LiDAR in the world, and rendered depth against them
+//! reprojection    a view beside the drive, brought back onto a real image
+//! flicker         what changes from one view to the next
+//! extrapolation   the views at one distance from the drive
+//! kid             the distance of two sets of images by features of a network
+//! evaluated_image the scores of one image
+//! evaluation      the scores of all images
+//! means, csv      their means; the images as CSV
 //! thumbnails      small pictures of a pair
 //! page            the HTML page
 //! ```
@@ -14,16 +22,36 @@
 //! compared in 8 bits, as agents get them and as files hold them. So other programs compute the same numbers from the
 //! files.
 
+mod boxes;
+mod csv;
+mod evaluated_image;
 mod evaluation;
 mod exposure;
+mod extrapolation;
+mod flicker;
+mod kid;
+mod lidar;
+mod mean;
+mod means;
 mod page;
 mod pair;
+mod reprojection;
 mod scores;
 mod thumbnails;
 
-pub use evaluation::{AlignedMeans, CameraMeans, EvaluatedImage, Evaluation, Means, Subject};
+pub use boxes::{Boxes, BoxesError, GROWN_PX, MOVES_M_PER_S, MovingBox, hide};
+pub use evaluated_image::EvaluatedImage;
+pub use evaluation::{Evaluation, RepairSubject, Subject};
 pub use exposure::Exposure;
+pub use extrapolation::{ExtrapolatedView, Extrapolation, ViewMeans, ViewScores};
+pub use flicker::flicker;
+pub use kid::{Kid, KidError, KidScores};
+pub use lidar::{
+    BINS_M, DepthMap, LidarBin, LidarDepth, LidarError, LidarMeans, LidarPoints, WorldPoints,
+};
+pub use means::{AlignedMeans, CameraMeans, Gain, Means, ScoreMeans};
 pub use page::render as page;
 pub use pair::{Pair, PairError};
-pub use scores::{AlignedScores, PairScores, Scores};
-pub use thumbnails::{Thumbnails, error_png};
+pub use reprojection::Reprojection;
+pub use scores::{AlignedScores, PairScores, Scored, Scores};
+pub use thumbnails::{Thumbnails, error_png, jpeg};

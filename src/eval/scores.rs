@@ -24,6 +24,9 @@ pub struct Scores {
     /// Mean of LDR-FLIP over the pixels that count. Masked pixels are replaced by the real image before.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
+    /// Distance of the two images by a network that the user gave; `None` if none was.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
     /// Share of the pixels that count, from 0 to 1.
     pub counted: f64,
     /// The same after the best change of exposure.
@@ -42,6 +45,20 @@ pub struct AlignedScores {
     pub ssim: f64,
     /// The change.
     pub exposure: Exposure,
+}
+
+/// Scores, and what means over the pixels of several images need.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Scored {
+    /// The scores.
+    #[serde(flatten)]
+    pub scores: Scores,
+    /// Sum of the squared errors of all values that count, from 0 to 1 each.
+    #[serde(skip)]
+    pub(super) squared_error: f64,
+    /// Number of these values.
+    #[serde(skip)]
+    pub(super) values: u64,
 }
 
 /// The scores of a pair, and what else comes out of comparing it.
@@ -74,10 +91,17 @@ impl PairScores {
             ssim: ssim.within,
             ssim_mirrored: ssim.mirrored,
             flip: error_sum / (values / 3) as f64,
+            lpips: None,
             counted: pair.counted_share(),
             aligned: align.then(|| aligned(pair, &truth)),
         };
         Self { scores, error_map, squared_error, values }
+    }
+
+    /// Without the map.
+    pub fn scored(&self) -> Scored {
+        let &Self { scores, squared_error, values, .. } = self;
+        Scored { scores, squared_error, values }
     }
 }
 

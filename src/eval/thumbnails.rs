@@ -22,6 +22,8 @@ const UNCOUNTED_RGB: [u8; 3] = [120, 120, 120];
 pub struct Thumbnails {
     /// The real image, the rendered one, and the map of their errors.
     pub files: [Vec<u8>; 3],
+    /// The repaired image, and the map of its errors, if there is one.
+    pub repaired: Option<[Vec<u8>; 2]>,
 }
 
 impl Thumbnails {
@@ -30,27 +32,44 @@ impl Thumbnails {
     /// # Errors
     /// The encoder's message.
     pub fn of(pair: &Pair, error_map: &[f32]) -> Result<Self, String> {
-        let picture = |rgb8: Vec<u8>| -> Result<Vec<u8>, String> {
-            let picture = picture(rgb8, pair.size_px())?;
-            let small = match picture.width() > WIDTH_PX {
-                true => {
-                    let height = (picture.height() * WIDTH_PX).div_ceil(picture.width());
-                    imageops::resize(&picture, WIDTH_PX, height, FilterType::Triangle)
-                }
-                false => picture,
-            };
-            let mut file = Vec::new();
-            let encoder = JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY);
-            small.write_with_encoder(encoder).map_err(|error| error.to_string())?;
-            Ok(file)
-        };
+        let size_px = pair.size_px();
         let files = [
-            picture(pair.truth().to_vec())?,
-            picture(pair.rendered().to_vec())?,
-            picture(colors(pair, error_map))?,
+            jpeg(pair.truth(), size_px)?,
+            jpeg(pair.rendered(), size_px)?,
+            jpeg(&colors(pair, error_map), size_px)?,
         ];
-        Ok(Self { files })
+        Ok(Self { files, repaired: None })
     }
+
+    /// With the repaired image in a pair of its own.
+    ///
+    /// # Errors
+    /// The encoder's message.
+    pub fn with_repaired(mut self, pair: &Pair, error_map: &[f32]) -> Result<Self, String> {
+        let size_px = pair.size_px();
+        let errors = jpeg(&colors(pair, error_map), size_px)?;
+        self.repaired = Some([jpeg(pair.rendered(), size_px)?, errors]);
+        Ok(self)
+    }
+}
+
+/// A picture, `[height, width, 3]`, as a JPEG file of at most 480 px of width.
+///
+/// # Errors
+/// The encoder's message.
+pub fn jpeg(rgb8: &[u8], size_px: [u32; 2]) -> Result<Vec<u8>, String> {
+    let picture = picture(rgb8.to_vec(), size_px)?;
+    let small = match picture.width() > WIDTH_PX {
+        true => {
+            let height = (picture.height() * WIDTH_PX).div_ceil(picture.width());
+            imageops::resize(&picture, WIDTH_PX, height, FilterType::Triangle)
+        }
+        false => picture,
+    };
+    let mut file = Vec::new();
+    let encoder = JpegEncoder::new_with_quality(&mut file, JPEG_QUALITY);
+    small.write_with_encoder(encoder).map_err(|error| error.to_string())?;
+    Ok(file)
 }
 
 /// The map of a pair's errors as a PNG file in full size.

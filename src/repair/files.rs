@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use crate::error::RepairError;
 use crate::limits::{MAX_MANIFEST_BYTES, MAX_MODEL_BYTES};
-use crate::manifest::Manifest;
+use crate::manifest::{Manifest, ModelFile};
 
 /// A manifest and the bytes that it names.
 pub(crate) struct ModelFiles {
@@ -28,16 +28,27 @@ pub(crate) struct GraphFiles {
 
 /// Reads a manifest alone.
 pub(crate) fn read_manifest(path: &Path) -> Result<Manifest, RepairError> {
-    Manifest::parse(&read_at_most(path, MAX_MANIFEST_BYTES)?, path)
+    Manifest::parse(&read_text(path)?, path)
+}
+
+/// The text of a manifest.
+pub(crate) fn read_text(path: &Path) -> Result<Vec<u8>, RepairError> {
+    read_at_most(path, MAX_MANIFEST_BYTES)
 }
 
 pub(crate) fn read(path: &Path) -> Result<ModelFiles, RepairError> {
-    let manifest_bytes = read_at_most(path, MAX_MANIFEST_BYTES)?;
+    let manifest_bytes = read_text(path)?;
     let manifest = Manifest::parse(&manifest_bytes, path)?;
+    let graph = read_graph(path, &manifest.files)?;
+    Ok(ModelFiles { manifest, manifest_bytes, graph })
+}
+
+/// The files that a manifest at `path` pins: the .onnx file, then external weights. There is at least one.
+pub(crate) fn read_graph(path: &Path, files: &[ModelFile]) -> Result<GraphFiles, RepairError> {
     let folder = path.parent().unwrap_or(Path::new(""));
     let mut contents = Vec::new();
     let mut left = MAX_MODEL_BYTES;
-    for (at, file) in manifest.files.iter().enumerate() {
+    for (at, file) in files.iter().enumerate() {
         let path = folder.join(&file.path);
         let bytes = read_at_most(&path, left)?;
         left -= bytes.len() as u64;
@@ -55,8 +66,7 @@ pub(crate) fn read(path: &Path) -> Result<ModelFiles, RepairError> {
     }
     let (name, bytes) = contents.remove(0);
     let weights = contents.into_iter().map(|(name, bytes)| (name, bytes.into())).collect();
-    let graph = GraphFiles { path: folder.join(name), bytes, weights };
-    Ok(ModelFiles { manifest, manifest_bytes, graph })
+    Ok(GraphFiles { path: folder.join(name), bytes, weights })
 }
 
 fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {

@@ -22,6 +22,7 @@
 //! | `runner`, `probe`, `fitted` | runs of the graph; what they show at load; the size in which it sees an image |
 //! | `model` | all of it in order |
 //! | `models` | the models that a program offers by name, each loaded when it is first asked for |
+//! | `network` | networks that measure images: a distance of two, or features of one |
 //! | `select` | which views of a step are repaired, by trust |
 //! | [`mod@reference`] | recorded images brought into a view by its depth |
 
@@ -35,6 +36,7 @@ mod manifest;
 mod merge;
 mod model;
 mod models;
+mod network;
 mod onnx;
 mod planes;
 mod probe;
@@ -56,5 +58,6 @@ pub use manifest::{
 };
 pub use model::{LoadOptions, Model, RepairTimes, Repaired};
 pub use models::Models;
+pub use network::{Network, NetworkInput, NetworkManifest, NetworkRole};
 pub use onnx::is_loaded;
 pub use select::{Decision, Selection};

@@ -36,7 +36,7 @@ pub struct Manifest {
     pub outputs: Vec<Output>,
 }
 
-fn default_memory_mib() -> u32 {
+pub(crate) fn default_memory_mib() -> u32 {
     4096
 }
 

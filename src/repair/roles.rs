@@ -64,7 +64,7 @@ pub(crate) fn luma(rgb: &Planes) -> Planes {
 }
 
 /// 0 to 255 as the model has it.
-fn in_range(planes: Planes, [black, white]: [f32; 2]) -> Planes {
+pub(crate) fn in_range(planes: Planes, [black, white]: [f32; 2]) -> Planes {
     planes.map(|value| black + value / 255.0 * (white - black))
 }
 

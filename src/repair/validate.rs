@@ -7,10 +7,10 @@ use crate::limits::{
     MAX_CONSTANT_VALUES, MAX_FILES, MAX_INPUTS, MAX_MULTIPLE_PX, MAX_SCALE, MAX_SIDE_PX,
     MAX_TIMEOUT_MS,
 };
-use crate::manifest::{Dtype, Fit, InputRole, Manifest, Merge, OutputRole};
+use crate::manifest::{Dtype, Fit, InputRole, Manifest, Merge, ModelFile, OutputRole, Provider};
 
 /// The field that is wrong, and what is accepted.
-type Checked = Result<(), (String, String)>;
+pub(crate) type Checked = Result<(), (String, String)>;
 
 impl Manifest {
     /// Reads and checks the text of a manifest; `file` is named in errors.
@@ -39,35 +39,46 @@ fn check(manifest: &Manifest) -> Checked {
         let message = format!("{:?}; this program reads {:?}", manifest.format, Manifest::FORMAT);
         return wrong("format", message);
     }
-    let is_letter = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
-    if manifest.name.is_empty() || manifest.name.len() > 64 || !manifest.name.chars().all(is_letter)
-    {
-        let message = format!("{:?}; 1 to 64 letters, digits, '.', '_' and '-'", manifest.name);
-        return wrong("name", message);
-    }
-    if manifest.providers.is_empty() {
-        return wrong("providers", "empty; name \"cpu\", \"cuda\" or \"tensorrt\"".to_owned());
-    }
-    if !(1..=MAX_TIMEOUT_MS).contains(&manifest.timeout_ms) {
-        let message = format!("{}; 1 to {MAX_TIMEOUT_MS}", manifest.timeout_ms);
-        return wrong("timeout_ms", message);
-    }
-    if manifest.memory_mib == 0 {
-        return wrong("memory_mib", "0; at least 1".to_owned());
-    }
-    check_files(manifest)?;
+    check_name(&manifest.name)?;
+    check_run(&manifest.providers, manifest.timeout_ms, manifest.memory_mib)?;
+    check_files(&manifest.files)?;
     check_size(manifest)?;
     check_inputs(manifest)?;
     check_output(manifest)
 }
 
-fn check_files(manifest: &Manifest) -> Checked {
-    if manifest.files.is_empty() || manifest.files.len() > MAX_FILES {
-        let message =
-            format!("{} files; name 1 to {MAX_FILES}, the .onnx file first", manifest.files.len());
+/// The name of a model or network.
+pub(crate) fn check_name(name: &str) -> Checked {
+    let is_letter = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
+    if name.is_empty() || name.len() > 64 || !name.chars().all(is_letter) {
+        let message = format!("{name:?}; 1 to 64 letters, digits, '.', '_' and '-'");
+        return Err(("name".to_owned(), message));
+    }
+    Ok(())
+}
+
+/// Where it runs, how long, and with how much memory.
+pub(crate) fn check_run(providers: &[Provider], timeout_ms: u64, memory_mib: u32) -> Checked {
+    let wrong = |field: &str, message: String| Err((field.to_owned(), message));
+    if providers.is_empty() {
+        return wrong("providers", "empty; name \"cpu\", \"cuda\" or \"tensorrt\"".to_owned());
+    }
+    if !(1..=MAX_TIMEOUT_MS).contains(&timeout_ms) {
+        return wrong("timeout_ms", format!("{timeout_ms}; 1 to {MAX_TIMEOUT_MS}"));
+    }
+    if memory_mib == 0 {
+        return wrong("memory_mib", "0; at least 1".to_owned());
+    }
+    Ok(())
+}
+
+/// Names and hashes of its files.
+pub(crate) fn check_files(files: &[ModelFile]) -> Checked {
+    if files.is_empty() || files.len() > MAX_FILES {
+        let message = format!("{} files; name 1 to {MAX_FILES}, the .onnx file first", files.len());
         return Err(("files".to_owned(), message));
     }
-    for (at, file) in manifest.files.iter().enumerate() {
+    for (at, file) in files.iter().enumerate() {
         let is_name =
             Path::new(&file.path).file_name().is_some_and(|name| name == file.path.as_str());
         if !is_name {
@@ -200,6 +211,7 @@ fn check_output(manifest: &Manifest) -> Checked {
     Ok(())
 }
 
-fn is_range(range: [f32; 2]) -> bool {
+/// Whether two values can be those of black and white.
+pub(crate) fn is_range(range: [f32; 2]) -> bool {
     range.iter().all(|end| end.is_finite()) && range[0] != range[1]
 }

@@ -77,6 +77,7 @@ pub use repair::references::ReferenceSource;
 pub use repair::rendered_image::RenderedImage;
 pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
+pub use repair::still::{StillRepair, StillRepairError, StillToRepair};
 pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
     asset_info,

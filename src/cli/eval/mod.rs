@@ -1,20 +1,38 @@
 //! `wildcity eval`.
 
+mod beside;
+mod drive;
+mod labels;
+mod networks;
+mod renderer;
+mod repairer;
+
 use std::io::{self, Write};
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 
-use wildcity_eval::{EvaluatedImage, Evaluation, Means, Pair, PairScores, Subject, Thumbnails};
-use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_eval::{
+    EvaluatedImage, Evaluation, Extrapolation, Gain, LidarMeans, Means, Pair, PairScores,
+    ScoreMeans, Subject, Thumbnails,
+};
+use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_session::RenderedImage;
 
+use self::beside::{Beside, BesideImage, Offsets, OnDrive, Tools};
+use self::drive::Drives;
+use self::labels::{LabelOptions, Labels};
+use self::networks::{FeatureSet, NetworkOptions, Networks};
+use self::renderer::{Maps, Renderer, covered};
+use self::repairer::{PlacedImage, Repairer, RepairerOptions};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
-use super::profile_options::{LoadedProfile, ProfileOptions};
-use super::real_images::{ImageList, RealImage, picture};
+use super::profile_options::ProfileOptions;
+use super::real_images::{ImageList, RealImage, camera_names, picture};
 use super::scene_source::Source;
 use super::{output, placement, progress};
 
@@ -82,6 +100,20 @@ pub(super) struct Eval {
     #[arg(long, value_name = "DIR", default_value = "wildcity-eval")]
     out: PathBuf,
 
+    /// Also draw views this far to the left of the drive, in metres (to the right if negative), from each image, and
+    /// tell what can be told without a real image there: trust, reprojection, flicker. Needs a twin with a drive.
+    #[arg(long, value_name = "METRES", allow_hyphen_values = true)]
+    extrapolate: Option<Offsets>,
+
+    #[command(flatten)]
+    labels: LabelOptions,
+
+    #[command(flatten)]
+    networks: NetworkOptions,
+
+    #[command(flatten)]
+    repairer: RepairerOptions,
+
     #[command(flatten)]
     twins: Twins,
 
@@ -97,48 +129,101 @@ Examples:
   wildcity eval street --images held-out/transforms.json
   wildcity eval street --images capture --every 8 --image-dir capture/images_4 --align-exposure
   wildcity eval point_cloud.ply --images capture/sparse/0 --every 8 --masks capture/masks --out eval
-  wildcity eval street --images views.jsonl --save-images";
+  wildcity eval street --images views.jsonl --save-images
+  wildcity eval street --images held-out/transforms.json --repair repair.json --extrapolate 1,3,5";
 
-/// What renders the images.
-struct Renderer {
-    source: Source,
-    /// That of the scene.
-    own_profile: RenderProfile,
-    /// The changes of the command line.
-    changes: LoadedProfile,
-    backend: Box<dyn Backend>,
-    alignment: Alignment,
+/// What images are compared with.
+struct Setup {
+    renderer: Renderer,
+    repairer: Option<Repairer>,
+    /// Of a twin that has some.
+    drives: Option<Drives>,
+    labels: Labels,
+    networks: Networks,
 }
 
-/// A rendered image.
-struct Rendered {
-    rgb8: Vec<u8>,
-    /// Share of the pixels with an opacity of at least 1/2.
-    covered: f64,
+/// Features of all images, if a network computes them.
+#[derive(Default)]
+struct Features {
+    truth: Vec<Vec<f32>>,
+    images: FeatureSet,
+    /// Distance by distance beside the drive.
+    beside: Vec<FeatureSet>,
+}
+
+/// An image that was compared, for what comes after it.
+struct Compared {
+    scores: EvaluatedImage,
+    view: View,
+    profile: RenderProfile,
+    truth: Vec<u8>,
+    rendered: RenderedImage,
+    repaired: Option<Vec<u8>>,
+    counts: Option<Vec<bool>>,
+    camera_name: String,
 }
 
 impl Eval {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
-        let images: Vec<&RealImage> = list.every(self.every as usize);
+        let names = camera_names(&list.every(1));
+        let images = list.every(1).into_iter().zip(&names).step_by(self.every as usize);
+        let images: Vec<(&RealImage, &String)> = images.collect();
         let changes = self.profile.load()?;
         let (source, own_profile) = Source::open(&self.scene, &self.twins)?;
         let alignment = self.alignment(&source, &list)?;
+        let held_out: Vec<Pose> =
+            images.iter().map(|(image, _)| alignment.pose(&image.world_from_camera)).collect();
         let backend = self.backend.backend()?;
-        let renderer = Renderer { source, own_profile, changes, backend, alignment };
-        let profile = renderer.profile(None)?;
+        let repairer = self.repairer.load(&source, &self.twins, &held_out)?;
+        let drives = match &source {
+            Source::Twin(resident) => Drives::of(&resident.version),
+            Source::File(_) => None,
+        };
+        ensure!(
+            self.extrapolate.is_none() || drives.is_some(),
+            "--extrapolate {}: views beside the drive need a twin with a recorded drive; `wildcity twin drive` adds one",
+            self.scene
+        );
+        let maps = Maps {
+            depth: self.extrapolate.is_some()
+                || self.labels.needs_depth()
+                || repairer.as_ref().is_some_and(Repairer::needs_depth),
+            normals: repairer.as_ref().is_some_and(Repairer::needs_normals),
+        };
+        let renderer = Renderer { source, own_profile, changes, backend, alignment, maps };
+        let real: Vec<&RealImage> = images.iter().map(|(image, _)| *image).collect();
+        let labels = self.labels.load(&renderer.source, &renderer.alignment, &real)?;
+        let networks = self.networks.load(&self.repairer.load_options())?;
+        let setup = Setup { renderer, repairer, drives, labels, networks };
+        let profile = setup.renderer.profile(None)?;
         output::create_dir(&self.out)?;
         let bar = progress::count("comparing");
         bar.set_length(images.len() as u64);
         let mut evaluated: Vec<EvaluatedImage> = Vec::with_capacity(images.len());
-        for image in images {
+        let mut beside = self.extrapolate.as_ref().map(Beside::new);
+        let mut features = Features::default();
+        for (at, (image, camera_name)) in images.iter().enumerate() {
             let about = || format!("image {}", image.name);
-            evaluated.push(self.evaluate(&renderer, image).with_context(about)?);
+            let compared = self.evaluate(&setup, image, camera_name).with_context(about)?;
+            features.add(&setup.networks, &compared).with_context(about)?;
+            if let Some(beside) = &mut beside {
+                let is_shown = at == images.len() / 2;
+                let drawn = self.look_beside(&setup, beside, &compared, image, is_shown);
+                let drawn = drawn.with_context(about)?;
+                features.add_beside(&setup.networks, &compared, &drawn).with_context(about)?;
+            }
+            evaluated.push(compared.scores);
             self.forget_better_pictures(&mut evaluated);
             bar.inc(1);
         }
         bar.finish_and_clear();
-        let evaluation = Evaluation::new(self.subject(&renderer, profile), evaluated);
+        let mut evaluation = Evaluation::new(self.subject(&setup, profile), evaluated);
+        evaluation.extrapolation = beside.map(Beside::finish).unwrap_or_default();
+        evaluation.kid = setup.networks.kid(&features.images, &features.truth)?;
+        for (line, set) in evaluation.extrapolation.iter_mut().zip(&features.beside) {
+            line.kid = setup.networks.kid(set, &features.truth)?;
+        }
         self.write(&evaluation)
     }
 
@@ -153,23 +238,116 @@ impl Eval {
         }
     }
 
-    /// Renders one image and compares it with the real one.
-    fn evaluate(&self, renderer: &Renderer, image: &RealImage) -> anyhow::Result<EvaluatedImage> {
+    /// Renders one image and compares it with the real one, and the repaired image, too.
+    fn evaluate(
+        &self,
+        setup: &Setup,
+        image: &RealImage,
+        camera_name: &str,
+    ) -> anyhow::Result<Compared> {
+        let Setup { renderer, repairer, drives, labels, networks } = setup;
         let profile = renderer.profile(image.near)?;
         let (truth, camera) = picture::real(&image.file, &image.camera, profile.background)?;
         let size_px = [camera.width_px, camera.height_px];
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
-        let Rendered { rgb8, covered } = renderer.render(&view, &profile)?;
-        let pair = Pair::new(size_px, truth, rgb8, counted(&view, mask))?;
-        let compared = PairScores::of(&pair, self.align_exposure);
-        if self.save_images {
-            self.save(&image.name, &pair, &compared.error_map)?;
+        let mut rendered = renderer.render(&view, &profile)?;
+        let mut counts = counted(&view, mask);
+        let hidden = labels.hide(image, &view, &renderer.alignment);
+        let moving = hidden.as_ref().map(|(_, share)| *share);
+        if let Some((still, _)) = hidden {
+            if self.save_images {
+                self.save_mask(&image.name, &still, size_px)?;
+            }
+            let counts = counts.get_or_insert_with(|| vec![true; still.len()]);
+            counts.iter_mut().zip(still).for_each(|(counts, still)| *counts &= still);
         }
-        let mut evaluated = EvaluatedImage::new(image.name.clone(), size_px, covered, &compared);
-        let thumbnails = Thumbnails::of(&pair, &compared.error_map);
-        evaluated.thumbnails = Some(thumbnails.map_err(anyhow::Error::msg)?);
-        Ok(evaluated)
+        let covered = covered(&rendered);
+        let lpips = |rgb8: &[u8]| networks.lpips(size_px, rgb8, &truth, counts.as_deref());
+        let pair = Pair::new(size_px, truth.clone(), rendered.rgb8.clone(), counts.clone())?;
+        let mut compared = PairScores::of(&pair, self.align_exposure);
+        compared.scores.lpips = lpips(&rendered.rgb8)?;
+        if self.save_images {
+            self.save(&image.name, ["rendered", "errors"], &pair, &compared.error_map)?;
+        }
+        let mut scores = EvaluatedImage::new(image.name.clone(), size_px, covered, &compared);
+        scores.moving = moving;
+        scores.lidar = labels.depth(image, &view, &rendered, counts.as_deref());
+        let mut repaired_rgb8 = None;
+        let mut thumbnails =
+            Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
+        if let Some(repairer) = repairer {
+            let place = drives.as_ref().and_then(|drives| {
+                let place = drives.place(camera_name, &view.world_from_camera)?;
+                Some((place.world_from_rig, drives))
+            });
+            let world_from_rig = place.map_or(view.world_from_camera, |(rig, _)| rig);
+            rendered.trust =
+                place.map_or(1.0, |(rig, drives)| drives.trust(&rig, &view, &rendered));
+            let placed = PlacedImage {
+                camera_name,
+                view: &view,
+                world_from_rig: &world_from_rig,
+                rendered: &rendered,
+                profile: &profile,
+            };
+            let repaired = repairer.repair(renderer, &placed)?;
+            let pair = Pair::new(size_px, truth.clone(), repaired.clone(), counts.clone())?;
+            let mut compared = PairScores::of(&pair, self.align_exposure);
+            compared.scores.lpips = lpips(&repaired)?;
+            repaired_rgb8 = Some(repaired);
+            if self.save_images {
+                self.save(
+                    &image.name,
+                    ["repaired", "repaired_errors"],
+                    &pair,
+                    &compared.error_map,
+                )?;
+            }
+            scores.repaired = Some(compared.scored());
+            let with = thumbnails.with_repaired(&pair, &compared.error_map);
+            thumbnails = with.map_err(anyhow::Error::msg)?;
+        }
+        scores.thumbnails = Some(thumbnails);
+        let camera_name = camera_name.to_owned();
+        let repaired = repaired_rgb8;
+        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera_name })
+    }
+
+    /// Draws the views beside the drive that belong to an image.
+    fn look_beside(
+        &self,
+        setup: &Setup,
+        beside: &mut Beside,
+        compared: &Compared,
+        image: &RealImage,
+        is_shown: bool,
+    ) -> anyhow::Result<Vec<BesideImage>> {
+        let Some(drives) = &setup.drives else { return Ok(Vec::new()) };
+        let repairer = setup.repairer.as_ref();
+        let tools = Tools { renderer: &setup.renderer, repairer, drives };
+        let on_drive = OnDrive {
+            name: &image.name,
+            camera_name: &compared.camera_name,
+            view: &compared.view,
+            profile: &compared.profile,
+            truth: &compared.truth,
+            rendered: &compared.rendered,
+            counts: compared.counts.as_deref(),
+            is_shown,
+        };
+        let drawn = beside.add(tools, &on_drive)?;
+        let offsets = self.extrapolate.iter().flat_map(|offsets| &offsets.0);
+        for (offset_m, BesideImage { rendered, repaired }) in offsets.zip(&drawn) {
+            if self.save_images {
+                let name = format!("{offset_m}m/{}", image.name);
+                self.save_pixels("beside", &name, rendered, &compared.view)?;
+                if let Some(repaired) = repaired {
+                    self.save_pixels("beside_repaired", &name, repaired, &compared.view)?;
+                }
+            }
+        }
+        Ok(drawn)
     }
 
     /// Keeps the pictures of the worst images only, so that memory does not grow with the number of images.
@@ -185,19 +363,52 @@ impl Eval {
         }
     }
 
-    fn save(&self, name: &str, pair: &Pair, error_map: &[f32]) -> anyhow::Result<()> {
+    fn save(
+        &self,
+        name: &str,
+        [pixels, errors]: [&str; 2],
+        pair: &Pair,
+        error_map: &[f32],
+    ) -> anyhow::Result<()> {
         let [width, height] = pair.size_px();
         let rendered = wildcity_session::png(pair.rendered(), width, height);
-        let errors = wildcity_eval::error_png(pair, error_map);
-        for (folder, file) in [("rendered", rendered), ("errors", errors)] {
-            let path = self.out.join(folder).join(picture::inside(name)).with_extension("png");
-            output::create_dir(path.parent().unwrap_or(&self.out))?;
-            output::write(&path, &file.map_err(anyhow::Error::msg)?)?;
-        }
-        Ok(())
+        self.save_file(pixels, name, &rendered.map_err(anyhow::Error::msg)?)?;
+        let map = wildcity_eval::error_png(pair, error_map);
+        self.save_file(errors, name, &map.map_err(anyhow::Error::msg)?)
     }
 
-    fn subject(&self, renderer: &Renderer, profile: RenderProfile) -> Subject {
+    fn save_pixels(
+        &self,
+        folder: &str,
+        name: &str,
+        rgb8: &[u8],
+        view: &View,
+    ) -> anyhow::Result<()> {
+        let file = wildcity_session::png(rgb8, view.camera.width_px, view.camera.height_px);
+        self.save_file(folder, name, &file.map_err(anyhow::Error::msg)?)
+    }
+
+    /// White where nothing moves, as `--masks` takes it.
+    fn save_mask(
+        &self,
+        name: &str,
+        still: &[bool],
+        [width, height]: [u32; 2],
+    ) -> anyhow::Result<()> {
+        let rgb8: Vec<u8> =
+            still.iter().flat_map(|still| [if *still { 255 } else { 0 }; 3]).collect();
+        let file = wildcity_session::png(&rgb8, width, height);
+        self.save_file("masks", name, &file.map_err(anyhow::Error::msg)?)
+    }
+
+    fn save_file(&self, folder: &str, name: &str, png: &[u8]) -> anyhow::Result<()> {
+        let path = self.out.join(folder).join(picture::inside(name)).with_extension("png");
+        output::create_dir(path.parent().unwrap_or(&self.out))?;
+        output::write(&path, png)
+    }
+
+    fn subject(&self, setup: &Setup, profile: RenderProfile) -> Subject {
+        let renderer = &setup.renderer;
         let version = renderer.source.version();
         Subject {
             scene: version.map_or(self.scene.clone(), |version| version.manifest.twin.clone()),
@@ -208,6 +419,10 @@ impl Eval {
             every: self.every as usize,
             backend: renderer.backend.name(),
             profile,
+            repair: setup.repairer.as_ref().map(Repairer::subject),
+            lpips_network: setup.networks.lpips_name(),
+            boxes: setup.labels.boxes_subject.clone(),
+            lidar: setup.labels.lidar_subject.clone(),
         }
     }
 
@@ -223,8 +438,24 @@ impl Eval {
         }
         let mut out = io::stdout().lock();
         print_means(&mut out, &evaluation.all)?;
+        if let Some(kid) = &evaluation.kid {
+            let after =
+                kid.repaired.map_or(String::new(), |kid| format!(", repaired {:.5}", kid.mean));
+            writeln!(out, "KID by {}: {:.5}{after}", kid.network, kid.rendered.mean)?;
+        }
+        if let Some((_, skipped)) =
+            evaluation.subject.lidar.as_ref().filter(|(_, skipped)| *skipped > 0)
+        {
+            writeln!(
+                out,
+                "{skipped} LiDAR points were left out: no two poses at most 0.2 s apart are around their time"
+            )?;
+        }
+        for one in &evaluation.extrapolation {
+            print_beside(&mut out, one)?;
+        }
         if let Some(worst) = evaluation.worst_first().first() {
-            writeln!(out, "worst: {}, {}", worst.name, decibels(worst.scores.psnr_db))?;
+            writeln!(out, "worst: {}, {}", worst.name, decibels(worst.rendered.scores.psnr_db))?;
         }
         for (name, _) in &files {
             writeln!(out, "{}", self.out.join(name).display())?;
@@ -233,25 +464,34 @@ impl Eval {
     }
 }
 
-impl Renderer {
-    /// How an image is rendered: `near` of the list overrides the scene's, and the command line both.
-    fn profile(&self, near: Option<f64>) -> anyhow::Result<RenderProfile> {
-        let near = near.unwrap_or(self.own_profile.near);
-        self.changes.apply(RenderProfile { near, ..self.own_profile })
+impl Features {
+    fn add(&mut self, networks: &Networks, compared: &Compared) -> anyhow::Result<()> {
+        let camera = &compared.view.camera;
+        let size_px = [camera.width_px, camera.height_px];
+        self.truth.extend(networks.features(size_px, &compared.truth)?);
+        self.images.rendered.extend(networks.features(size_px, &compared.rendered.rgb8)?);
+        if let Some(repaired) = &compared.repaired {
+            self.images.repaired.extend(networks.features(size_px, repaired)?);
+        }
+        Ok(())
     }
 
-    fn render(&self, view: &View, profile: &RenderProfile) -> anyhow::Result<Rendered> {
-        let views = [*view];
-        let scene = self.source.scene(&views, profile)?;
-        let pixels = view.camera.pixels();
-        let mut rgb8 = vec![0; 3 * pixels];
-        let mut opacity = vec![0.0; pixels];
-        let target =
-            Target { rgb8: Some(&mut rgb8), opacity: Some(&mut opacity), ..Target::default() };
-        let frame = Frame { scene: &scene, profile, views: &views };
-        self.backend.render(&frame, &mut [target], &|_, _| {})?;
-        let covered = opacity.iter().filter(|opacity| **opacity >= 0.5).count();
-        Ok(Rendered { rgb8, covered: covered as f64 / pixels as f64 })
+    fn add_beside(
+        &mut self,
+        networks: &Networks,
+        compared: &Compared,
+        drawn: &[BesideImage],
+    ) -> anyhow::Result<()> {
+        let camera = &compared.view.camera;
+        let size_px = [camera.width_px, camera.height_px];
+        self.beside.resize_with(drawn.len(), FeatureSet::default);
+        for (set, image) in self.beside.iter_mut().zip(drawn) {
+            set.rendered.extend(networks.features(size_px, &image.rendered)?);
+            if let Some(repaired) = &image.repaired {
+                set.repaired.extend(networks.features(size_px, repaired)?);
+            }
+        }
+        Ok(())
     }
 }
 
@@ -264,15 +504,59 @@ fn counted(view: &View, mask: Option<Vec<bool>>) -> Option<Vec<bool>> {
 }
 
 fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()> {
-    let Means { images, psnr_db, ssim, ssim_mirrored, flip, .. } = means;
+    let images = means.images;
+    print_scores(out, &format!("mean of {images} images"), &means.rendered)?;
+    if let Some(repaired) = &means.repaired {
+        print_scores(out, "repaired", repaired)?;
+    }
+    if let Some(lidar) = &means.lidar {
+        let LidarMeans { points, mean_m, median_m, .. } = lidar;
+        writeln!(
+            out,
+            "depth against {points} LiDAR points: mean {mean_m:.3} m, median {median_m:.3} m"
+        )?;
+    }
+    if let Some(gain) = &means.gain {
+        let Gain { psnr_db, ssim, flip, .. } = gain;
+        writeln!(out, "gain: PSNR {psnr_db:+.2} dB, SSIM {ssim:+.4}, FLIP {flip:+.4}")?;
+    }
+    Ok(())
+}
+
+fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Result<()> {
+    let ScoreMeans { psnr_db, ssim, ssim_mirrored, flip, .. } = means;
     let psnr = decibels(*psnr_db);
     writeln!(
         out,
-        "mean of {images} images: PSNR {psnr}, SSIM {ssim:.4} (mirrored edges: {ssim_mirrored:.4}), FLIP {flip:.4}"
+        "{what}: PSNR {psnr}, SSIM {ssim:.4} (mirrored edges: {ssim_mirrored:.4}), FLIP {flip:.4}"
     )?;
+    if let Some(lpips) = means.lpips {
+        writeln!(out, "  LPIPS {lpips:.4}")?;
+    }
     if let Some(aligned) = &means.aligned {
         let psnr = decibels(aligned.psnr_db);
         writeln!(out, "with aligned exposure: PSNR {psnr}, SSIM {:.4}", aligned.ssim)?;
+    }
+    Ok(())
+}
+
+fn print_beside(out: &mut impl Write, one: &Extrapolation) -> io::Result<()> {
+    let Extrapolation { offset_m, trust, covered, .. } = one;
+    writeln!(
+        out,
+        "{offset_m} m beside the drive: trust {trust:.2}, covered {:.1} %",
+        100.0 * covered
+    )?;
+    let means = [("rendered", Some(&one.rendered)), ("repaired", one.repaired.as_ref())];
+    for (what, means) in means {
+        let Some(means) = means else { continue };
+        writeln!(
+            out,
+            "  {what}: reprojection {} ({:.1} % came back), flicker {:.4}",
+            decibels(means.reprojection_psnr_db),
+            100.0 * means.reprojection_share,
+            means.flicker
+        )?;
     }
     Ok(())
 }

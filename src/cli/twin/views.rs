@@ -1,7 +1,6 @@
 //! `wildcity twin views`.
 
-use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 use image::RgbImage;
@@ -10,14 +9,13 @@ use image::imageops::{self, FilterType};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::manifest::ObjectRef;
-use wildcity_scene::rig::is_name;
 use wildcity_scene::trajectory::NearestPlace;
 use wildcity_scene::views::RecordedView;
 use wildcity_scene::{Manifest, Trajectory};
 use wildcity_twin::store::{Commit, CommitKind, StorageOptions, VersionChange};
 
 use crate::cli::directories::{TwinVersion, Twins};
-use crate::cli::real_images::{ImageList, RealImage, picture};
+use crate::cli::real_images::{ImageList, RealImage, camera_names, picture};
 use crate::cli::{placement, progress};
 
 use super::change;
@@ -204,27 +202,6 @@ impl Views {
     }
 }
 
-/// The camera of each image: its folder if the images are in several folders, else its file name without the digits at
-/// its end.
-fn camera_names(images: &[&RealImage]) -> Vec<String> {
-    let folder = |image: &RealImage| Path::new(&image.name).parent().map(Path::to_owned);
-    let folders: BTreeSet<Option<PathBuf>> = images.iter().map(|image| folder(image)).collect();
-    let name = |image: &&RealImage| {
-        let path = Path::new(&image.name);
-        let text = match folders.len() > 1 {
-            true => path.parent().and_then(Path::file_name),
-            false => path.file_stem(),
-        };
-        let text = text.unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        let ends_name = |c: char| c.is_ascii_digit() || "._-".contains(c);
-        let text = if folders.len() > 1 { &*text } else { text.trim_end_matches(ends_name) };
-        let allowed = |c: char| if c.is_ascii_alphanumeric() || "_-".contains(c) { c } else { '_' };
-        let text: String = text.chars().map(allowed).collect();
-        if is_name(&text) { text } else { "camera".to_owned() }
-    };
-    images.iter().map(name).collect()
-}
-
 /// A distance in metres, with or without its unit.
 fn metres(text: &str) -> Result<f64, String> {
     let number: f64 = text
@@ -242,29 +219,6 @@ fn metres(text: &str) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use wildcity_scene::geometry::Pose;
-    use wildcity_scene::geometry::camera::Pinhole;
-
-    fn named(names: &[&str]) -> Vec<String> {
-        let pinhole = Pinhole { fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0 };
-        let image = |name: &&str| RealImage {
-            name: (*name).to_owned(),
-            file: PathBuf::new(),
-            mask: None,
-            camera: Camera::from_pinhole(2, 2, pinhole),
-            world_from_camera: Pose::IDENTITY,
-            near: None,
-        };
-        let images: Vec<RealImage> = names.iter().map(image).collect();
-        camera_names(&images.iter().collect::<Vec<_>>())
-    }
-
-    #[test]
-    fn cameras_are_named_by_folder_or_file() {
-        assert_eq!(named(&["images/front/1.png", "images/Left 2/1.png"]), ["front", "left_2"]);
-        assert_eq!(named(&["images/front_0001.jpg", "images/rear_0001.jpg"]), ["front", "rear"]);
-        assert_eq!(named(&["0001.jpg", "0002.jpg"]), ["camera", "camera"]);
-    }
 
     #[test]
     fn distances_have_an_optional_unit() {

@@ -1,16 +1,16 @@
 //! What is rendered of an image that may be repaired.
 
 /// An image as it was rendered, and what the model may need beside it. Maps that it does not need are empty.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedImage {
-    /// `[height, width, 3]`.
+    /// `[height, width, 3]`: sRGB, 8 bits.
     pub rgb8: Vec<u8>,
-    /// `[height, width]`, in metres.
+    /// `[height, width]`, in metres; 0 where there is none.
     pub depth_m: Vec<f32>,
-    /// `[height, width]`.
+    /// `[height, width]`, 0 to 1.
     pub opacity: Vec<f32>,
-    /// `[height, width, 3]`.
+    /// `[height, width, 3]`: unit vectors in the camera's axes.
     pub normals: Vec<f32>,
-    /// The trust by which it was selected.
+    /// The trust by which it was selected, 0 to 1.
     pub trust: f64,
 }

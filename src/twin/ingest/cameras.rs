@@ -29,6 +29,8 @@ pub struct ListedCamera {
     pub image: Option<String>,
     /// File of the image's mask, likewise.
     pub mask: Option<String>,
+    /// When the image was taken, in microseconds, if the list says so.
+    pub time_us: Option<i64>,
 }
 
 /// Why a camera list was refused.
@@ -130,6 +132,7 @@ struct Entry {
     near: Option<f64>,
     image: Option<String>,
     mask: Option<String>,
+    time_us: Option<i64>,
     position: Option<[f64; 3]>,
     position_ply: Option<[f64; 3]>,
     #[serde(rename = "R_world_to_cam")]
@@ -172,6 +175,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
 fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, image, mask, .. } =
         entry;
+    let time_us = entry.time_us;
     let of_rigs = [
         ("shutter", entry.shutter.is_some()),
         ("exposure", entry.exposure.is_some()),
@@ -213,5 +217,5 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     };
     let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
-    Ok(ListedCamera { name, camera, world_from_camera, near, image, mask })
+    Ok(ListedCamera { name, camera, world_from_camera, near, image, mask, time_us })
 }

@@ -15,7 +15,7 @@ use glam::{DMat3, DQuat};
 use wildcity_scene::align::PosedImage;
 
 pub use error::{CaptureError, Place};
-pub use nerfstudio::{read as read_nerfstudio, read_masked as read_nerfstudio_masked};
+pub use nerfstudio::{FrameImage, read as read_nerfstudio, read_frames as read_nerfstudio_frames};
 
 /// Reads a COLMAP model: the folder with cameras.bin and images.bin, or with cameras.txt and images.txt; or a folder
 /// that has it in sparse/0 or sparse.

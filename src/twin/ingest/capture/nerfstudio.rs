@@ -30,8 +30,20 @@ struct Frame {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
     mask_path: Option<String>,
+    time_us: Option<i64>,
     #[serde(flatten)]
     intrinsics: Intrinsics,
+}
+
+/// A frame with what is beside its camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameImage {
+    /// Its image and camera.
+    pub posed: PosedImage,
+    /// File of its mask (`mask_path`), if it has one.
+    pub mask: Option<String>,
+    /// When it was taken (`time_us`), in microseconds, if the file says so.
+    pub time_us: Option<i64>,
 }
 
 /// Numbers of a camera, by their names in the file.
@@ -44,15 +56,14 @@ struct Intrinsics(BTreeMap<String, Value>);
 /// # Errors
 /// The error names the file, the line or the field, and what to do.
 pub fn read(path: &Path) -> Result<Vec<PosedImage>, CaptureError> {
-    let masked = read_masked(path)?;
-    Ok(masked.into_iter().map(|(image, _)| image).collect())
+    Ok(read_frames(path)?.into_iter().map(|frame| frame.posed).collect())
 }
 
-/// The same with the mask of each image (`mask_path`), if it has one.
+/// The same with masks and times.
 ///
 /// # Errors
 /// As [`read`].
-pub fn read_masked(path: &Path) -> Result<Vec<(PosedImage, Option<String>)>, CaptureError> {
+pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
     let inside = path.join("transforms.json");
     let path = if path.is_dir() { inside.as_path() } else { path };
     let text = read_whole(path, limits::CAPTURE_BYTES)
@@ -68,11 +79,12 @@ pub fn read_masked(path: &Path) -> Result<Vec<(PosedImage, Option<String>)>, Cap
         return Err(CaptureError::at(path, place, "there is no frame: give a file with frames"));
     }
     let frames = file.frames.into_iter().enumerate();
-    let masked = |(index, mut frame): (usize, Frame)| {
+    let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
-        Ok((posed(path, index, frame, &file.intrinsics)?, mask))
+        let time_us = frame.time_us;
+        Ok(FrameImage { posed: posed(path, index, frame, &file.intrinsics)?, mask, time_us })
     };
-    frames.map(masked).collect()
+    frames.map(read).collect()
 }
 
 fn posed(

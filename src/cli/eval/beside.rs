@@ -1,0 +1,243 @@
+//! `--extrapolate`: views beside the drive, for which there is no real image.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use wildcity_eval::{ExtrapolatedView, Extrapolation, Reprojection, ViewScores, flicker, jpeg};
+use wildcity_render::View;
+use wildcity_repair::Image;
+use wildcity_repair::reference::{
+    Projection, Rays, Reference, WarpTarget, Warped, opaque_depth, warp,
+};
+use wildcity_scene::RenderProfile;
+use wildcity_scene::geometry::Pose;
+use wildcity_session::RenderedImage;
+
+use super::drive::{DrivePlace, Drives};
+use super::renderer::{Renderer, covered};
+use super::repairer::{PlacedImage, Repairer};
+
+/// Largest distance from the drive, in metres.
+const FARTHEST_M: f64 = 50.0;
+
+/// Most distances.
+const MOST: usize = 16;
+
+/// The distances of `--extrapolate`, in metres.
+#[derive(Clone, Debug)]
+pub(super) struct Offsets(pub(super) Vec<f64>);
+
+impl std::str::FromStr for Offsets {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let must = || {
+            format!(
+                "expected 1 to {MOST} distances in metres, such as 1,3,5: at most {FARTHEST_M}, not 0"
+            )
+        };
+        let offset = |text: &str| text.trim().parse::<f64>().map_err(|_| must());
+        let offsets = text.split(',').map(offset).collect::<Result<Vec<f64>, String>>()?;
+        let is_offset = |offset: &f64| *offset != 0.0 && offset.abs() <= FARTHEST_M;
+        if offsets.len() > MOST || !offsets.iter().all(is_offset) {
+            return Err(must());
+        }
+        Ok(Self(offsets))
+    }
+}
+
+/// What draws and repairs views, and where they are.
+#[derive(Clone, Copy)]
+pub(super) struct Tools<'a> {
+    pub(super) renderer: &'a Renderer,
+    pub(super) repairer: Option<&'a Repairer>,
+    pub(super) drives: &'a Drives,
+}
+
+/// A real image, from which views beside the drive are moved.
+pub(super) struct OnDrive<'a> {
+    pub(super) name: &'a str,
+    pub(super) camera_name: &'a str,
+    pub(super) view: &'a View,
+    pub(super) profile: &'a RenderProfile,
+    pub(super) truth: &'a [u8],
+    /// What was rendered there.
+    pub(super) rendered: &'a RenderedImage,
+    /// Which pixels of the real image count.
+    pub(super) counts: Option<&'a [bool]>,
+    /// Whether its pictures are shown.
+    pub(super) is_shown: bool,
+}
+
+/// The pixels of a view beside the drive.
+pub(super) struct BesideImage {
+    pub(super) rendered: Vec<u8>,
+    pub(super) repaired: Option<Vec<u8>>,
+}
+
+/// The views beside the drive, distance by distance.
+pub(super) struct Beside(Vec<Line>);
+
+struct Line {
+    offset_m: f64,
+    views: Vec<ExtrapolatedView>,
+    pictures: Vec<(&'static str, Vec<u8>)>,
+}
+
+/// A view that is drawn, and repaired if that is asked for.
+struct Drawn {
+    view: View,
+    rendered: RenderedImage,
+    repaired: Option<Vec<u8>>,
+}
+
+/// The camera of the views of an image, as the warp needs it.
+struct Lens {
+    rays: Rays,
+    projection: Arc<Projection>,
+}
+
+impl Beside {
+    pub(super) fn new(offsets: &Offsets) -> Self {
+        let line =
+            |offset_m: &f64| Line { offset_m: *offset_m, views: Vec::new(), pictures: Vec::new() };
+        Self(offsets.0.iter().map(line).collect())
+    }
+
+    /// Draws and compares the views beside an image. Returns their pixels, distance by distance.
+    pub(super) fn add(
+        &mut self,
+        tools: Tools<'_>,
+        image: &OnDrive<'_>,
+    ) -> anyhow::Result<Vec<BesideImage>> {
+        let place = tools.drives.place(image.camera_name, &image.view.world_from_camera);
+        let Some(place) = place else { return Ok(Vec::new()) };
+        let camera = &image.view.camera;
+        let lens = Lens { rays: Rays::of(camera), projection: Arc::new(Projection::of(camera)) };
+        let mut drawn = Vec::with_capacity(self.0.len());
+        for line in &mut self.0 {
+            drawn.push(line.add(tools, image, &place, &lens)?);
+        }
+        Ok(drawn)
+    }
+
+    /// The means of all views.
+    pub(super) fn finish(self) -> Vec<Extrapolation> {
+        let line = |line: Line| Extrapolation {
+            pictures: line.pictures,
+            ..Extrapolation::new(line.offset_m, line.views)
+        };
+        self.0.into_iter().map(line).collect()
+    }
+}
+
+impl Line {
+    fn add(
+        &mut self,
+        tools: Tools<'_>,
+        image: &OnDrive<'_>,
+        place: &DrivePlace<'_>,
+        lens: &Lens,
+    ) -> anyhow::Result<BesideImage> {
+        let moved_m = self.offset_m * place.left();
+        let now = draw(tools, image, place, &|pose| moved(pose, moved_m))?;
+        let step = place.step_back();
+        let before =
+            step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m)));
+        let before = before.transpose()?;
+
+        // The geometry is that of what was rendered, also for the repaired pixels.
+        let onto_now = |of: &dyn Fn(&Drawn) -> Vec<u8>| match &before {
+            Some(before) => {
+                let back = into(lens, &now.view, &now.rendered, before, of(before));
+                flicker(&of(&now), &back.image.rgb8, &back.valid)
+            }
+            None => f64::NAN,
+        };
+        let size_px = [image.view.camera.width_px, image.view.camera.height_px];
+        let scores = |of: &dyn Fn(&Drawn) -> Vec<u8>| {
+            let back = into(lens, image.view, image.rendered, &now, of(&now));
+            let reprojection =
+                Reprojection::of(size_px, image.truth, &back.image.rgb8, &back.valid, image.counts);
+            let scores = ViewScores { reprojection: reprojection?, flicker: onto_now(of) };
+            anyhow::Ok((scores, back.image.rgb8))
+        };
+        let (rendered, mut came_back) = scores(&|drawn| drawn.rendered.rgb8.clone())?;
+        let mut repaired = None;
+        if now.repaired.is_some() {
+            let of = |drawn: &Drawn| drawn.repaired.clone().unwrap_or_default();
+            let (scores, back) = scores(&of)?;
+            repaired = Some(scores);
+            came_back = back;
+        }
+        if image.is_shown {
+            let mut show = |what, pixels: &[u8]| {
+                let file = jpeg(pixels, size_px).map_err(anyhow::Error::msg)?;
+                self.pictures.push((what, file));
+                anyhow::Ok(())
+            };
+            show("on the drive", image.truth)?;
+            show("rendered beside it", &now.rendered.rgb8)?;
+            if let Some(repaired) = &now.repaired {
+                show("repaired", repaired)?;
+            }
+            show("brought back", &came_back)?;
+        }
+        self.views.push(ExtrapolatedView {
+            name: image.name.to_owned(),
+            trust: now.rendered.trust,
+            covered: covered(&now.rendered),
+            rendered,
+            repaired,
+        });
+        Ok(BesideImage { rendered: now.rendered.rgb8, repaired: now.repaired })
+    }
+}
+
+fn moved(pose: &Pose, by_m: DVec3) -> Pose {
+    Pose { position_m: pose.position_m + by_m, ..*pose }
+}
+
+/// Draws the view of an image that is moved, with its rig.
+fn draw(
+    tools: Tools<'_>,
+    image: &OnDrive<'_>,
+    place: &DrivePlace<'_>,
+    moved: &dyn Fn(&Pose) -> Pose,
+) -> anyhow::Result<Drawn> {
+    let Tools { renderer, repairer, drives } = tools;
+    let view = View::new(image.view.camera, moved(&image.view.world_from_camera));
+    let world_from_rig = moved(&place.world_from_rig);
+    let mut rendered = renderer.render(&view, image.profile)?;
+    rendered.trust = drives.trust(&world_from_rig, &view, &rendered);
+    let placed = PlacedImage {
+        camera_name: image.camera_name,
+        view: &view,
+        world_from_rig: &world_from_rig,
+        rendered: &rendered,
+        profile: image.profile,
+    };
+    let repaired = repairer.map(|repairer| repairer.repair(renderer, &placed)).transpose()?;
+    Ok(Drawn { view, rendered, repaired })
+}
+
+/// Brings pixels of one view into another by the depths that were rendered of both.
+fn into(lens: &Lens, view: &View, rendered: &RenderedImage, from: &Drawn, rgb8: Vec<u8>) -> Warped {
+    let depth_m = opaque_depth(&rendered.depth_m, &rendered.opacity);
+    let [width, height] = [view.camera.width_px, view.camera.height_px].map(|side| side as usize);
+    let reference = Reference {
+        image: Image { width, height, rgb8 },
+        depth_m: opaque_depth(&from.rendered.depth_m, &from.rendered.opacity),
+        projection: lens.projection.clone(),
+        world_from_camera: from.view.world_from_camera,
+    };
+    let target = WarpTarget {
+        camera: &view.camera,
+        rays: &lens.rays,
+        world_from_camera: view.world_from_camera,
+        shutter: None,
+        depth_m: &depth_m,
+    };
+    warp(&target, &[Arc::new(reference)])
+}

@@ -1,0 +1,74 @@
+//! What renders the images.
+
+use wildcity_render::{Backend, Frame, Target, View};
+use wildcity_scene::RenderProfile;
+use wildcity_scene::align::Alignment;
+use wildcity_session::RenderedImage;
+
+use crate::cli::profile_options::LoadedProfile;
+use crate::cli::scene_source::Source;
+
+/// What renders the images.
+pub(super) struct Renderer {
+    pub(super) source: Source,
+    /// That of the scene.
+    pub(super) own_profile: RenderProfile,
+    /// The changes of the command line.
+    pub(super) changes: LoadedProfile,
+    pub(super) backend: Box<dyn Backend>,
+    /// From the axes of the images' poses to those of the scene.
+    pub(super) alignment: Alignment,
+    /// Which maps are rendered beside colours and opacity.
+    pub(super) maps: Maps,
+}
+
+/// Maps of an image.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Maps {
+    /// Also needed for normals.
+    pub(super) depth: bool,
+    pub(super) normals: bool,
+}
+
+impl Renderer {
+    /// How an image is rendered: `near` of the list overrides the scene's, and the command line both.
+    pub(super) fn profile(&self, near: Option<f64>) -> anyhow::Result<RenderProfile> {
+        let near = near.unwrap_or(self.own_profile.near);
+        self.changes.apply(RenderProfile { near, ..self.own_profile })
+    }
+
+    pub(super) fn render(
+        &self,
+        view: &View,
+        profile: &RenderProfile,
+    ) -> anyhow::Result<RenderedImage> {
+        let views = [*view];
+        let scene = self.source.scene(&views, profile)?;
+        let pixels = view.camera.pixels();
+        let map =
+            |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
+        let mut image = RenderedImage {
+            rgb8: vec![0; 3 * pixels],
+            depth_m: map(self.maps.depth, 1),
+            opacity: map(true, 1),
+            normals: map(self.maps.normals, 3),
+            trust: 0.0,
+        };
+        let target = Target {
+            rgb8: Some(&mut image.rgb8),
+            depth_m: self.maps.depth.then_some(&mut image.depth_m),
+            opacity: Some(&mut image.opacity),
+            normals: self.maps.normals.then_some(&mut image.normals),
+            ..Target::default()
+        };
+        let frame = Frame { scene: &scene, profile, views: &views };
+        self.backend.render(&frame, &mut [target], &|_, _| {})?;
+        Ok(image)
+    }
+}
+
+/// Share of the pixels with an opacity of at least 1/2.
+pub(super) fn covered(image: &RenderedImage) -> f64 {
+    let covered = image.opacity.iter().filter(|opacity| **opacity >= 0.5).count();
+    covered as f64 / image.opacity.len() as f64
+}

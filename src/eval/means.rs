@@ -1,0 +1,147 @@
+//! Means of the values of some images.
+
+use serde::Serialize;
+
+use super::evaluated_image::EvaluatedImage;
+use super::lidar::LidarMeans;
+use super::mean::mean_of;
+use super::scores::{AlignedScores, Scored, Scores, pooled_psnr_db};
+use wildcity_render::compare::json_numbers::serialize_number;
+
+/// Means of the values of some images. Images of which no pixel counts are left out. NaN if there is no other.
+#[derive(Clone, Debug, Serialize)]
+pub struct Means {
+    /// Number of images.
+    pub images: usize,
+    /// Of the images as they were rendered.
+    #[serde(flatten)]
+    pub rendered: ScoreMeans,
+    /// Of the same images after the repair; `None` if it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub repaired: Option<ScoreMeans>,
+    /// Repaired minus rendered; `None` if it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gain: Option<Gain>,
+    /// Depth against LiDAR; `None` if it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lidar: Option<LidarMeans>,
+}
+
+/// Means of scores.
+#[derive(Clone, Debug, Serialize)]
+pub struct ScoreMeans {
+    /// Mean PSNR, in dB.
+    #[serde(serialize_with = "serialize_number")]
+    pub psnr_db: f64,
+    /// PSNR of the pixels of all images together, in dB.
+    #[serde(serialize_with = "serialize_number")]
+    pub pooled_psnr_db: f64,
+    /// Mean of [`Scores::ssim`].
+    #[serde(serialize_with = "serialize_number")]
+    pub ssim: f64,
+    /// Mean of [`Scores::ssim_mirrored`].
+    #[serde(serialize_with = "serialize_number")]
+    pub ssim_mirrored: f64,
+    /// Mean FLIP.
+    #[serde(serialize_with = "serialize_number")]
+    pub flip: f64,
+    /// Mean of [`Scores::lpips`]; `None` if it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
+    /// Means after the best change of exposure; `None` if it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub aligned: Option<AlignedMeans>,
+}
+
+/// Means after the best change of exposure of each image.
+#[derive(Clone, Debug, Serialize)]
+pub struct AlignedMeans {
+    /// Mean PSNR, in dB.
+    #[serde(serialize_with = "serialize_number")]
+    pub psnr_db: f64,
+    /// Mean of [`Scores::ssim`].
+    #[serde(serialize_with = "serialize_number")]
+    pub ssim: f64,
+}
+
+/// What a repair changed: the mean after it minus the mean before. More is better for PSNR and SSIM, less for the others.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Gain {
+    /// In dB.
+    #[serde(serialize_with = "serialize_number")]
+    pub psnr_db: f64,
+    /// Of [`Scores::ssim`].
+    #[serde(serialize_with = "serialize_number")]
+    pub ssim: f64,
+    /// Of FLIP.
+    #[serde(serialize_with = "serialize_number")]
+    pub flip: f64,
+    /// Of LPIPS; `None` if it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
+}
+
+/// Means of the images of one camera.
+#[derive(Clone, Debug, Serialize)]
+pub struct CameraMeans {
+    /// Folder of the images' names.
+    pub camera: String,
+    /// The means.
+    #[serde(flatten)]
+    pub means: Means,
+}
+
+impl Means {
+    pub(super) fn of(images: &[&EvaluatedImage]) -> Self {
+        let counted = images.iter().copied().filter(|image| image.rendered.values > 0);
+        let counted: Vec<&EvaluatedImage> = counted.collect();
+        let rendered: Vec<&Scored> = counted.iter().map(|image| &image.rendered).collect();
+        let repaired: Vec<&Scored> =
+            counted.iter().filter_map(|image| image.repaired.as_ref()).collect();
+        let rendered = ScoreMeans::of(&rendered);
+        let repaired = (!repaired.is_empty()).then(|| ScoreMeans::of(&repaired));
+        let gain = repaired.as_ref().map(|repaired| Gain::of(&rendered, repaired));
+        let lidar = LidarMeans::of(images.iter().filter_map(|image| image.lidar.as_ref()));
+        Self { images: counted.len(), rendered, repaired, gain, lidar }
+    }
+}
+
+impl ScoreMeans {
+    fn of(scored: &[&Scored]) -> Self {
+        let mean = |value: &dyn Fn(&Scores) -> f64| {
+            // A mask may leave pixels, but no window.
+            mean_of(scored.iter().map(|scored| value(&scored.scores)).filter(|v| !v.is_nan()))
+        };
+        let is_aligned = scored.iter().any(|scored| scored.scores.aligned.is_some());
+        let aligned = |value: &dyn Fn(&AlignedScores) -> f64| {
+            mean(&|scores| scores.aligned.as_ref().map_or(f64::NAN, value))
+        };
+        let has_lpips = scored.iter().any(|scored| scored.scores.lpips.is_some());
+        Self {
+            psnr_db: mean(&|scores| scores.psnr_db),
+            pooled_psnr_db: pooled_psnr_db(
+                scored.iter().map(|scored| scored.squared_error).sum(),
+                scored.iter().map(|scored| scored.values).sum(),
+            ),
+            ssim: mean(&|scores| scores.ssim),
+            ssim_mirrored: mean(&|scores| scores.ssim_mirrored),
+            flip: mean(&|scores| scores.flip),
+            lpips: has_lpips.then(|| mean(&|scores| scores.lpips.unwrap_or(f64::NAN))),
+            aligned: is_aligned.then(|| AlignedMeans {
+                psnr_db: aligned(&|scores| scores.psnr_db),
+                ssim: aligned(&|scores| scores.ssim),
+            }),
+        }
+    }
+}
+
+impl Gain {
+    fn of(before: &ScoreMeans, after: &ScoreMeans) -> Self {
+        Self {
+            psnr_db: after.psnr_db - before.psnr_db,
+            ssim: after.ssim - before.ssim,
+            flip: after.flip - before.flip,
+            lpips: after.lpips.zip(before.lpips).map(|(after, before)| after - before),
+        }
+    }
+}

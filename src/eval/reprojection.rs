@@ -1,0 +1,70 @@
+//! Reprojection: a view beside the drive, brought back onto the real image that it was moved from.
+//!
+//! Beside the drive there is no real image. But most of what a view there shows was seen from the drive, and must have the
+//! same colours. What shines or is far off in depth differs, so this number has a floor; it compares methods on the
+//! same views.
+
+use serde::Serialize;
+
+use super::pair::{Pair, PairError};
+use super::scores::PairScores;
+use wildcity_render::compare::json_numbers::serialize_number;
+
+/// How far a view that was brought back is from the real image.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Reprojection {
+    /// Over the pixels that came back, in dB.
+    #[serde(serialize_with = "serialize_number")]
+    pub psnr_db: f64,
+    /// Mean LDR-FLIP of these pixels.
+    #[serde(serialize_with = "serialize_number")]
+    pub flip: f64,
+    /// Share of the real image's pixels that came back, from 0 to 1.
+    pub share: f64,
+}
+
+impl Reprojection {
+    /// Compares. `truth` and `back` are `[height, width, 3]` in 8 bits; `valid` is `[height, width]`, above 0 where `back`
+    /// has a value; `counts` says which pixels of the real image count, all without it.
+    ///
+    /// # Errors
+    /// [`PairError::Size`].
+    pub fn of(
+        size_px: [u32; 2],
+        truth: &[u8],
+        back: &[u8],
+        valid: &[f32],
+        counts: Option<&[bool]>,
+    ) -> Result<Self, PairError> {
+        let counted = valid.iter().enumerate().map(|(pixel, valid)| {
+            *valid > 0.0 && counts.is_none_or(|counts| counts.get(pixel) == Some(&true))
+        });
+        let pair = Pair::new(size_px, truth.to_vec(), back.to_vec(), Some(counted.collect()))?;
+        let scores = PairScores::of(&pair, false).scores;
+        Ok(Self { psnr_db: scores.psnr_db, flip: scores.flip, share: scores.counted })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_that_do_not_come_back_or_do_not_count_are_left_out() {
+        let truth = vec![100; 3 * 16];
+        let mut back = vec![110; 3 * 16];
+        back[..3].fill(0);
+        back[3 * 15..].fill(255);
+        let mut valid = vec![1.0; 16];
+        valid[0] = 0.0;
+        let mut counts = vec![true; 16];
+        counts[15] = false;
+        let of = |counts| Reprojection::of([4, 4], &truth, &back, &valid, counts).unwrap();
+        let found = of(Some(&counts[..]));
+        assert!((found.psnr_db - 20.0 * 25.5_f64.log10()).abs() < 1e-12, "{found:?}");
+        assert_eq!(found.share, 14.0 / 16.0);
+        assert!(of(None).psnr_db < found.psnr_db - 3.0, "the last pixel counts then");
+        let error = Reprojection::of([4, 4], &truth, &back, &valid[1..], None).unwrap_err();
+        assert!(error.to_string().starts_with("the mask has 15 values"), "{error}");
+    }
+}
