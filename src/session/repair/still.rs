@@ -7,22 +7,22 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use wildcity_render::{Backend, RenderError, View};
+use wildcity_render::{Backend, View};
 use wildcity_repair::reference::{Rays, Reference, ReferenceCache};
 use wildcity_repair::{InputRole, Model, RepairError};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
 use wildcity_scene::views::RecordedView;
-use wildcity_twin::residency::{ResidencyError, Resident};
-use wildcity_twin::store::{Catalog, StoreError};
+use wildcity_twin::residency::Resident;
+use wildcity_twin::store::Catalog;
 
-use super::drawn::{self, Beside, Sight};
+use super::drawn::{Beside, Sight};
+use super::offline::ReferenceSupply;
 use super::references::{ReferenceSource, ReferenceView, ReferenceViews};
 use super::rendered_image::RenderedImage;
 use super::session_repair;
-use crate::record::format::profile_hash;
-use crate::viewpoint::viewpoints;
+use crate::error::SessionError;
 
 /// A recorded image is one that is compared if it is so near to it, in metres ..
 const SAME_PLACE_M: f64 = 0.05;
@@ -87,15 +87,9 @@ pub enum StillRepairError {
         /// Its scale.
         scale: u32,
     },
-    /// The twin or a recorded image cannot be read.
+    /// The twin or a recorded image cannot be read, or a reference cannot be drawn.
     #[error(transparent)]
-    Store(#[from] StoreError),
-    /// What a reference shows could not be loaded.
-    #[error(transparent)]
-    Residency(#[from] ResidencyError),
-    /// A reference could not be drawn.
-    #[error(transparent)]
-    Render(#[from] RenderError),
+    Reference(#[from] SessionError),
     /// The model failed.
     #[error(transparent)]
     Model(#[from] RepairError),
@@ -225,18 +219,9 @@ impl StillRepair {
         profile: &RenderProfile,
         backend: &dyn Backend,
     ) -> Result<Arc<Reference>, StillRepairError> {
-        let version = &twin.resident.version;
-        let key = view.key(&version.hash, &profile_hash(profile));
-        if let Some(known) = self.cache.get(&key) {
-            return Ok(known);
-        }
-        let image = drawn::read(&twin.catalog, version, view)?;
-        let scene = twin.resident.scene(&viewpoints(&[view.view()]), profile)?;
-        let projection = views.projection(&view.camera);
-        let drawn = drawn::draw(view, image, projection, &scene, profile, backend)?;
-        let reference = Arc::new(drawn);
-        self.cache.insert(key, reference.clone());
-        Ok(reference)
+        let StillTwin { catalog, resident, .. } = twin;
+        let supply = ReferenceSupply { resident, profile, backend, catalog, cache: &self.cache };
+        Ok(supply.reference(views, view)?)
     }
 }
 
@@ -251,7 +236,7 @@ impl StillTwin {
         let mut views = None;
         if needs_images {
             let version = resident.version.clone();
-            let mut table = catalog.views(&version)?;
+            let mut table = catalog.views(&version).map_err(SessionError::from)?;
             let had = table.len();
             table.retain(|view| !is_held_out(view, held_out));
             left_out = had - table.len();
