@@ -343,22 +343,25 @@ fn seen(points_m: &[DVec3], map: &DepthMap<'_>) -> Vec<Seen> {
     points_m.iter().filter_map(project).collect()
 }
 
-/// Those without a nearer one within [`SAME_PX`]: the others may be hidden behind it.
-fn nearest(seen: Vec<Seen>) -> Vec<Seen> {
+/// From the nearest on, those without one of them within [`SAME_PX`]: the others may be hidden behind it.
+fn nearest(mut seen: Vec<Seen>) -> Vec<Seen> {
+    seen.sort_by(|a, b| a.depth_m.total_cmp(&b.depth_m));
     let cell_of = |at_px: DVec2| [at_px.x, at_px.y].map(|at| (at / SAME_PX).floor() as i32);
-    let mut cells: HashMap<[i32; 2], Vec<usize>> = HashMap::new();
-    for (index, one) in seen.iter().enumerate() {
-        cells.entry(cell_of(one.at_px)).or_default().push(index);
-    }
-    let is_hidden = |one: &Seen| {
+    let mut cells: HashMap<[i32; 2], Vec<DVec2>> = HashMap::new();
+    let mut kept = Vec::new();
+    for one in seen {
         let [x, y] = cell_of(one.at_px);
-        let around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [x + dx, y + dy]));
-        around.filter_map(|cell| cells.get(&cell)).flatten().any(|&other| {
-            let other = &seen[other];
-            other.depth_m < one.depth_m && other.at_px.distance(one.at_px) <= SAME_PX
-        })
-    };
-    seen.iter().filter(|one| !is_hidden(one)).copied().collect()
+        let mut around = (-1..=1).flat_map(|dy| (-1..=1).map(move |dx| [x + dx, y + dy]));
+        let is_hidden = around.any(|cell| {
+            let of_cell = cells.get(&cell).into_iter().flatten();
+            of_cell.into_iter().any(|nearer_px| nearer_px.distance(one.at_px) <= SAME_PX)
+        });
+        if !is_hidden {
+            cells.entry([x, y]).or_default().push(one.at_px);
+            kept.push(one);
+        }
+    }
+    kept
 }
 
 fn median(sorted: &[f64]) -> f64 {

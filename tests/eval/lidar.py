@@ -57,16 +57,17 @@ def in_world(points, point_times, rig_from_lidar):
 
 
 def depth(world, camera, depth_map, opacity, counts):
-    """Of each point without a nearer one within 2 px: rendered depth minus its own."""
+    """From the nearest point on, of each without another of them within 2 px: rendered depth minus its own."""
     points = (world - camera[:3, 3]) @ camera[:3, :3]
     points = points[points[:, 2] > 0]
     at = points[:, :2] / points[:, 2:] * [FX, FY] + [CX, CY]
     within = ((at >= 0) & (at < [WIDTH, HEIGHT])).all(axis=1)
     at, z = at[within], points[within, 2]
-    apart = np.linalg.norm(at[:, None] - at[None], axis=-1)
-    hidden = ((apart <= 2) & (z[None] < z[:, None])).any(axis=1)
+    kept = np.zeros(len(z), dtype=bool)
+    for index in np.argsort(z, kind="stable"):
+        kept[index] = not (np.linalg.norm(at[kept] - at[index], axis=-1) <= 2).any()
     columns, rows = at.astype(int).T
-    used = ~hidden & counts[rows, columns] & (opacity[rows, columns] >= 0.5)
+    used = kept & counts[rows, columns] & (opacity[rows, columns] >= 0.5)
     used &= (depth_map[rows, columns] > 0) & (z < 80)
     errors = np.abs(depth_map[rows, columns].astype(np.float64) - z)[used]
     bins = []

@@ -10,8 +10,8 @@ use wildcity_repair::{Image, LoadOptions, Network};
 /// `--lpips` and `--features`.
 #[derive(Debug, clap::Args)]
 pub(super) struct NetworkOptions {
-    /// Manifest of a network that gives the distance of two images, as LPIPS (docs/evaluation.md;
-    /// `python -m wildcity.export_lpips` makes one). Pixels that do not count are replaced by the real image's.
+    /// Manifest of a network that gives the distance of two images, as LPIPS (docs/evaluation.md). Pixels that do not
+    /// count are replaced by the real image's.
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
 
