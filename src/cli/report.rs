@@ -109,8 +109,8 @@ pub(super) struct Command {
     #[arg(requires = "repair", allow_negative_numbers = true)]
     offsets: Vec<f64>,
 
-    /// Twin that shows what is true, for --repair on a twin that was spoiled: NAME, or NAME@NUMBER. Without it nobody
-    /// knows what is true beside a drive, and only times and flicker are measured.
+    /// Twin that shows what is true, for --repair on a twin that was spoiled: NAME, or NAME@NUMBER. Without it,
+    /// what is true beside a drive is unknown, and only times and flicker are measured.
     #[arg(long, value_name = "TWIN", requires = "repair")]
     truth: Option<TwinVersion>,
 

@@ -123,7 +123,7 @@ fn options_of_repair_need_a_model_and_are_checked_first() {
     assert!(said(&refused).contains("nowhere.json: No such file"), "{}", said(&refused));
     let model = root().join("scenes/repair.json").display().to_string();
     let library = library().display().to_string();
-    let given = ["--repair", &model, "--onnxruntime", &library, "--truth", "nobody"];
+    let given = ["--repair", &model, "--onnxruntime", &library, "--truth", "missing"];
     let refused = report(dir.path(), &given).output().unwrap();
-    assert!(said(&refused).contains("--truth nobody"), "{}", said(&refused));
+    assert!(said(&refused).contains("--truth missing"), "{}", said(&refused));
 }

@@ -37,7 +37,7 @@ pub struct RepairBenchmark<'a> {
     pub resident: &'a Arc<Resident>,
     /// Where it is stored, with its recorded images.
     pub catalog: &'a Catalog,
-    /// The twin that shows what is true; none if nobody knows.
+    /// The twin that shows what is true; none if it is unknown.
     pub truth: Option<&'a Arc<Resident>>,
     /// What renders.
     pub backend: &'a dyn Backend,
@@ -66,7 +66,7 @@ pub struct RepairSubject {
     pub read: usize,
     /// See `read`.
     pub read_ms: f64,
-    /// What is true; none if nobody knows.
+    /// What is true; none if it is unknown.
     pub truth: Option<Truth>,
     /// The models, in the order of the rows.
     pub models: Vec<RepairedModel>,

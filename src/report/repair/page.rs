@@ -39,7 +39,7 @@ fn introduction(report: &RepairReport) -> Markup {
             }
         } @else {
             p.miss {
-                "There is no PSNR, FLIP or gain: nobody knows how these views truly look. For a twin that was spoiled, "
+                "There is no PSNR, FLIP or gain: how these views truly look is unknown. For a twin that was spoiled, "
                 "--truth names the twin that it was made from."
             }
         }
@@ -149,8 +149,7 @@ impl Below {
         match self.gain_db {
             None => format!("none of {images} images is repaired"),
             Some(gain_db) => format!(
-                "{repaired} of {images} images are repaired, {gain_db:+.2} dB on average, and {worse} of them are \
-                 worse than rendered"
+                "{repaired} of {images} images are repaired, {gain_db:+.2} dB on average; worse than rendered: {worse}"
             ),
         }
     }
