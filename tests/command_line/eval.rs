@@ -11,10 +11,10 @@ use crate::data::real;
 use crate::in_folder::{done, refused};
 use crate::scene_files::{gaussians, inria_columns, ply};
 
-const WIDTH: u32 = 120;
-const HEIGHT: u32 = 80;
+pub(crate) const WIDTH: u32 = 120;
+pub(crate) const HEIGHT: u32 = 80;
 /// What is added to each value of the image `b`, of 255.
-const OFF: u8 = 10;
+pub(crate) const OFF: u8 = 10;
 
 /// Names, positions and the rows of `R_world_to_cam` of cameras that look at the origin, each rolled a little.
 fn cameras() -> Vec<(&'static str, DVec3, [DVec3; 3])> {
@@ -71,7 +71,7 @@ fn write_colmap(dir: &Path) {
 }
 
 /// A scene, a camera list, and images that the program rendered; `b` is brighter by [`OFF`].
-fn capture() -> tempfile::TempDir {
+pub(crate) fn capture() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     let at = dir.path();
     let mut scene = gaussians(300, 1, 1.5, 7);
@@ -102,7 +102,7 @@ fn capture() -> tempfile::TempDir {
     dir
 }
 
-fn eval(dir: &Path, scene: &str, images: &str, more: &[&str]) -> (String, Value) {
+pub(crate) fn eval(dir: &Path, scene: &str, images: &str, more: &[&str]) -> (String, Value) {
     let fixed = [
         "eval",
         scene,

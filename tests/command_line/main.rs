@@ -16,8 +16,12 @@ mod gpu;
 mod http;
 #[path = "../support/images.rs"]
 mod images;
+#[path = "../support/onnx_doubles.rs"]
+mod onnx_doubles;
 #[path = "../support/onnx_models.rs"]
 mod onnx_models;
+#[path = "../support/onnx_protobuf.rs"]
+mod onnx_protobuf;
 #[path = "../support/places.rs"]
 mod places;
 #[path = "../support/reported.rs"]
@@ -50,6 +54,7 @@ mod demo;
 mod devices;
 mod episode;
 mod eval;
+mod eval_networks;
 mod garbage;
 mod generate;
 mod hang_up;

@@ -231,3 +231,30 @@ pub(crate) fn warped_where_valid() -> Vec<u8> {
     }
     .onnx()
 }
+
+/// The mean absolute difference of `image` and `truth`: one number.
+pub(crate) fn distance() -> Vec<u8> {
+    Graph {
+        nodes: vec![
+            node("Sub", &["image", "truth"], &["difference"], &[]),
+            node("Abs", &["difference"], &["absolute"], &[]),
+            node("GlobalAveragePool", &["absolute"], &["channels"], &[]),
+            node("ReduceMean", &["channels"], &["distance"], &[int("keepdims", 0)]),
+        ],
+        constants: Vec::new(),
+        inputs: vec![port("image", F32, &IMAGE), port("truth", F32, &IMAGE)],
+        outputs: vec![port("distance", F32, &[])],
+    }
+    .onnx()
+}
+
+/// The mean of each channel of `image`: three features.
+pub(crate) fn mean_color() -> Vec<u8> {
+    Graph {
+        nodes: vec![node("GlobalAveragePool", &["image"], &["features"], &[])],
+        constants: Vec::new(),
+        inputs: vec![port("image", F32, &IMAGE)],
+        outputs: vec![port("features", F32, &[Some(1), Some(3), Some(1), Some(1)])],
+    }
+    .onnx()
+}
