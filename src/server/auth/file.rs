@@ -8,19 +8,10 @@ use serde::Deserialize;
 
 use wildcity_twin::ingest;
 
+use super::error::TokensError;
 use super::grant::{Grant, Role, TokenLimits};
 use super::tokens::{Secret, Token, Tokens};
 use crate::limits;
-
-/// Why a file of tokens cannot be used. The message contains no token.
-#[derive(Debug, thiserror::Error)]
-#[error("{location}: {reason}")]
-pub struct TokensError {
-    /// The location in the file, as `tokens[2].hash`.
-    pub location: String,
-    /// What is wrong, and what is expected.
-    pub reason: String,
-}
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -2,11 +2,12 @@
 //!
 //! A server without tokens listens on a loopback address only, and every client may do everything.
 
+mod error;
 mod file;
 mod grant;
 mod tokens;
 
-pub use file::TokensError;
+pub use error::TokensError;
 pub use grant::Role;
 pub use tokens::Tokens;
 

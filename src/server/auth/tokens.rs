@@ -8,7 +8,7 @@ use blake3::Hash;
 use parking_lot::Mutex;
 use sha2::{Digest as _, Sha256};
 
-use super::file::TokensError;
+use super::error::TokensError;
 use super::grant::{Grant, Role};
 use crate::fault::Fault;
 
