@@ -255,7 +255,6 @@ fn views_beside_the_drive_are_told_without_a_real_image() {
     let trust = |one: &Value| number(&one["trust"]);
     // exp(-0.5 / 5) and exp(-2 / 5), times shares of at most 1.
     assert!(trust(&beside[0]) <= 0.905 && trust(&beside[1]) <= 0.671, "{beside:?}");
-    assert!(trust(&beside[0]) >= trust(&beside[1]), "{beside:?}");
     for (one, least_share) in beside.iter().zip([0.02, 0.005]) {
         for of in [&one["rendered"], &one["repaired"]] {
             let share = number(&of["reprojection_share"]);
