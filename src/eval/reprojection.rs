@@ -57,7 +57,7 @@ mod tests {
         back[3 * 15..].fill(255);
         let mut valid = vec![1.0; 16];
         valid[0] = 0.0;
-        let mut counts = vec![true; 16];
+        let mut counts = [true; 16];
         counts[15] = false;
         let of = |counts| Reprojection::of([4, 4], &truth, &back, &valid, counts).unwrap();
         let found = of(Some(&counts[..]));
