@@ -153,8 +153,8 @@ pub struct LidarMeans {
 }
 
 impl LidarPoints {
-    /// Reads a safetensors file: `points_m` [n, 3] (f32 or f64), `time_us` [n] (i64); and perhaps `rig_from_lidar` [4, 4]
-    /// (f64, identity without it), `pose_time_us` [m] (i64) and `world_from_rig` [m, 4, 4] (f64).
+    /// Reads a safetensors file: `points_m` `[n, 3]` (f32 or f64), `time_us` `[n]` (i64); and perhaps `rig_from_lidar` `[4, 4]`
+    /// (f64, identity without it), `pose_time_us` `[m]` (i64) and `world_from_rig` `[m, 4, 4]` (f64).
     ///
     /// # Errors
     /// Names the tensor that is missing or cannot be used. Points that are not finite are left out.
