@@ -16,6 +16,7 @@ use serde::Deserialize;
 use crate::limits;
 
 use super::catalog::check_name;
+use super::layout::COLLECTION;
 use super::lease::{self, LeaseRecord};
 use super::{Catalog, StoreError};
 
@@ -52,8 +53,6 @@ pub struct ObjectTotals {
 /// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
-/// The folder of the state of garbage collection.
-const FOLDER: &str = "gc";
 /// Age of what a stopped process left of a side file, in microseconds: a day, in which every write ends.
 const LEFTOVER_AGE_US: i64 = 86_400_000_000;
 /// The side file with the candidates.
@@ -106,7 +105,7 @@ impl Catalog {
                 lease.remove(self, name)?;
             }
         }
-        for folder in [lease::FOLDER, FOLDER] {
+        for folder in [lease::FOLDER, COLLECTION] {
             let before_us = now_us.saturating_sub(LEFTOVER_AGE_US);
             self.objects.remove_leftovers(name, folder, before_us)?;
         }
