@@ -112,15 +112,14 @@ impl Local {
         }
     }
 
-    /// Creates the directory for commits in preparation. Nothing in it need survive a power cut.
-    pub(super) fn create_staging(&self) -> Result<(), StoreError> {
-        let staging = self.root.join(STAGING);
-        if self.exists(&staging)? { Ok(()) } else { create_dirs(&*self.disk, &staging) }
+    /// Creates a directory of which nothing need survive a power cut: of commits in preparation, and of locks.
+    pub(super) fn create_transient(&self, dir: &Path) -> Result<(), StoreError> {
+        if self.exists(dir)? { Ok(()) } else { create_dirs(&*self.disk, dir) }
     }
 
     /// Waits until no other process publishes a version of a twin, takes the publish lock, and settles the twin.
     pub(super) fn lock_publishing(&self, name: &str) -> Result<Option<Lock>, StoreError> {
-        self.create_staging()?;
+        self.create_transient(&self.root.join(STAGING))?;
         let lock = self.publish_lock(name, Wait::Yes)?;
         self.settle(name)?;
         Ok(lock)

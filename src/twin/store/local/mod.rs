@@ -296,7 +296,7 @@ impl ObjectBackend for Local {
 
     fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError> {
         let path = self.root.join(name).join(file);
-        create_parent(&*self.disk, &path)?;
+        path.parent().map_or(Ok(()), |dir| self.create_transient(dir))?;
         self.disk.lock(&path, Wait::Yes).map_err(StoreError::io("lock", &path))
     }
 

@@ -34,7 +34,7 @@ impl LocalStaging {
     pub(super) fn begin(local: &Local, name: &str, commit: &str) -> Result<Self, StoreError> {
         // Removing abandoned directories takes this lock, too, and must not find this one before
         // its own lock is taken.
-        local.create_staging()?;
+        local.create_transient(&local.root.join(STAGING))?;
         let _publish_lock = local.publish_lock(name, Wait::Yes)?;
         let dir = local.root.join(STAGING).join(format!("{name}{SEPARATOR}{commit}"));
         local.disk.create_dir(&dir).map_err(StoreError::io("create", &dir))?;
