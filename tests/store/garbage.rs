@@ -139,6 +139,42 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
     });
 }
 
+/// An object that was noted as garbage of an old version may be one of a newer version, which is not noted yet.
+#[test]
+fn a_version_loses_all_of_its_objects_or_none() {
+    everywhere(|place| {
+        let keep = Retention { versions: 1, grace: NOW };
+        let is_sound = |catalog: &Catalog, gone: &[u64]| {
+            let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+            assert!(checked.is_sound(), "{checked:?}");
+            assert_eq!(checked.collected, gone);
+        };
+        let catalog = twin(place, 3);
+        catalog.collect("street", keep, false).unwrap();
+        // Version 4 has the cell of version 2 again, and version 5 has not.
+        change(&catalog, [3, 3], 2).change(3, cells_alone()).unwrap();
+        change(&catalog, [3, 3], 5).change(4, cells_alone()).unwrap();
+        let second = catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2]);
+        // The manifests and tables of versions 1 and 2; the chunk of version 2 is needed.
+        assert_eq!((second.removed.objects, second.noted.objects), (4, 2 * OWN));
+        let third = catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2, 3, 4]);
+        assert_eq!((third.removed, third.noted), (second.noted, ObjectTotals::default()));
+
+        // A rollback needs the objects again, and writes none of them.
+        change(&catalog, [3, 3], 6).change(5, cells_alone()).unwrap();
+        catalog.collect("street", keep, false).unwrap();
+        catalog.rollback("street", 5).unwrap();
+        change(&catalog, [9, 9], 1).change(7, cells_alone()).unwrap();
+        change(&catalog, [3, 3], 7).change(8, cells_alone()).unwrap();
+        catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2, 3, 4, 5, 7]);
+        catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 7, 8]);
+    });
+}
+
 /// Holds in a directory. In an object store, only the grace period protects objects that no version
 /// names yet.
 #[test]
