@@ -151,27 +151,31 @@ fn a_version_loses_all_of_its_objects_or_none() {
         };
         let catalog = twin(place, 3);
         catalog.collect("street", keep, false).unwrap();
-        // Version 4 has the cell of version 2 again, and version 5 has not.
-        change(&catalog, [3, 3], 2).change(3, cells_alone()).unwrap();
-        change(&catalog, [3, 3], 5).change(4, cells_alone()).unwrap();
+        // Version 5 has the cell of version 2 again beside a new one, and version 6 has not.
+        let push = |cell, seed, base| {
+            change(&catalog, cell, seed).change(base, cells_alone()).unwrap();
+        };
+        push([9, 9], 1, 3);
+        push([3, 3], 2, 4);
+        push([3, 3], 5, 5);
         let second = catalog.collect("street", keep, false).unwrap();
         is_sound(&catalog, &[1, 2]);
-        // The manifests and tables of versions 1 and 2; the chunk of version 2 is needed.
-        assert_eq!((second.removed.objects, second.noted.objects), (4, 2 * OWN));
+        // The manifests and tables of versions 1 and 2 go; the chunk of version 2 is needed. Versions 3 and 4 share one.
+        assert_eq!((second.removed.objects, second.noted.objects), (4, 2 * OWN + 2));
         let third = catalog.collect("street", keep, false).unwrap();
-        is_sound(&catalog, &[1, 2, 3, 4]);
+        is_sound(&catalog, &[1, 2, 3, 4, 5]);
         assert_eq!((third.removed, third.noted), (second.noted, ObjectTotals::default()));
 
-        // A rollback needs the objects again, and writes none of them.
-        change(&catalog, [3, 3], 6).change(5, cells_alone()).unwrap();
+        // A rollback needs the objects again, and writes none of them. So does version 9.
+        push([3, 3], 6, 6);
         catalog.collect("street", keep, false).unwrap();
-        catalog.rollback("street", 5).unwrap();
-        change(&catalog, [9, 9], 1).change(7, cells_alone()).unwrap();
-        change(&catalog, [3, 3], 7).change(8, cells_alone()).unwrap();
+        assert_eq!(catalog.rollback("street", 6).unwrap().number, 8);
+        push([9, 9], 2, 8);
+        push([3, 3], 7, 9);
         catalog.collect("street", keep, false).unwrap();
-        is_sound(&catalog, &[1, 2, 3, 4, 5, 7]);
+        is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 8]);
         catalog.collect("street", keep, false).unwrap();
-        is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 7, 8]);
+        is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 7, 8, 9]);
     });
 }
 
