@@ -128,7 +128,8 @@ fn shrunk<H: History>(mut history: H, mut said: String, plant: Option<H::Plant>)
 fn run_or_panic<H: History>(what: &str, histories: u64) {
     let begun = Instant::now();
     let histories = number("HISTORIES").unwrap_or(histories);
-    if let Some(Failure { history, said }) = run::<H>(number("FIRST_SEED").unwrap_or(1), histories, None) {
+    let first = number("FIRST_SEED").unwrap_or(1);
+    if let Some(Failure { history, said }) = run::<H>(first, histories, None) {
         panic!("{said}\n{history}");
     }
     let took = begun.elapsed();
