@@ -206,6 +206,7 @@ impl Log {
     fn open(path: &Path, limit_bytes: u64) -> io::Result<Self> {
         let file = OpenOptions::new().create(true).append(true).open(path)?;
         let bytes = file.metadata()?.len();
+        sync_name(path);
         let mut log = Self { path: path.to_owned(), file, bytes, limit_bytes };
         log.end_cut_line()?;
         Ok(log)
@@ -257,15 +258,19 @@ impl Log {
             Ok(file) => {
                 self.file = file;
                 self.bytes = 0;
-                // The new name must survive a power cut as well. Not all file systems can do that.
-                let dir = self.path.parent().filter(|dir| !dir.as_os_str().is_empty());
-                let _ = File::open(dir.unwrap_or(Path::new("."))).and_then(|dir| dir.sync_all());
+                sync_name(&self.path);
             }
             Err(error) => {
                 tracing::error!("the audit log is not rotated: {}: {error}", self.path.display());
             }
         }
     }
+}
+
+/// Makes the name of a file durable, as its lines are: otherwise a power cut takes both. Not all file systems can.
+fn sync_name(path: &Path) {
+    let dir = path.parent().filter(|dir| !dir.as_os_str().is_empty());
+    let _ = File::open(dir.unwrap_or(Path::new("."))).and_then(|dir| dir.sync_all());
 }
 
 #[cfg(test)]

@@ -149,7 +149,8 @@ fn not_found() -> io::Error {
 
 impl SimDisk {
     pub(crate) fn new(clock: Arc<SimClock>, plant: Option<Plant>) -> Self {
-        let names = Names::from([(PathBuf::from(ROOT), Node::Dir)]);
+        let names = ["/", ROOT].map(|dir| (PathBuf::from(dir), Node::Dir));
+        let names = Names::from(names);
         let state = State {
             live: names.clone(),
             durable: names,
@@ -331,8 +332,7 @@ impl State {
             let new = self.live.get(&path);
             let node = if old != new && random.once_in(2) { new } else { old };
             // Without its directory, a name is lost. Parents come first.
-            let has_parent =
-                path == Path::new(ROOT) || path.parent().is_some_and(|dir| after.contains_key(dir));
+            let has_parent = path.parent().is_none_or(|dir| after.contains_key(dir));
             if let Some(node) = node.filter(|_| has_parent) {
                 after.insert(path, *node);
             }

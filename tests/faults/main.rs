@@ -14,7 +14,7 @@
 //!
 //! A history follows from its seed alone. A failure prints the seed and the shortest history that still fails; `SEED=n
 //! cargo test -p wildcity-twin --test faults one_history` runs one on both, and `HISTORIES=n ... many_histories` any
-//! number.
+//! number, from the seed `FIRST_SEED` on.
 
 mod assets;
 mod bucket;
@@ -24,6 +24,7 @@ mod history;
 mod medium;
 mod random;
 mod reads;
+mod unsynced;
 mod world;
 
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -39,6 +40,9 @@ const HISTORIES: u64 = 4_000;
 /// Histories in the gate, in an object store, whose requests run on a thread of their own.
 const BUCKET_HISTORIES: u64 = 1_500;
 
+/// Histories after which the progress is printed.
+const HISTORIES_TO_TELL: u64 = 10_000;
+
 /// Histories within which a planted fault must be found.
 const HISTORIES_TO_FIND: u64 = 1_000;
 
@@ -47,9 +51,9 @@ fn number(variable: &str) -> Option<u64> {
     Some(text.parse().unwrap_or_else(|_| panic!("{variable} is {text:?}, not a number")))
 }
 
-/// Runs histories of the seeds from 1 on, on all cores. Returns the first failure, shrunk.
-fn run(kind: Kind, histories: u64, plant: Option<Plant>) -> Option<Failure> {
-    let next = AtomicU64::new(1);
+/// Runs histories of the seeds from `first` on, on all cores. Returns the first failure, shrunk.
+fn run(kind: Kind, first: u64, histories: u64, plant: Option<Plant>) -> Option<Failure> {
+    let next = AtomicU64::new(first);
     let failed = AtomicU64::new(u64::MAX);
     let threads = std::thread::available_parallelism().map_or(1, |threads| threads.get());
     std::thread::scope(|scope| {
@@ -57,11 +61,14 @@ fn run(kind: Kind, histories: u64, plant: Option<Plant>) -> Option<Failure> {
             scope.spawn(|| {
                 loop {
                     let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed > histories || failed.load(Ordering::Relaxed) < seed {
+                    if seed >= first + histories || failed.load(Ordering::Relaxed) < seed {
                         return;
                     }
                     if History::of(seed).run(kind, plant).is_err() {
                         failed.fetch_min(seed, Ordering::Relaxed);
+                    }
+                    if seed.is_multiple_of(HISTORIES_TO_TELL) {
+                        eprintln!("seed {seed} on a {kind:?}");
                     }
                 }
             });
@@ -73,7 +80,8 @@ fn run(kind: Kind, histories: u64, plant: Option<Plant>) -> Option<Failure> {
 
 fn run_or_panic(kind: Kind, histories: u64) {
     let begun = Instant::now();
-    if let Some(failure) = run(kind, histories, None) {
+    let histories = number("HISTORIES").unwrap_or(histories);
+    if let Some(failure) = run(kind, number("FIRST_SEED").unwrap_or(1), histories, None) {
         panic!("{failure}");
     }
     let took = begun.elapsed();
@@ -82,12 +90,12 @@ fn run_or_panic(kind: Kind, histories: u64) {
 
 #[test]
 fn many_histories() {
-    run_or_panic(Kind::Disk, number("HISTORIES").unwrap_or(HISTORIES));
+    run_or_panic(Kind::Disk, HISTORIES);
 }
 
 #[test]
 fn many_histories_in_an_object_store() {
-    run_or_panic(Kind::Bucket, number("HISTORIES").unwrap_or(BUCKET_HISTORIES));
+    run_or_panic(Kind::Bucket, BUCKET_HISTORIES);
 }
 
 #[test]
@@ -115,7 +123,7 @@ fn planted_faults_are_found() {
         (Kind::Bucket, Plant::RecordReplaced),
     ];
     for (kind, plant) in plants {
-        let failure = run(kind, HISTORIES_TO_FIND, Some(plant));
+        let failure = run(kind, 1, HISTORIES_TO_FIND, Some(plant));
         let failure = failure.unwrap_or_else(|| panic!("{plant:?} on a {kind:?} is not found"));
         let operations = failure.history.operations.len();
         assert!(operations <= 6, "{plant:?} on a {kind:?} is not shrunk: {failure}");

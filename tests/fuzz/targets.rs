@@ -7,18 +7,21 @@
 use std::fs;
 
 use wildcity_client::Observation;
+use wildcity_convert::{geojson, opendrive, openscenario as xosc};
 use wildcity_protocol::message::Request;
 use wildcity_scene::{Rig, Trajectory};
 use wildcity_server::Tokens;
 use wildcity_session::RecordedEpisode;
-use wildcity_twin::ingest;
+use wildcity_sim::map::{Map, MapFile};
+use wildcity_sim::scenario::{Document, TracksFile};
+use wildcity_twin::ingest::{self, capture as captures};
 use wildcity_twin::store::Catalog;
 
 /// A target: its name, which is also that of its folder in the corpus, and its function.
 type Target = (&'static str, fn(&[u8]));
 
 /// All targets.
-pub(crate) const TARGETS: [Target; 8] = [
+pub(crate) const TARGETS: [Target; 12] = [
     ("scene", scene),
     ("record", record),
     ("observation", observation),
@@ -27,6 +30,10 @@ pub(crate) const TARGETS: [Target; 8] = [
     ("tokens", tokens),
     ("rig", rig),
     ("trajectory", trajectory),
+    ("scenario", scenario),
+    ("map", map),
+    ("openscenario", openscenario),
+    ("capture", capture),
 ];
 
 /// A scene file of any format.
@@ -93,5 +100,46 @@ pub(crate) fn rig(data: &[u8]) {
 pub(crate) fn trajectory(data: &[u8]) {
     if let Ok(trajectory) = serde_json::from_slice::<Trajectory>(data) {
         let _ = trajectory.check();
+    }
+}
+
+/// A file of a scenario, or of recorded tracks.
+pub(crate) fn scenario(data: &[u8]) {
+    if let Ok(document) = Document::parse(data) {
+        let _ = document.with(&document.first_values());
+    }
+    if let Ok(tracks) = TracksFile::parse(data) {
+        let _ = tracks.check();
+    }
+}
+
+/// A map, of any format.
+pub(crate) fn map(data: &[u8]) {
+    let of_opendrive = opendrive::read(data).ok().map(|imported| imported.map);
+    let files = [MapFile::parse(data).ok(), geojson::read(data, None).ok(), of_opendrive];
+    for file in files.into_iter().flatten() {
+        Map::new(file).expect("a file that was read makes a map");
+    }
+}
+
+/// A scenario of OpenSCENARIO.
+pub(crate) fn openscenario(data: &[u8]) {
+    let [name, twin, ego] = ["drive", "city", "Ego"].map(str::to_owned);
+    let settings = xosc::Settings { name, twin, ego };
+    let _ = xosc::read(data, &settings);
+}
+
+/// The cameras of a capture: transforms.json, or cameras and images of COLMAP with a line of `===` between them.
+pub(crate) fn capture(data: &[u8]) {
+    let dir = tempfile::tempdir().expect("a directory");
+    let file = |name: &str| dir.path().join(name);
+    fs::write(file("transforms.json"), data).expect("written");
+    let _ = captures::read_nerfstudio_frames(&file("transforms.json"));
+    let Some(at) = data.windows(4).position(|part| part == b"===\n") else { return };
+    // Binary files hide those of text, and come after them.
+    for ending in ["txt", "bin"] {
+        fs::write(file(&format!("cameras.{ending}")), &data[..at]).expect("written");
+        fs::write(file(&format!("images.{ending}")), &data[at + 4..]).expect("written");
+        let _ = captures::read_colmap(dir.path());
     }
 }

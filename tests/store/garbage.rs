@@ -139,6 +139,46 @@ fn an_object_that_is_put_again_is_no_garbage_any_more() {
     });
 }
 
+/// An object that was noted as garbage of an old version may be one of a newer version, which is not noted yet.
+#[test]
+fn a_version_loses_all_of_its_objects_or_none() {
+    everywhere(|place| {
+        let keep = Retention { versions: 1, grace: NOW };
+        let is_sound = |catalog: &Catalog, gone: &[u64]| {
+            let checked = catalog.fsck("street", &mut |_, _| {}).unwrap();
+            assert!(checked.is_sound(), "{checked:?}");
+            assert_eq!(checked.collected, gone);
+        };
+        let catalog = twin(place, 3);
+        catalog.collect("street", keep, false).unwrap();
+        // Version 5 has the cell of version 2 again beside a new one, and version 6 has not.
+        let push = |cell, seed, base| {
+            change(&catalog, cell, seed).change(base, cells_alone()).unwrap();
+        };
+        push([9, 9], 1, 3);
+        push([3, 3], 2, 4);
+        push([3, 3], 5, 5);
+        let second = catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2]);
+        // The manifests and tables of versions 1 and 2 go; the chunk of version 2 is needed. Versions 3 and 4 share one.
+        assert_eq!((second.removed.objects, second.noted.objects), (4, 2 * OWN + 2));
+        let third = catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2, 3, 4, 5]);
+        assert_eq!((third.removed, third.noted), (second.noted, ObjectTotals::default()));
+
+        // A rollback needs the objects again, and writes none of them. So does version 9.
+        push([3, 3], 6, 6);
+        catalog.collect("street", keep, false).unwrap();
+        assert_eq!(catalog.rollback("street", 6).unwrap().number, 8);
+        push([9, 9], 2, 8);
+        push([3, 3], 7, 9);
+        catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 8]);
+        catalog.collect("street", keep, false).unwrap();
+        is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 7, 8, 9]);
+    });
+}
+
 /// Holds in a directory. In an object store, only the grace period protects objects that no version
 /// names yet.
 #[test]

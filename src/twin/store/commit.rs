@@ -368,6 +368,7 @@ impl Commit {
                     if self.catalog.record(&self.name, number)?.commit.as_ref()
                         == Some(&self.id) =>
                 {
+                    self.staging.restore(&objects, number)?;
                     return Ok(Version { number, hash, created_us, manifest });
                 }
                 Err(StoreError::Conflict { .. }) if tries < limits::PUBLISH_TRIES => tries += 1,

@@ -4,18 +4,22 @@
 //! The first run notes them as candidates. A later run, after the grace period, removes the
 //! candidates that are still garbage and were not written since. So a process that reads a version
 //! at the first run has that long to lease it, and a commit that needs an object again has written
-//! it again. In a directory, publishing is locked while objects are removed. In an object store there is no
+//! it again. A version goes as a whole: as long as its manifest stays, all of its objects do, though some of them may
+//! have been noted before, as those of an older version. In a directory, publishing is locked while objects are removed. In an object store there is no
 //! lock: if a commit writes an object again in the very seconds in which it is removed, the object is lost.
 //! So run garbage collection there only while no push can need an object that has been garbage for a day.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::ErrorKind;
 use std::time::Duration;
 
 use serde::Deserialize;
 
 use crate::limits;
 
+use super::backend::ListedObject;
 use super::catalog::check_name;
+use super::layout::COLLECTION;
 use super::lease::{self, LeaseRecord};
 use super::{Catalog, StoreError};
 
@@ -52,8 +56,6 @@ pub struct ObjectTotals {
 /// microseconds since 1970.
 type Candidates = BTreeMap<String, i64>;
 
-/// The folder of the state of garbage collection.
-const FOLDER: &str = "gc";
 /// Age of what a stopped process left of a side file, in microseconds: a day, in which every write ends.
 const LEFTOVER_AGE_US: i64 = 86_400_000_000;
 /// The side file with the candidates.
@@ -66,7 +68,7 @@ const COLLECTED: &str = "gc/collected";
 struct CollectionPlan {
     report: CollectionReport,
     candidates: Candidates,
-    remove: Vec<String>,
+    remove: BTreeSet<String>,
     /// Versions that lose objects.
     gone: BTreeSet<u64>,
 }
@@ -97,7 +99,7 @@ impl Catalog {
                 // made while publishing is locked; in an object store, just before the removal.
                 plan = self.plan(name, keep, &before, now_us)?;
                 self.mark_collected(name, &plan.gone, now_us)?;
-                Ok(plan.remove.clone())
+                Ok(plan.remove.iter().cloned().collect())
             })?;
         }
         self.objects.write_side_file(name, CANDIDATES, &self.encode(&plan.candidates)?)?;
@@ -106,7 +108,7 @@ impl Catalog {
                 lease.remove(self, name)?;
             }
         }
-        for folder in [lease::FOLDER, FOLDER] {
+        for folder in [lease::FOLDER, COLLECTION] {
             let before_us = now_us.saturating_sub(LEFTOVER_AGE_US);
             self.objects.remove_leftovers(name, folder, before_us)?;
         }
@@ -165,35 +167,71 @@ impl Catalog {
         }
         let grace_us = i64::try_from(keep.grace.as_micros()).unwrap_or(i64::MAX);
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
-        let mut plan = CollectionPlan::default();
-        for object in self.objects.list_objects(name)?.whole()? {
-            if !object.is_file || named.contains(&object.hash) {
-                continue;
-            }
+        let mut found = self.objects.list_objects(name)?.whole()?;
+        found.retain(|object| object.is_file && !named.contains(&object.hash));
+        let is_removable = |object: &&ListedObject| {
             let noted_us = before.get(&object.hash).copied();
-            if noted_us.is_some_and(is_old) && is_old(object.written_us) {
+            noted_us.is_some_and(is_old) && is_old(object.written_us)
+        };
+        let removable = found.iter().filter(is_removable).map(|object| object.hash.clone());
+        let mut plan = CollectionPlan { remove: removable.collect(), ..CollectionPlan::default() };
+        let others = numbers.into_iter();
+        let others = others.filter(|number| !kept.contains(number) && !gone.contains(number));
+        self.keep_whole_versions(name, others.collect(), &is_old, &mut plan)?;
+        for object in &found {
+            let noted_us = before.get(&object.hash).copied();
+            if plan.remove.contains(&object.hash) {
                 plan.report.removed.add(object.bytes);
-                plan.remove.push(object.hash);
             } else if plan.candidates.len() < limits::GC_CANDIDATES {
                 plan.report.noted.add(object.bytes);
-                plan.candidates.insert(object.hash, noted_us.unwrap_or(now_us));
-            }
-        }
-        // Versions that lose their manifest. A damaged record names no object that could be removed. One that the disk
-        // fails to read may: its version would seem damaged if it lost objects and were not marked.
-        let loses = |number: &u64| !kept.contains(number) && !gone.contains(number);
-        let removes = !plan.remove.is_empty();
-        for number in numbers.into_iter().filter(|number| removes && loses(number)) {
-            let is_gone = match self.record(name, number) {
-                Err(StoreError::Damaged { .. }) => false,
-                record => plan.remove.contains(&record?.manifest),
-            };
-            if is_gone {
-                plan.gone.insert(number);
+                plan.candidates.insert(object.hash.clone(), noted_us.unwrap_or(now_us));
             }
         }
         plan.report.kept = kept.into_iter().collect();
         Ok(plan)
+    }
+
+    /// Decides which of the `others`, the versions that are not kept and not gone, go now: those that lose their
+    /// manifest. Objects that another of them needs stay until that one goes.
+    fn keep_whole_versions(
+        &self,
+        name: &str,
+        others: Vec<u64>,
+        is_old: &dyn Fn(i64) -> bool,
+        plan: &mut CollectionPlan,
+    ) -> Result<(), StoreError> {
+        if plan.remove.is_empty() {
+            return Ok(());
+        }
+        let mut manifests = Vec::new();
+        let mut needed = BTreeSet::new();
+        for number in others {
+            // A damaged record names no object that could be removed. One that the disk fails to read may: its version
+            // would seem damaged if it lost objects and were not marked.
+            let record = match self.record(name, number) {
+                Err(StoreError::Damaged { .. }) => continue,
+                record => record?,
+            };
+            let stays = !plan.remove.contains(&record.manifest) || !is_old(record.created_us);
+            if stays && !needed.contains(&record.manifest) {
+                match self.named_by(name, &record.manifest) {
+                    Ok(named) => needed.extend(named),
+                    // What is lost can be read no more.
+                    Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {}
+                    Err(error @ StoreError::Io { .. }) => return Err(error),
+                    // It is unknown what a damaged manifest names, until it goes itself.
+                    Err(_) => {
+                        plan.remove.clear();
+                        return Ok(());
+                    }
+                }
+            }
+            manifests.push((number, record.manifest));
+        }
+        plan.remove.retain(|object| !needed.contains(object));
+        let lost = manifests.into_iter().filter(|(_, hash)| plan.remove.contains(hash));
+        plan.gone = lost.map(|(number, _)| number).collect();
+        Ok(())
     }
 
     /// Hashes of a manifest and all objects that it names.

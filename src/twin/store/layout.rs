@@ -10,10 +10,19 @@ use super::StoreError;
 /// The folder of assets of actors, in place of a twin's name; no twin can have it.
 pub(super) const ACTORS: &str = ".actors";
 
+/// The folder of a twin's log records.
+pub(super) const LOG: &str = "log";
+
+/// The folder of a twin's objects.
+pub(super) const OBJECTS: &str = "objects";
+
+/// The folder of the state of garbage collection.
+pub(super) const COLLECTION: &str = "gc";
+
 /// Path of a log record below the root. The number has ten digits, so that names sort as numbers
 /// do.
 pub(super) fn record_key(name: &str, number: u64) -> String {
-    format!("{name}/log/{number:010}")
+    format!("{name}/{LOG}/{number:010}")
 }
 
 /// Ending of a side file that a process keeps locked while it uses the side file of the same name.
@@ -21,7 +30,7 @@ pub(super) const LOCK_ENDING: &str = ".lock";
 
 /// Path of an object below the root.
 pub(super) fn object_key(name: &str, hash: &str) -> String {
-    format!("{name}/objects/{}/{hash}", &hash[..2])
+    format!("{name}/{OBJECTS}/{}/{hash}", &hash[..2])
 }
 
 /// The version numbers among the file names of a log, ascending.

@@ -3,7 +3,7 @@
 //!
 //! A history follows from its seed, except for the order in which threads run. A failure prints the seed and the shortest
 //! history that still fails; `SEED=n cargo test -p wildcity-server --lib one_history` runs one of each kind, and
-//! `HISTORIES=n ... many_histories` any number.
+//! `HISTORIES=n ... many_histories` any number, from the seed `FIRST_SEED` on.
 //!
 //! Not simulated: TLS, the kernel's sockets, and a client that does not read until the time-out for it.
 
@@ -37,6 +37,9 @@ const UPLOAD_HISTORIES: u64 = 3_500;
 
 /// Histories of connections in the gate.
 const CONNECTION_HISTORIES: u64 = 1_000;
+
+/// Histories after which the progress is printed.
+const HISTORIES_TO_TELL: u64 = 10_000;
 
 /// Histories within which a planted fault must be found.
 const HISTORIES_TO_FIND: u64 = 1_000;
@@ -75,9 +78,9 @@ struct Failure<H> {
     said: String,
 }
 
-/// Runs histories of the seeds from 1 on, on all cores. Returns the first failure, shrunk.
-fn run<H: History>(histories: u64, plant: Option<H::Plant>) -> Option<Failure<H>> {
-    let next = AtomicU64::new(1);
+/// Runs histories of the seeds from `first` on, on all cores. Returns the first failure, shrunk.
+fn run<H: History>(first: u64, histories: u64, plant: Option<H::Plant>) -> Option<Failure<H>> {
+    let next = AtomicU64::new(first);
     let failed: Mutex<Option<(u64, String)>> = Mutex::new(None);
     let failed_before =
         |seed| failed.lock().as_ref().is_some_and(|(failed, _): &(u64, String)| *failed < seed);
@@ -88,13 +91,16 @@ fn run<H: History>(histories: u64, plant: Option<H::Plant>) -> Option<Failure<H>
                 let machine = Machine::new();
                 loop {
                     let seed = next.fetch_add(1, Ordering::Relaxed);
-                    if seed > histories || failed_before(seed) {
+                    if seed >= first + histories || failed_before(seed) {
                         return;
                     }
                     if let Some(said) = reason(&machine, &H::of(seed), plant)
                         && !failed_before(seed)
                     {
                         *failed.lock() = Some((seed, said));
+                    }
+                    if seed.is_multiple_of(HISTORIES_TO_TELL) {
+                        eprintln!("seed {seed} of {}", std::any::type_name::<H>());
                     }
                 }
             });
@@ -122,7 +128,8 @@ fn shrunk<H: History>(mut history: H, mut said: String, plant: Option<H::Plant>)
 fn run_or_panic<H: History>(what: &str, histories: u64) {
     let begun = Instant::now();
     let histories = number("HISTORIES").unwrap_or(histories);
-    if let Some(Failure { history, said }) = run::<H>(histories, None) {
+    let first = number("FIRST_SEED").unwrap_or(1);
+    if let Some(Failure { history, said }) = run::<H>(first, histories, None) {
         panic!("{said}\n{history}");
     }
     let took = begun.elapsed();
@@ -158,12 +165,12 @@ fn run_one<H: History>(machine: &Machine, seed: u64) {
 #[test]
 fn planted_faults_are_found() {
     for plant in [Plant::UnsyncedFiles, Plant::AnnouncedCounted] {
-        let failure = run::<uploads::Uploads>(HISTORIES_TO_FIND, Some(plant));
+        let failure = run::<uploads::Uploads>(1, HISTORIES_TO_FIND, Some(plant));
         let Failure { history, said } = failure.unwrap_or_else(|| panic!("{plant:?} is not found"));
         assert!(history.steps.len() <= 6, "{plant:?} is not shrunk: {said}\n{history}");
     }
     let plant = connections::Plant::StepsTwice;
-    let failure = run::<connections::Connections>(HISTORIES_TO_FIND, Some(plant));
+    let failure = run::<connections::Connections>(1, HISTORIES_TO_FIND, Some(plant));
     let Failure { history, said } = failure.unwrap_or_else(|| panic!("{plant:?} is not found"));
     assert!(history.parts() <= 4, "{plant:?} is not shrunk: {said}\n{history}");
 }

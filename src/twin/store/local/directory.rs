@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use crate::store::StoreError;
 use crate::store::disk::{Disk, Lock, ReadFile, Wait};
-use crate::store::layout::{object_key, record_key};
+use crate::store::layout::{COLLECTION, LOG, OBJECTS, object_key, record_key};
 
 use super::files::{create_dirs, entries};
 
@@ -46,6 +46,11 @@ impl Local {
         self.root.join(object_key(name, hash))
     }
 
+    /// The directory of a twin's objects.
+    pub(super) fn objects_dir(&self, name: &str) -> PathBuf {
+        self.root.join(name).join(OBJECTS)
+    }
+
     pub(super) fn open(&self, name: &str, hash: &str) -> Result<OpenObject, StoreError> {
         let path = self.object_file(name, hash);
         let file = self.disk.open(&path).map_err(StoreError::io("open", &path))?;
@@ -81,7 +86,7 @@ impl Local {
         name: &str,
         named: &BTreeSet<String>,
     ) -> Result<(), StoreError> {
-        let objects = self.root.join(name).join("objects");
+        let objects = self.objects_dir(name);
         for prefix in entries(&*self.disk, &objects)? {
             for hash in entries(&*self.disk, &objects.join(&prefix))? {
                 if !named.contains(&hash) {
@@ -98,18 +103,43 @@ impl Local {
     /// directories are kept. The caller holds the publish lock.
     pub(super) fn remove_empty(&self, name: &str) {
         let twin = self.root.join(name);
-        for prefix in entries(&*self.disk, &twin.join("objects")).unwrap_or_default() {
-            let _ = self.disk.remove_dir(&twin.join("objects").join(prefix));
+        let objects = self.objects_dir(name);
+        for prefix in entries(&*self.disk, &objects).unwrap_or_default() {
+            let _ = self.disk.remove_dir(&objects.join(prefix));
         }
-        for dir in [twin.join("objects"), twin.join("log"), twin] {
+        for dir in [objects, twin.join(LOG), twin] {
             let _ = self.disk.remove_dir(&dir);
         }
     }
 
-    /// Waits until no other process publishes a version of a twin, and takes the publish lock.
+    /// Creates a directory of which nothing need survive a power cut: of commits in preparation, and of locks.
+    pub(super) fn create_transient(&self, dir: &Path) -> Result<(), StoreError> {
+        if self.exists(dir)? { Ok(()) } else { create_dirs(&*self.disk, dir) }
+    }
+
+    /// Waits until no other process publishes a version of a twin, takes the publish lock, and settles the twin.
     pub(super) fn lock_publishing(&self, name: &str) -> Result<Option<Lock>, StoreError> {
-        create_dirs(&*self.disk, &self.root.join(STAGING))?;
-        self.publish_lock(name, Wait::Yes)
+        self.create_transient(&self.root.join(STAGING))?;
+        let lock = self.publish_lock(name, Wait::Yes)?;
+        self.settle(name)?;
+        Ok(lock)
+    }
+
+    /// Makes the log of a twin and the state of garbage collection durable, as they are now. The caller holds the
+    /// publish lock.
+    ///
+    /// A process that was stopped, or that failed to sync, may have left a record, or its removal, that a power cut
+    /// takes back. Whoever removes objects, or takes a number, because of what the log says, would then have relied
+    /// on what never was: the versions before the lost one would be without objects, or the log would have a gap.
+    pub(super) fn settle(&self, name: &str) -> Result<(), StoreError> {
+        let twin = self.root.join(name);
+        for dir in [twin.join(LOG), twin.join(COLLECTION), twin] {
+            match self.disk.sync_dir(&dir) {
+                Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {}
+                synced => synced.map_err(StoreError::io("sync", &dir))?,
+            }
+        }
+        Ok(())
     }
 
     /// Takes the publish lock; `None` if another process has it and this one does not wait. Its file is never

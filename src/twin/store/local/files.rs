@@ -1,7 +1,8 @@
 //! Files and directories, synced so that they survive a power cut.
 
+use std::collections::BTreeSet;
 use std::io::{self, ErrorKind, Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::store::StoreError;
 use crate::store::disk::{Disk, ReadFile};
@@ -76,25 +77,58 @@ pub(super) fn create_parent(disk: &dyn Disk, path: &Path) -> Result<(), StoreErr
     path.parent().map_or(Ok(()), |dir| create_dirs(disk, dir))
 }
 
-/// Creates a directory and the missing ones above it, and syncs each: what is written into a
-/// directory is lost in a power cut if the directory's own entry is.
+/// Creates a directory and the missing ones above it, and makes their names durable: what is written into a
+/// directory is lost in a power cut if the directory's own name is.
+///
+/// A directory that exists may have been created by a process that was stopped before it synced the name. So that name
+/// is synced, too. The names above it are durable, because each is synced before anything is created below it.
 ///
 /// # Errors
 /// [`StoreError::Io`] names the directory that cannot be created or synced.
 pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
-    let is_dir = || disk.info(dir).is_ok_and(|found| found.is_dir);
     // The parent of "twins" is "", which is the current directory.
-    if dir.as_os_str().is_empty() || is_dir() {
+    if dir.as_os_str().is_empty() {
         return Ok(());
     }
+    if is_dir(disk, dir) {
+        return match dir.parent().map(|parent| disk.sync_dir(parent)) {
+            // This process may not read the directory above, so that another user has created this one.
+            Some(Err(error)) if error.kind() == ErrorKind::PermissionDenied => Ok(()),
+            Some(synced) => synced.map_err(StoreError::io("sync", dir)),
+            None => Ok(()),
+        };
+    }
     create_parent(disk, dir)?;
+    create_dir(disk, dir)?;
+    sync_parent(disk, dir)
+}
+
+/// Creates directories in an existing one, and makes their names durable, as [`create_dirs`], with a single sync.
+pub(super) fn create_dirs_in(
+    disk: &dyn Disk,
+    parent: &Path,
+    dirs: &BTreeSet<PathBuf>,
+) -> Result<(), StoreError> {
+    for dir in dirs {
+        if !is_dir(disk, dir) {
+            create_dir(disk, dir)?;
+        }
+    }
+    sync(disk, parent)
+}
+
+/// Creates a directory, whose name is not durable yet. Another process may create it at the same time.
+fn create_dir(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     match disk.create_dir(dir) {
-        // Another process may have created it in between.
-        Err(error) if error.kind() != ErrorKind::AlreadyExists || !is_dir() => {
+        Err(error) if error.kind() != ErrorKind::AlreadyExists || !is_dir(disk, dir) => {
             Err(StoreError::io("create", dir)(error))
         }
-        _ => sync_parent(disk, dir),
+        _ => Ok(()),
     }
+}
+
+fn is_dir(disk: &dyn Disk, dir: &Path) -> bool {
+    disk.info(dir).is_ok_and(|found| found.is_dir)
 }
 
 /// Makes a new name durable by syncing its directory.

@@ -20,7 +20,7 @@ use super::backend::{
 };
 use super::disk::{FileInfo, Lock, Wait};
 use super::layout::{
-    ACTORS, LOCK_ENDING, check_hash, check_side_file, is_hash, is_prefix, log_numbers,
+    ACTORS, LOCK_ENDING, LOG, check_hash, check_side_file, is_hash, is_prefix, log_numbers,
 };
 
 pub(super) use directory::Local;
@@ -29,7 +29,7 @@ pub use files::create_dirs;
 pub use real_disk::RealDisk;
 
 use directory::{OpenObject, SEPARATOR, STAGING};
-use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, read_all, sync_parent};
+use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, read_all, sync, sync_parent};
 use staging::LocalStaging;
 
 impl ObjectBackend for Local {
@@ -46,7 +46,7 @@ impl ObjectBackend for Local {
     }
 
     fn version_numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
-        Ok(log_numbers(entries(&*self.disk, &self.root.join(name).join("log"))?))
+        Ok(log_numbers(entries(&*self.disk, &self.root.join(name).join(LOG))?))
     }
 
     fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
@@ -160,6 +160,8 @@ impl ObjectBackend for Local {
         if abandoned.is_empty() {
             return Ok(());
         }
+        // What the log says decides what is removed.
+        self.settle(name)?;
         // The staging directories are removed last: while they exist, the next start tries again.
         if let Some(named) = named() {
             self.remove_unnamed(name, &named)?;
@@ -188,7 +190,7 @@ impl ObjectBackend for Local {
     }
 
     fn list_objects(&self, name: &str) -> Result<ObjectListing, StoreError> {
-        let objects = self.root.join(name).join("objects");
+        let objects = self.objects_dir(name);
         let mut listing = ObjectListing::default();
         // No object lies in a folder of another name.
         for prefix in entries(&*self.disk, &objects)?.into_iter().filter(|name| is_prefix(name)) {
@@ -224,10 +226,14 @@ impl ObjectBackend for Local {
         which: &mut dyn FnMut() -> Result<Vec<String>, StoreError>,
     ) -> Result<(), StoreError> {
         let _publish_lock = self.lock_publishing(name)?;
+        let mut folders = BTreeSet::new();
         for hash in which()? {
             let path = self.object_file(name, &hash);
             self.disk.remove_file(&path).map_err(StoreError::io("remove", &path))?;
+            folders.extend(path.parent().map(Path::to_owned));
         }
+        // An asset that was removed does not come back.
+        folders.iter().try_for_each(|folder| sync(&*self.disk, folder))?;
         self.remove_empty(name);
         Ok(())
     }
@@ -290,7 +296,7 @@ impl ObjectBackend for Local {
 
     fn hold(&self, name: &str, file: &str) -> Result<Option<Lock>, StoreError> {
         let path = self.root.join(name).join(file);
-        create_parent(&*self.disk, &path)?;
+        path.parent().map_or(Ok(()), |dir| self.create_transient(dir))?;
         self.disk.lock(&path, Wait::Yes).map_err(StoreError::io("lock", &path))
     }
 

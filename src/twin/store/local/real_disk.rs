@@ -74,7 +74,9 @@ impl Disk for RealDisk {
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
         // The parent of "twins" is "", which is the current directory.
         let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-        File::open(dir)?.sync_all()
+        // What is no directory, such as a pipe, is an error, and nothing to wait for.
+        let flags = OFlags::DIRECTORY.bits().cast_signed();
+        File::options().read(true).custom_flags(flags).open(dir)?.sync_all()
     }
 
     fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>> {

@@ -9,7 +9,9 @@ use crate::store::backend::{Staging, StoredObject, WriteObject};
 use crate::store::disk::{Lock, Wait};
 
 use super::directory::{LOCK, Local, SEPARATOR, STAGING};
-use super::files::{BUFFER_BYTES, HashingFile, create_parent, sync, sync_parent};
+use super::files::{
+    BUFFER_BYTES, HashingFile, create_dirs, create_dirs_in, create_parent, sync, sync_parent,
+};
 
 /// Objects of a commit that no reader sees yet. Dropped before it is published, it leaves nothing
 /// behind.
@@ -32,7 +34,8 @@ impl LocalStaging {
     pub(super) fn begin(local: &Local, name: &str, commit: &str) -> Result<Self, StoreError> {
         // Removing abandoned directories takes this lock, too, and must not find this one before
         // its own lock is taken.
-        let _publish_lock = local.lock_publishing(name)?;
+        local.create_transient(&local.root.join(STAGING))?;
+        let _publish_lock = local.publish_lock(name, Wait::Yes)?;
         let dir = local.root.join(STAGING).join(format!("{name}{SEPARATOR}{commit}"));
         local.disk.create_dir(&dir).map_err(StoreError::io("create", &dir))?;
         let path = dir.join(LOCK);
@@ -53,21 +56,28 @@ impl LocalStaging {
 
     /// Moves those of the objects that were put here to their final places, over older copies, too.
     fn place(&mut self, hashes: &BTreeSet<&str>) -> Result<(), StoreError> {
-        let mut changed = BTreeSet::new();
+        let disk = &*self.local.disk;
+        let mut staged = Vec::new();
         for hash in hashes {
-            let staged = self.dir.join(hash);
-            if !self.local.exists(&staged)? {
-                continue;
+            if self.local.exists(&self.dir.join(hash))? {
+                staged.push((self.dir.join(hash), self.local.object_file(&self.name, hash)));
             }
-            let path = self.local.object_file(&self.name, hash);
-            create_parent(&*self.local.disk, &path)?;
+        }
+        if staged.is_empty() {
+            return Ok(());
+        }
+        let objects = self.local.objects_dir(&self.name);
+        let folders = staged.iter().filter_map(|(_, path)| path.parent().map(Path::to_owned));
+        let folders: BTreeSet<PathBuf> = folders.collect();
+        create_dirs(disk, &objects)?;
+        create_dirs_in(disk, &objects, &folders)?;
+        for (staged, path) in staged {
             if !self.local.exists(&path)? {
                 self.placed.push(path.clone());
             }
-            self.local.disk.rename(&staged, &path).map_err(StoreError::io("write", &path))?;
-            changed.insert(path.parent().map(Path::to_owned));
+            disk.rename(&staged, &path).map_err(StoreError::io("write", &path))?;
         }
-        changed.iter().flatten().try_for_each(|dir| sync(&*self.local.disk, dir))
+        folders.iter().try_for_each(|folder| sync(disk, folder))
     }
 }
 

@@ -24,7 +24,7 @@ use wildcity_scene::rig::is_name;
 use super::StoreError;
 use super::backend::{HashedStart, ListedObject, ObjectBackend, ObjectListing, Staging};
 use super::disk::Lock;
-use super::layout::{check_side_file, is_hash, log_numbers, object_key, record_key};
+use super::layout::{LOG, OBJECTS, check_side_file, is_hash, log_numbers, object_key, record_key};
 
 pub(super) use client::Remote;
 pub use retry::{RetryPolicy, Traffic};
@@ -53,7 +53,7 @@ impl ObjectBackend for Remote {
     }
 
     fn version_numbers(&self, name: &str) -> Result<Vec<u64>, StoreError> {
-        Ok(log_numbers(self.list_side_files(name, "log")?))
+        Ok(log_numbers(self.list_side_files(name, LOG)?))
     }
 
     fn read_record(&self, name: &str, number: u64) -> Result<Vec<u8>, StoreError> {
@@ -186,7 +186,7 @@ impl ObjectBackend for Remote {
     }
 
     fn list_objects(&self, name: &str) -> Result<ObjectListing, StoreError> {
-        let key = format!("{name}/objects");
+        let key = format!("{name}/{OBJECTS}");
         let store = self.store.clone();
         let at = self.key(&key);
         let found: Vec<ObjectMeta> = self.run("list", &key, move || {
