@@ -38,6 +38,12 @@ const REFERENCE_RAD: f64 = std::f64::consts::PI / 6.0;
 /// A `reference` is kept until another one is so much nearer, in metres: a change would be seen as flicker.
 const KEPT_M: f64 = 0.5;
 
+/// A recorded image is one that is held out if it is so near to its pose, in metres, ..
+const SAME_PLACE_M: f64 = 0.05;
+
+/// .. and looks in the same direction within this angle, in radians.
+const SAME_DIRECTION_RAD: f64 = 0.02;
+
 /// Most tables of lenses that a version keeps, 2 MB each. A rig has a few cameras.
 const PROJECTIONS: usize = 64;
 
@@ -303,6 +309,21 @@ impl ReferenceViews {
     }
 }
 
+/// A table of recorded images without those at some poses.
+pub(crate) fn without(mut table: Vec<RecordedView>, held_out: &[Pose]) -> Vec<RecordedView> {
+    table.retain(|view| !is_held_out(view, held_out));
+    table
+}
+
+fn is_held_out(view: &RecordedView, held_out: &[Pose]) -> bool {
+    let axis = |pose: &Pose| pose.rotation * DVec3::Z;
+    let own = &view.world_from_camera;
+    held_out.iter().any(|pose| {
+        own.position_m.distance(pose.position_m) <= SAME_PLACE_M
+            && axis(own).angle_between(axis(pose)) <= SAME_DIRECTION_RAD
+    })
+}
+
 fn recorded(view: &Arc<RecordedView>) -> ReferenceView {
     ReferenceView {
         name: name(&view.trajectory, view.station_m, &view.camera_name),
@@ -316,4 +337,42 @@ fn recorded(view: &Arc<RecordedView>) -> ReferenceView {
 
 fn name(trajectory: &str, station_m: f64, camera: &str) -> String {
     format!("{trajectory}@{station_m:.2}/{camera}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+    use wildcity_scene::geometry::Camera;
+    use wildcity_scene::geometry::camera::Pinhole;
+    use wildcity_scene::manifest::ObjectRef;
+
+    #[test]
+    fn only_an_image_of_the_same_place_and_direction_is_left_out() {
+        let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 5.0, cy: 5.0 };
+        let view = RecordedView {
+            trajectory: "log".into(),
+            station_m: 0.0,
+            camera_name: "front".into(),
+            camera: Camera::from_pinhole(10, 10, pinhole),
+            world_from_camera: Pose { position_m: DVec3::X, ..Pose::IDENTITY },
+            exposure_stops: None,
+            image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+        };
+        let at = |x_m: f64, turn_rad: f64| Pose {
+            position_m: DVec3::X * x_m,
+            rotation: DQuat::from_rotation_y(turn_rad),
+        };
+        for (x_m, turn_rad, is_same) in [
+            (1.0, 0.0, true),
+            (1.04, 0.01, true),
+            (1.06, 0.0, false),
+            (0.5, 0.0, false),
+            (1.0, 0.03, false),
+            (1.0, 3.1, false),
+        ] {
+            assert_eq!(is_held_out(&view, &[at(9.0, 0.0), at(x_m, turn_rad)]), is_same, "{x_m}");
+        }
+        assert!(!is_held_out(&view, &[]));
+    }
 }
