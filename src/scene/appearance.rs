@@ -12,6 +12,8 @@ use image::imageops::{FilterType, resize};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Rgba, Rgba32FImage};
 use serde::{Deserialize, Serialize};
 
+use crate::srgb::{linear_from_stored, stored_from_linear};
+
 /// Per-camera changes to a rendered image: first the exposure, then the overlay.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Appearance {
@@ -94,6 +96,39 @@ impl Exposure {
             _ => return Err(AppearanceError::MatrixOrGain),
         };
         Ok(Self { matrix, offset })
+    }
+}
+
+impl Exposure {
+    /// Twice as bright for each stop.
+    pub fn of_stops(stops: f64) -> Self {
+        let gain = stops.exp2();
+        let matrix = [[gain, 0.0, 0.0], [0.0, gain, 0.0], [0.0, 0.0, gain]];
+        Self { matrix, offset: [0.0; 3] }
+    }
+
+    /// This one, applied to what another one gives.
+    #[must_use]
+    pub fn after(&self, first: &Self) -> Self {
+        let apply = |row: [f64; 3], to: [f64; 3]| row[0] * to[0] + row[1] * to[1] + row[2] * to[2];
+        let column = |c: usize| [0, 1, 2].map(|r| first.matrix[r][c]);
+        let matrix = self.matrix.map(|row| [0, 1, 2].map(|c| apply(row, column(c))));
+        let offset = [0, 1, 2].map(|r| apply(self.matrix[r], first.offset) + self.offset[r]);
+        Self { matrix, offset }
+    }
+
+    /// Changes an image, `[height, width, 3]` in 8 bits of sRGB.
+    pub fn change_rgb8(&self, rgb8: &mut [u8]) {
+        let linear: Vec<f64> =
+            (0..=255_u8).map(|byte| linear_from_stored(f64::from(byte) / 255.0)).collect();
+        for pixel in rgb8.chunks_exact_mut(3) {
+            let before = [0, 1, 2].map(|channel| linear[usize::from(pixel[channel])]);
+            for (channel, out) in pixel.iter_mut().enumerate() {
+                let [r, g, b] = self.matrix[channel];
+                let value = r * before[0] + g * before[1] + b * before[2] + self.offset[channel];
+                *out = (255.0 * stored_from_linear(value.clamp(0.0, 1.0))).round() as u8;
+            }
+        }
     }
 }
 

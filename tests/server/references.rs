@@ -237,6 +237,7 @@ fn add_views(server: &TestServer, paint: [u8; 3], stations: &[f64], names: [&str
                 world_from_camera: view.world_from_camera,
                 exposure_stops: None,
                 image: commit.put_image(&png).unwrap(),
+                mask: None,
             });
         }
     }

@@ -33,6 +33,7 @@ fn table(commit: &mut Commit) -> Vec<RecordedView> {
         },
         exposure_stops: None,
         image: commit.put_image(image).unwrap(),
+        mask: None,
     };
     IMAGES.iter().enumerate().map(view).collect()
 }

@@ -19,11 +19,13 @@ use wildcity_eval::{
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
+use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::rig::RigCamera;
 use wildcity_session::RenderedImage;
 
-use self::beside::{Beside, BesideImage, Offsets, OnDrive, Tools};
+use self::beside::{Beside, BesideImage, Lens, Offsets, OnDrive, Tools};
 use self::drive::Drives;
 use self::labels::{LabelOptions, Labels};
 use self::networks::{FeatureSet, NetworkOptions, Networks};
@@ -32,7 +34,7 @@ use self::repairer::{PlacedImage, Repairer, RepairerOptions};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::profile_options::ProfileOptions;
-use super::real_images::{ImageList, RealImage, camera_names, picture};
+use super::real_images::{ImageList, RealImage, camera_names, own_vehicle, picture};
 use super::scene_source::Source;
 use super::{output, placement, progress};
 
@@ -160,7 +162,9 @@ struct Compared {
     rendered: RenderedImage,
     repaired: Option<Vec<u8>>,
     counts: Option<Vec<bool>>,
-    camera_name: String,
+    camera: RigCamera,
+    /// Of the images that are repaired or moved beside the drive.
+    lens: Option<Lens>,
 }
 
 impl Eval {
@@ -251,7 +255,17 @@ impl Eval {
         let size_px = [camera.width_px, camera.height_px];
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
-        let mut rendered = renderer.render(&view, &profile)?;
+        let shown = RigCamera {
+            appearance: Appearance { exposure: image.exposure(), overlay: None },
+            ..RigCamera::new(camera_name, camera, Pose::IDENTITY)
+        };
+        let mut rendered = renderer.render(&view, &profile, &shown.appearance)?;
+        let needs_lens = repairer.is_some() || self.extrapolate.is_some();
+        let lens = needs_lens.then(|| Lens::of(&camera));
+        let own_vehicle = renderer.source.version().and_then(|version| {
+            own_vehicle::outside(version.manifest.rig.as_ref(), camera_name, size_px)
+        });
+        let mask = own_vehicle::both(mask, own_vehicle);
         let mut counts = counted(&view, mask);
         let hidden = labels.hide(image, &view, &renderer.alignment);
         let moving = hidden.as_ref().map(|(_, share)| *share);
@@ -276,7 +290,7 @@ impl Eval {
         let mut repaired_rgb8 = None;
         let mut thumbnails =
             Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
-        if let Some(repairer) = repairer {
+        if let Some((repairer, lens)) = repairer.as_ref().zip(lens.as_ref()) {
             let place = drives.as_ref().and_then(|drives| {
                 let place = drives.place(camera_name, &view.world_from_camera)?;
                 Some((place.world_from_rig, drives))
@@ -285,13 +299,15 @@ impl Eval {
             rendered.trust =
                 place.map_or(1.0, |(rig, drives)| drives.trust(&rig, &view, &rendered));
             let placed = PlacedImage {
-                camera_name,
+                camera: &shown,
+                rays: &lens.rays,
                 view: &view,
                 world_from_rig: &world_from_rig,
                 rendered: &rendered,
                 profile: &profile,
+                kept: None,
             };
-            let repaired = repairer.repair(renderer, &placed)?;
+            let repaired = repairer.repair(renderer, &placed)?.rgb8;
             let pair = Pair::new(size_px, truth.clone(), repaired.clone(), counts.clone())?;
             let mut compared = PairScores::of(&pair, self.align_exposure);
             compared.scores.lpips = lpips(&repaired)?;
@@ -309,9 +325,9 @@ impl Eval {
             thumbnails = with.map_err(anyhow::Error::msg)?;
         }
         scores.thumbnails = Some(thumbnails);
-        let camera_name = camera_name.to_owned();
         let repaired = repaired_rgb8;
-        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera_name })
+        let camera = shown;
+        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
     }
 
     /// Draws the views beside the drive that belong to an image.
@@ -323,12 +339,15 @@ impl Eval {
         image: &RealImage,
         is_shown: bool,
     ) -> anyhow::Result<Vec<BesideImage>> {
-        let Some(drives) = &setup.drives else { return Ok(Vec::new()) };
+        let (Some(drives), Some(lens)) = (&setup.drives, &compared.lens) else {
+            return Ok(Vec::new());
+        };
         let repairer = setup.repairer.as_ref();
         let tools = Tools { renderer: &setup.renderer, repairer, drives };
         let on_drive = OnDrive {
             name: &image.name,
-            camera_name: &compared.camera_name,
+            camera: &compared.camera,
+            lens,
             view: &compared.view,
             profile: &compared.profile,
             truth: &compared.truth,

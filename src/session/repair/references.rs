@@ -23,8 +23,8 @@ use wildcity_twin::store::Version;
 /// Places along the drive, from the rig's, in metres.
 const OFFSETS_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
-/// An image is at a place if it is at most so far from it, in metres.
-const WITHIN_M: f64 = 1.5;
+/// An image counts for a place if it is at most so far from it, in metres: so a place has one if they are 12 m apart or less.
+const WITHIN_M: f64 = 6.0;
 
 /// Distance between the places where a twin without recorded images is drawn, in metres.
 const STEP_M: f64 = 2.0;
@@ -106,8 +106,44 @@ impl ReferenceView {
         let image = self.recorded.as_ref().map(|view| &view.image.object);
         let Self { name, camera, world_from_camera, .. } = self;
         let exposure = &self.appearance.exposure;
-        let text = format!("{name} {camera:?} {world_from_camera:?} {image:?} {exposure:?}");
+        let stops = self.recorded.as_ref().and_then(|view| view.exposure_stops);
+        let mask = self.recorded.as_ref().and_then(|view| view.mask.as_ref());
+        let text = format!(
+            "{name} {camera:?} {world_from_camera:?} {image:?} {exposure:?} {stops:?} {mask:?}"
+        );
         *hasher.update(text.as_bytes()).finalize().as_bytes()
+    }
+
+    /// The same image with the exposure of a camera, if its own is known.
+    pub(crate) fn exposed_for(mut self, camera: &RigCamera) -> Self {
+        if self.recorded.as_ref().is_some_and(|view| view.exposure_stops.is_some()) {
+            self.appearance.exposure = camera.appearance.exposure;
+        }
+        self
+    }
+
+    /// The same image for a view of a camera: halved until it has about as many pixels per radian as the view, since an image
+    /// with more is sampled with gaps, and what falls into them changes from view to view. Also less is drawn and kept.
+    pub(crate) fn reduced_for(mut self, camera: &Camera) -> Self {
+        let px_per_rad = |camera: &Camera| (camera.pinhole.fx * camera.pinhole.fy).sqrt();
+        let ratio = px_per_rad(&self.camera) / px_per_rad(camera);
+        // The nearest power of two: what remains is between 0.7 and 1.4.
+        let halvings = ratio.log2().round().clamp(0.0, 8.0) as i32;
+        if halvings == 0 {
+            return self;
+        }
+        let factor = 2.0_f64.powi(halvings);
+        let side = |px: u32| ((f64::from(px) / factor).round() as u64).max(1);
+        let [width_px, height_px] = [self.camera.width_px, self.camera.height_px].map(side);
+        // A camera that cannot be smaller stays as it is.
+        self.camera = self.camera.scaled(width_px, height_px).unwrap_or(self.camera);
+        self
+    }
+
+    /// Its name, size and exposure: what tells it from all others of a version.
+    pub(crate) fn id(&self) -> String {
+        let Self { name, camera, appearance, .. } = self;
+        format!("{name} {}x{} {:?}", camera.width_px, camera.height_px, appearance.exposure)
     }
 
     /// How it is drawn.
@@ -201,7 +237,7 @@ impl ReferenceViews {
     /// same direction within 30°. The one that was used before, by its name, stays until another is 0.5 m nearer.
     pub(crate) fn nearest(
         &self,
-        camera: &str,
+        camera: &RigCamera,
         world_from_camera: &Pose,
         world_from_rig: &Pose,
         kept: Option<&str>,
@@ -213,11 +249,11 @@ impl ReferenceViews {
                 && view.angle_rad(world_from_camera) <= REFERENCE_RAD
         };
         let all: Vec<ReferenceView> =
-            self.of_camera(&place, camera).into_iter().filter(fits).collect();
+            self.of_camera(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
         let kept = all.iter().find(|view| Some(&*view.name) == kept);
         let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < KEPT_M);
-        Some(kept.unwrap_or(nearest).clone())
+        Some(kept.unwrap_or(nearest).clone().exposed_for(camera))
     }
 
     /// How a camera projects.
@@ -358,6 +394,7 @@ mod tests {
             world_from_camera: Pose { position_m: DVec3::X, ..Pose::IDENTITY },
             exposure_stops: None,
             image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+            mask: None,
         };
         let at = |x_m: f64, turn_rad: f64| Pose {
             position_m: DVec3::X * x_m,
