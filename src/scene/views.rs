@@ -59,7 +59,7 @@ pub enum ViewError {
         value: f64,
     },
     /// An exposure that no camera has.
-    #[error("exposure_stops is {value}; give -{MOST_STOPS} to {MOST_STOPS}")]
+    #[error("exposure_stops is {value}; give -{most} to {most}", most = MOST_STOPS)]
     Stops {
         /// The refused value.
         value: f64,

@@ -255,17 +255,17 @@ impl Eval {
         let size_px = [camera.width_px, camera.height_px];
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
+        let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
+        let mounted = rig.and_then(|rig| rig.cameras.iter().find(|one| one.name == camera_name));
+        let exposure = image.exposure().or(mounted.and_then(|one| one.appearance.exposure));
         let shown = RigCamera {
-            appearance: Appearance { exposure: image.exposure(), overlay: None },
+            appearance: Appearance { exposure, overlay: None },
             ..RigCamera::new(camera_name, camera, Pose::IDENTITY)
         };
         let mut rendered = renderer.render(&view, &profile, &shown.appearance)?;
         let needs_lens = repairer.is_some() || self.extrapolate.is_some();
         let lens = needs_lens.then(|| Lens::of(&camera));
-        let own_vehicle = renderer.source.version().and_then(|version| {
-            own_vehicle::outside(version.manifest.rig.as_ref(), camera_name, size_px)
-        });
-        let mask = own_vehicle::both(mask, own_vehicle);
+        let mask = own_vehicle::both(mask, own_vehicle::outside(rig, camera_name, size_px));
         let mut counts = counted(&view, mask);
         let hidden = labels.hide(image, &view, &renderer.alignment);
         let moving = hidden.as_ref().map(|(_, share)| *share);

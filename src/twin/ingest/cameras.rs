@@ -95,7 +95,7 @@ pub enum CamerasError {
         cause: PoseError,
     },
     /// An exposure that no camera has.
-    #[error("camera {name:?}: exposure_stops is {stops}; give -{MOST_STOPS} to {MOST_STOPS}")]
+    #[error("camera {name:?}: exposure_stops is {stops}; give -{most} to {most}", most = MOST_STOPS)]
     Stops {
         /// The camera's name.
         name: String,

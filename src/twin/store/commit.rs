@@ -211,7 +211,7 @@ impl Commit {
                 uncached.objects.check_present(&commit.name, &views.object, views.bytes)?;
             }
             for view in uncached.views_of(&manifest)? {
-                for image in views::objects(&view) {
+                for image in super::views::objects(&view) {
                     uncached.objects.check_present(&commit.name, &image.object, image.bytes)?;
                 }
             }

@@ -85,8 +85,9 @@ impl Catalog {
         };
         let views: Vec<RecordedView> =
             serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
-        match views.iter().flat_map(objects).find(|object| !is_hash(&object.object)) {
-            Some(object) => Err(damaged(format!("{:?} is not a hash", object.object))),
+        let wrong = views.iter().flat_map(objects).find(|object| !is_hash(&object.object));
+        match wrong.map(|object| object.object.clone()) {
+            Some(object) => Err(damaged(format!("{object:?} is not a hash"))),
             None => Ok(views),
         }
     }
