@@ -352,6 +352,25 @@ mod tests {
     use super::*;
 
     #[test]
+    fn exposures_are_applied_in_linear_light_one_after_the_other() {
+        let mut rgb8 = [0, 10, 128, 188, 255, 255];
+        Exposure::of_stops(-1.0).change_rgb8(&mut rgb8);
+        // 188 is half of 255 in linear light.
+        assert_eq!(rgb8, [0, 5, 92, 137, 188, 188]);
+        let mut bright = [188, 60, 255];
+        Exposure::of_stops(1.0).change_rgb8(&mut bright);
+        assert_eq!(bright, [255, 85, 255]);
+        let swap = Exposure {
+            matrix: [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
+            offset: [0.1, 0.0, 0.0],
+        };
+        let first = Exposure { matrix: swap.matrix, offset: [0.0, 0.2, 0.4] };
+        let both = swap.after(&first);
+        assert_eq!(both.matrix, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 4.0]]);
+        assert_eq!(both.offset.map(|value| (value * 10.0_f64).round()), [3.0, 0.0, 8.0]);
+    }
+
+    #[test]
     fn json_round_trips() {
         let overlay = Overlay::new(3, (0..24).collect()).unwrap();
         let text = overlay.to_data_uri();

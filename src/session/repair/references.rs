@@ -379,7 +379,7 @@ fn name(trajectory: &str, station_m: f64, camera: &str) -> String {
 mod tests {
     use super::*;
     use glam::DQuat;
-    use wildcity_scene::geometry::Camera;
+    use wildcity_scene::appearance::Exposure;
     use wildcity_scene::geometry::camera::Pinhole;
     use wildcity_scene::manifest::ObjectRef;
 
@@ -411,5 +411,55 @@ mod tests {
             assert_eq!(is_held_out(&view, &[at(9.0, 0.0), at(x_m, turn_rad)]), is_same, "{x_m}");
         }
         assert!(!is_held_out(&view, &[]));
+    }
+
+    fn reference(width_px: u32, focal_px: f64, exposure_stops: Option<f64>) -> ReferenceView {
+        let middle = 0.5 * f64::from(width_px);
+        let pinhole = Pinhole { fx: focal_px, fy: focal_px, cx: middle, cy: middle };
+        recorded(&Arc::new(RecordedView {
+            trajectory: "log".into(),
+            station_m: 2.0,
+            camera_name: "front".into(),
+            camera: Camera::from_pinhole(width_px, width_px, pinhole),
+            world_from_camera: Pose::IDENTITY,
+            exposure_stops,
+            image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+            mask: None,
+        }))
+    }
+
+    #[test]
+    fn a_reference_is_halved_until_it_has_the_resolution_of_the_view() {
+        let view = reference(100, 80.0, None).camera;
+        for (width_px, focal_px, wanted_px) in [
+            (100, 80.0, 100),
+            (50, 40.0, 50),
+            (140, 112.0, 140),
+            (143, 115.0, 72),
+            (200, 160.0, 100),
+            (400, 160.0, 200),
+            (403, 320.0, 101),
+        ] {
+            let reduced = reference(width_px, focal_px, None).reduced_for(&view);
+            assert_eq!(reduced.camera.width_px, wanted_px, "{width_px} px, {focal_px}");
+            let factor = f64::from(wanted_px) / f64::from(width_px);
+            assert!((reduced.camera.pinhole.fx - factor * focal_px).abs() < 1e-9);
+            assert_eq!(reduced.name, "log@2.00/front");
+        }
+        let large = reference(200, 160.0, None);
+        assert_ne!(large.id(), large.clone().reduced_for(&view).id());
+    }
+
+    #[test]
+    fn only_a_known_exposure_is_changed_for_a_camera() {
+        let mut camera = RigCamera::new("front", reference(100, 80.0, None).camera, Pose::IDENTITY);
+        camera.appearance.exposure = Some(Exposure::of_stops(0.5));
+        let known = reference(100, 80.0, Some(-1.0)).exposed_for(&camera);
+        assert_eq!(known.appearance.exposure, camera.appearance.exposure);
+        let unknown = reference(100, 80.0, None).exposed_for(&camera);
+        assert_eq!(unknown.appearance.exposure, None);
+        assert_ne!(known.id(), unknown.id());
+        let hash = blake3::hash(b"");
+        assert_ne!(known.key("v", &hash), unknown.key("v", &hash));
     }
 }
