@@ -72,12 +72,13 @@ pub use record::replay_report::{
     ImageDifference, ProvenanceChange, RepairedImages, ReplayError, ReplayReport, ReplayUntil,
     ReplayedImage, WrongValue,
 };
-pub use repair::offline::{OfflineRepair, OfflineView, ViewReferences};
+pub use repair::offline::{
+    NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, ViewReferences,
+};
 pub use repair::references::ReferenceSource;
 pub use repair::rendered_image::RenderedImage;
 pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
-pub use repair::still::{StillRepair, StillRepairError, StillToRepair};
 pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
     asset_info,

@@ -398,3 +398,31 @@ fn another_programs_image_of_a_real_capture_is_met() {
         "{image}"
     );
 }
+
+#[test]
+fn an_image_whose_exposure_is_known_is_compared_in_it() {
+    let dir = capture();
+    let at = dir.path();
+    let path = at.join("images/front/a.png");
+    let mut image = image::open(&path).unwrap().into_rgb8();
+    wildcity_scene::appearance::Exposure::of_stops(-1.0).change_rgb8(&mut image);
+    image.save(&path).unwrap();
+    let db = |images: &str| {
+        let (_, made) = eval(at, "scene.ply", images, &[]);
+        made["images"][0]["psnr_db"].as_f64().unwrap()
+    };
+    let unknown = db("views.jsonl");
+    let list = fs::read_to_string(at.join("views.jsonl")).unwrap();
+    let known = list.replacen("{", "{\"exposure_stops\": -1, ", 1);
+    fs::write(at.join("known.jsonl"), known).unwrap();
+    let found = db("known.jsonl");
+    // Twice rounded to 8 bits.
+    assert!(found > 50.0 && unknown < 30.0, "{found} {unknown}");
+    let frames = transforms(&json!({"exposure_stops": -1}));
+    fs::write(at.join("transforms.json"), frames).unwrap();
+    assert!((db("transforms.json") - found).abs() < 1e-6);
+    let frames = transforms(&json!({"exposure_stops": -17}));
+    fs::write(at.join("transforms.json"), frames).unwrap();
+    let said = refused(at, &["eval", "scene.ply", "--images", "transforms.json"]);
+    assert!(said.contains("frames[0].exposure_stops: -17; give -16 to 16"), "{said}");
+}

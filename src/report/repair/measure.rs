@@ -14,7 +14,8 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::rig::RigCamera;
 use wildcity_session::{
-    OfflineRepair, OfflineView, ReferenceSource, RenderedImage, TrainingCoverage, ViewReferences,
+    NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, ReferenceSource,
+    RenderedImage, TrainingCoverage, ViewReferences,
 };
 use wildcity_twin::residency::Resident;
 use wildcity_twin::store::Catalog;
@@ -134,7 +135,7 @@ pub fn measure(
 struct Bench<'a> {
     given: &'a RepairBenchmark<'a>,
     cameras: &'a [RigCamera],
-    offline: OfflineRepair<'a>,
+    offline: OfflineReferences,
     coverage: TrainingCoverage,
     /// By camera.
     optics: Vec<(Arc<Projection>, Rays)>,
@@ -153,11 +154,11 @@ struct Shown {
 
 impl<'a> Bench<'a> {
     fn new(given: &'a RepairBenchmark<'a>, cameras: &'a [RigCamera]) -> Result<Self, ReportError> {
-        let RepairBenchmark { resident, catalog, backend, references, .. } = *given;
+        let RepairBenchmark { resident, catalog, .. } = *given;
         let coverage = TrainingCoverage::new(&resident.version.manifest);
         let coverage = coverage.ok_or(ReportError::NoDrive)?;
-        let offline = OfflineRepair::new(resident, catalog, backend, cameras, references)?;
-        given.models.iter().try_for_each(|model| offline.check(model))?;
+        let offline = OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
+        given.models.iter().try_for_each(|model| offline.check(model, cameras))?;
         let optics = |camera: &RigCamera| {
             (Arc::new(Projection::of(&camera.camera)), Rays::of(&camera.camera))
         };
@@ -324,10 +325,15 @@ impl<'a> Bench<'a> {
     ) -> Result<Shown, ReportError> {
         let view = &station.views[frame][camera];
         let world_from_rig = &station.world_from_rig[frame];
-        let of = OfflineView { camera, view, world_from_rig, rendered };
-        let needs_nearest = |model: &Arc<Model>| model.needs(InputRole::Reference);
-        let needs_nearest = self.given.models.iter().any(needs_nearest);
-        let beside = self.offline.references(&of, needs_nearest)?;
+        let RepairBenchmark { resident, backend, references, models, .. } = *self.given;
+        let mounted = &self.cameras[camera];
+        let (_, rays) = &self.optics[camera];
+        let of = OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept: None };
+        let nearest = models.iter().any(|model| model.needs(InputRole::Reference));
+        let profile = &resident.version.manifest.profile;
+        let drawing = OfflineDrawing { profile, backend, cache: references };
+        let needed = NeededReferences { warped: true, nearest };
+        let beside = self.offline.beside(&of, needed, drawing)?;
         self.read += beside.read_count;
         self.read_ms += 1e3 * beside.read.as_secs_f64();
         let warp = 1e3 * beside.warp.as_secs_f64();
@@ -335,11 +341,11 @@ impl<'a> Bench<'a> {
         let mut rgb8 = vec![rendered.rgb8.clone(), warped];
         debug_assert_eq!((RENDERED, WARPED, FIRST_MODEL), (0, 1, rgb8.len()));
         let mut repair_ms = vec![RepairMs::default(), RepairMs { warp, ..RepairMs::default() }];
-        for model in self.given.models {
-            let repaired = self.offline.repaired(model, &of, &beside);
+        for model in models {
+            let repaired = beside.repaired(model, &of);
             let (pixels, times) = repaired.map_err(|cause| ReportError::Repair {
                 model: model.manifest().name.clone(),
-                camera: self.cameras[camera].name.clone(),
+                camera: mounted.name.clone(),
                 cause: Box::new(cause),
             })?;
             let roles = [InputRole::ReferenceWarped, InputRole::ReferenceValid];

@@ -7,7 +7,6 @@
 use std::sync::Arc;
 
 use wildcity_render::{Backend, View};
-use wildcity_repair::reference::Reference;
 use wildcity_repair::{InputRole, Model, Models, RepairError};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::RigCamera;
@@ -19,9 +18,9 @@ use super::format::EpisodeHeader;
 use super::repairs::RecordedRepair;
 use super::replay_report::{ProvenanceChange, ReplayError};
 use crate::observe::trust::TrainingCoverage;
-use crate::repair::drawn::{Beside, CameraRays, Sight};
-use crate::repair::offline::ReferenceSupply;
-use crate::repair::references::{ReferenceView, ReferenceViews};
+use crate::repair::drawn::{Beside, CameraRays};
+use crate::repair::offline::{NeededReferences, OfflineView, ReferenceSupply};
+use crate::repair::references::ReferenceViews;
 use crate::repair::rendered_image::RenderedImage;
 use crate::repair::session_repair;
 use crate::repair::status::RepairState;
@@ -116,9 +115,7 @@ impl<'a> RepairReplay<'a> {
         resident: &Resident,
         cameras: &[RigCamera],
     ) -> Result<(), ReplayError> {
-        let needs = |model: &Arc<Model>| {
-            session_repair::needs_warped(model) || model.needs(InputRole::Reference)
-        };
+        let needs = |model: &Arc<Model>| NeededReferences::of(model).any();
         if self.model.as_ref().is_some_and(needs) {
             let version = resident.version.clone();
             let table = self.catalog.views(&version);
@@ -200,47 +197,21 @@ impl<'a> RepairReplay<'a> {
         &self,
         model: &Model,
         image: &ImageToRepair<'_>,
-        drawing: Drawing<'_>,
+        Drawing { resident, profile, backend }: Drawing<'_>,
     ) -> Result<Beside, String> {
         let ImageToRepair { camera, mounted, rendered, view, world_from_rig, is_observe } = *image;
-        let mut beside = Beside::default();
-        let Some(references) = &self.references else { return Ok(beside) };
-        if model.needs(InputRole::Reference) {
-            let kept = match is_observe {
-                true => None,
-                false => self.state.references[camera].as_deref(),
-            };
-            let pose = &view.world_from_camera;
-            let nearest = references.nearest(&mounted.name, pose, world_from_rig, kept);
-            if let Some(nearest) = &nearest {
-                let reference = self.reference(references, nearest, drawing)?;
-                beside.set_reference(&nearest.name, &reference, &mounted.camera);
-            }
-        }
-        if session_repair::needs_warped(model) {
-            let rays = self.rays.of(camera, mounted);
-            let sight = Sight { camera: mounted, rays, view, image: rendered };
-            let mut around = Vec::new();
-            for view in sight.overlapping(references.around(world_from_rig)) {
-                let reference = self.reference(references, &view, drawing)?;
-                around.push((view.name, reference));
-            }
-            sight.warped(&around, &mut beside);
-        }
-        Ok(beside)
-    }
-
-    /// A reference: from memory, or read and drawn.
-    fn reference(
-        &self,
-        references: &ReferenceViews,
-        view: &ReferenceView,
-        Drawing { resident, profile, backend }: Drawing<'_>,
-    ) -> Result<Arc<Reference>, String> {
+        let Some(references) = &self.references else { return Ok(Beside::default()) };
+        let kept = match is_observe {
+            true => None,
+            false => self.state.references[camera].as_deref(),
+        };
+        let rays = self.rays.of(camera, mounted);
+        let of = OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept };
         let Self { models, catalog, .. } = *self;
         let cache = models.references();
         let supply = ReferenceSupply { resident, profile, backend, catalog, cache };
-        supply.reference(references, view).map_err(|error| error.to_string())
+        let found = supply.beside(references, &of, NeededReferences::of(model));
+        found.map(|found| found.beside).map_err(|error| error.to_string())
     }
 }
 

@@ -16,4 +16,3 @@ pub(crate) mod references;
 pub(crate) mod rendered_image;
 pub(crate) mod session_repair;
 pub(crate) mod status;
-pub(crate) mod still;

@@ -1,12 +1,13 @@
 //! The repair of views without a session: the images beside them are read and drawn on the caller's thread.
 //!
-//! A replay finds its references by this, and the report measures by it what a repair gains and costs.
+//! A replay finds its references by this, the report measures by it what a repair gains and costs, and an evaluation
+//! repairs by it. A model gets what a session gives it.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use wildcity_render::{Backend, View};
-use wildcity_repair::reference::{Reference, ReferenceCache};
+use wildcity_repair::reference::{Rays, Reference, ReferenceCache};
 use wildcity_repair::{Image, InputRole, Model, RepairError, RepairTimes};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
@@ -14,8 +15,8 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Resident;
 use wildcity_twin::store::Catalog;
 
-use super::drawn::{self, Beside, CameraRays, Sight};
-use super::references::{ReferenceSource, ReferenceView, ReferenceViews};
+use super::drawn::{self, Beside, Sight};
+use super::references::{ReferenceSource, ReferenceView, ReferenceViews, without};
 use super::rendered_image::RenderedImage;
 use super::session_repair;
 use crate::error::SessionError;
@@ -32,57 +33,57 @@ pub(crate) struct ReferenceSupply<'a> {
     pub(crate) cache: &'a ReferenceCache,
 }
 
-impl ReferenceSupply<'_> {
-    /// A reference: from memory, or read and drawn.
-    ///
-    /// # Errors
-    /// A recorded image or the twin cannot be read, or the depth cannot be drawn.
-    pub(crate) fn reference(
-        &self,
-        views: &ReferenceViews,
-        view: &ReferenceView,
-    ) -> Result<Arc<Reference>, SessionError> {
-        let Self { resident, profile, backend, catalog, cache } = *self;
-        let key = view.key(&resident.version.hash, &profile_hash(profile));
-        if let Some(known) = cache.get(&key) {
-            return Ok(known);
-        }
-        let image = drawn::read(catalog, &resident.version, view)?;
-        let scene = resident.scene(&viewpoints(&[view.view()]), profile)?;
-        let projection = views.projection(&view.camera);
-        let drawn = drawn::draw(view, image, projection, &scene, profile, backend);
-        let reference = Arc::new(drawn?);
-        cache.insert(key, reference.clone());
-        Ok(reference)
-    }
+/// Which images beside a view are needed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct NeededReferences {
+    /// Those that are brought into the view by its depth.
+    pub warped: bool,
+    /// The nearest of the same camera.
+    pub nearest: bool,
 }
 
-/// Repairs views of a version of a twin, one by one.
-pub struct OfflineRepair<'a> {
-    cameras: &'a [RigCamera],
-    rays: CameraRays,
-    /// `None` if the twin has no recorded drive.
+/// Finds the images beside views of a version of a twin.
+#[derive(Debug)]
+pub struct OfflineReferences {
+    resident: Arc<Resident>,
+    catalog: Catalog,
+    /// `None` if there is nothing to draw or to read.
     views: Option<ReferenceViews>,
-    supply: ReferenceSupply<'a>,
+    left_out: usize,
+}
+
+/// What the images beside views are drawn with, and where they stay.
+#[derive(Clone, Copy)]
+pub struct OfflineDrawing<'a> {
+    /// How the twin is drawn.
+    pub profile: &'a RenderProfile,
+    /// What draws it.
+    pub backend: &'a dyn Backend,
+    /// Images that were read and drawn.
+    pub cache: &'a ReferenceCache,
 }
 
 /// A rendered view that may be repaired.
 #[derive(Clone, Copy)]
 pub struct OfflineView<'a> {
-    /// Which camera.
-    pub camera: usize,
+    /// Its camera, by the name that recorded images have.
+    pub camera: &'a RigCamera,
+    /// The rays of that camera.
+    pub rays: &'a Rays,
     /// How it was rendered.
     pub view: &'a View,
-    /// Where the rig was.
+    /// Where the rig was: images are looked for around it.
     pub world_from_rig: &'a Pose,
     /// Its pixels, depth and opacity; normals if a model needs them.
     pub rendered: &'a RenderedImage,
+    /// Name of the nearest image of the same camera in the view before, if there was one.
+    pub kept: Option<&'a str>,
 }
 
-/// The recorded images beside a view.
-#[derive(Debug)]
+/// The images beside a view; none without a twin.
+#[derive(Debug, Default)]
 pub struct ViewReferences {
-    beside: Beside,
+    pub(crate) beside: Beside,
     /// Time to read and draw those that were not in memory.
     pub read: Duration,
     /// How many those were.
@@ -91,95 +92,94 @@ pub struct ViewReferences {
     pub warp: Duration,
 }
 
-impl ViewReferences {
-    /// The recorded images in the view, and 1 for each pixel that they have, else 0.
-    pub fn warped(&self) -> Option<(&Image, &[f32])> {
-        self.beside.warped.as_ref().map(|(image, valid)| (image, &valid[..]))
+impl NeededReferences {
+    /// Those that a model needs.
+    pub fn of(model: &Model) -> Self {
+        let nearest = model.needs(InputRole::Reference);
+        Self { warped: session_repair::needs_warped(model), nearest }
+    }
+
+    /// Whether some are needed.
+    pub fn any(self) -> bool {
+        self.warped || self.nearest
     }
 }
 
-impl<'a> OfflineRepair<'a> {
-    /// For the images of some cameras of a version, drawn as the version says. References stay in `cache`.
+impl ReferenceSupply<'_> {
+    /// The images beside a view. Blocks.
     ///
     /// # Errors
-    /// The table of recorded images cannot be read.
-    pub fn new(
-        resident: &'a Arc<Resident>,
-        catalog: &'a Catalog,
-        backend: &'a dyn Backend,
-        cameras: &'a [RigCamera],
-        cache: &'a ReferenceCache,
-    ) -> Result<Self, SessionError> {
-        let version = resident.version.clone();
-        let table = catalog.views(&version)?;
-        let views = ReferenceViews::of(version, table, cameras);
-        let profile = &resident.version.manifest.profile;
-        let supply = ReferenceSupply { resident, profile, backend, catalog, cache };
-        Ok(Self { cameras, rays: CameraRays::new(cameras.len()), views, supply })
-    }
-
-    /// Where the recorded images come from; `None` without a recorded drive.
-    pub fn source(&self) -> Option<ReferenceSource> {
-        self.views.as_ref().map(ReferenceViews::source)
-    }
-
-    /// Checks that a model can repair the images of the cameras.
-    ///
-    /// # Errors
-    /// [`SessionError::RepairUnavailable`].
-    pub fn check(&self, model: &Model) -> Result<(), SessionError> {
-        session_repair::check_cameras(model, self.cameras)?;
-        if session_repair::needs_warped(model) || model.needs(InputRole::Reference) {
-            session_repair::check_references(model, self.views.as_ref(), self.cameras)?;
-        }
-        Ok(())
-    }
-
-    /// The recorded images beside a view: in it by its depth, and the nearest of the same camera if a model needs
-    /// one. Blocks.
-    ///
-    /// # Errors
-    /// An image or the twin cannot be read, or drawn.
-    pub fn references(
+    /// A recorded image or the twin cannot be read, or the depth cannot be drawn.
+    pub(crate) fn beside(
         &self,
+        views: &ReferenceViews,
         of: &OfflineView<'_>,
-        with_nearest: bool,
+        needed: NeededReferences,
     ) -> Result<ViewReferences, SessionError> {
-        let camera = &self.cameras[of.camera];
-        let rays = self.rays.of(of.camera, camera);
-        let sight = Sight { camera, rays, view: of.view, image: of.rendered };
-        let mut found = ViewReferences {
-            beside: Beside::default(),
-            read: Duration::ZERO,
-            read_count: 0,
-            warp: Duration::ZERO,
-        };
-        let mut around = Vec::new();
-        if let Some(views) = &self.views {
-            let started = Instant::now();
-            let overlapping = sight.overlapping(views.around(of.world_from_rig));
-            found.warp = started.elapsed();
-            for view in overlapping {
-                let reference = self.read(views, &view, &mut found)?;
-                around.push((view.name, reference));
-            }
-            let pose = &of.view.world_from_camera;
-            let nearest = match with_nearest {
-                true => views.nearest(&camera.name, pose, of.world_from_rig, None),
-                false => None,
-            };
+        let &OfflineView { camera, rays, view, world_from_rig, rendered, kept } = of;
+        let mut found = ViewReferences::default();
+        if needed.nearest {
+            let pose = &view.world_from_camera;
+            let nearest = views.nearest(camera, pose, world_from_rig, kept);
             if let Some(nearest) = nearest {
-                let reference = self.read(views, &nearest, &mut found)?;
+                let reference = self.timed(views, &nearest, &mut found)?;
                 found.beside.set_reference(&nearest.name, &reference, &camera.camera);
             }
         }
-        let started = Instant::now();
-        sight.warped(&around, &mut found.beside);
-        found.warp += started.elapsed();
+        if needed.warped {
+            let sight = Sight { camera, rays, view, image: rendered };
+            let started = Instant::now();
+            let overlapping = sight.overlapping(views.around(world_from_rig));
+            found.warp = started.elapsed();
+            let mut around = Vec::new();
+            for view in overlapping {
+                let reference = self.timed(views, &view, &mut found)?;
+                around.push((view.name, reference));
+            }
+            let started = Instant::now();
+            sight.warped(&around, &mut found.beside);
+            found.warp += started.elapsed();
+        }
         Ok(found)
     }
 
-    /// The repaired pixels of a view, and how long the parts took. Blocks.
+    /// A reference: from memory, or read and drawn.
+    fn timed(
+        &self,
+        views: &ReferenceViews,
+        view: &ReferenceView,
+        found: &mut ViewReferences,
+    ) -> Result<Arc<Reference>, SessionError> {
+        let Self { resident, profile, backend, catalog, cache } = *self;
+        let key = view.key(&resident.version.hash, &profile_hash(profile));
+        if let Some(known) = cache.get(&key) {
+            return Ok(known);
+        }
+        let started = Instant::now();
+        let image = drawn::read(catalog, &resident.version, view)?;
+        let scene = resident.scene(&viewpoints(&[view.view()]), profile)?;
+        let projection = views.projection(&view.camera);
+        let drawn = drawn::draw(view, image, projection, &scene, profile, backend);
+        let reference = Arc::new(drawn?);
+        cache.insert(key, reference.clone());
+        found.read += started.elapsed();
+        found.read_count += 1;
+        Ok(reference)
+    }
+}
+
+impl ViewReferences {
+    /// The images in the view, and 1 for each pixel that they have, else 0.
+    pub fn warped(&self) -> Option<(&Image, &[f32])> {
+        self.beside.warped.as_ref().map(|(image, valid)| (image, &valid[..]))
+    }
+
+    /// Name of the nearest image of the same camera.
+    pub fn nearest(&self) -> Option<&str> {
+        self.beside.nearest.as_deref()
+    }
+
+    /// The repaired pixels of their view, and how long the parts took. Blocks.
     ///
     /// # Errors
     /// The model fails.
@@ -187,26 +187,76 @@ impl<'a> OfflineRepair<'a> {
         &self,
         model: &Model,
         of: &OfflineView<'_>,
-        references: &ViewReferences,
     ) -> Result<(Vec<u8>, RepairTimes), RepairError> {
-        let camera = &self.cameras[of.camera];
-        session_repair::repair_timed(model, camera, of.rendered, &references.beside)
+        session_repair::repair_timed(model, of.camera, of.rendered, &self.beside)
+    }
+}
+
+impl OfflineReferences {
+    /// Those of a version. If it has no recorded images, it is drawn with some cameras. Recorded images at the poses
+    /// `held_out` are left out: those are compared with, and a model would see its own truth.
+    ///
+    /// # Errors
+    /// The table of recorded images cannot be read.
+    pub fn open(
+        resident: Arc<Resident>,
+        catalog: Catalog,
+        cameras: &[RigCamera],
+        held_out: &[Pose],
+    ) -> Result<Self, SessionError> {
+        let version = resident.version.clone();
+        let table = catalog.views(&version)?;
+        let had = table.len();
+        let table = without(table, held_out);
+        let left_out = had - table.len();
+        let is_empty = table.is_empty() && cameras.is_empty();
+        let views = if is_empty { None } else { ReferenceViews::of(version, table, cameras) };
+        Ok(Self { resident, catalog, views, left_out })
     }
 
-    fn read(
-        &self,
-        views: &ReferenceViews,
-        view: &ReferenceView,
-        found: &mut ViewReferences,
-    ) -> Result<Arc<Reference>, SessionError> {
-        let key = view.key(&self.supply.resident.version.hash, &profile_hash(self.supply.profile));
-        let is_new = self.supply.cache.get(&key).is_none();
-        let started = Instant::now();
-        let reference = self.supply.reference(views, view)?;
-        if is_new {
-            found.read += started.elapsed();
-            found.read_count += 1;
+    /// Where the images come from; `None` without a recorded drive.
+    pub fn source(&self) -> Option<ReferenceSource> {
+        self.views.as_ref().map(ReferenceViews::source)
+    }
+
+    /// Number of recorded images that are left out.
+    pub fn left_out(&self) -> usize {
+        self.left_out
+    }
+
+    /// Checks that the images of a model have the size of what it gets.
+    ///
+    /// # Errors
+    /// [`SessionError::RepairUnavailable`].
+    pub fn check_scale(model: &Model) -> Result<(), SessionError> {
+        session_repair::check_cameras(model, &[])
+    }
+
+    /// Checks that a model can repair the images of some cameras.
+    ///
+    /// # Errors
+    /// [`SessionError::RepairUnavailable`].
+    pub fn check(&self, model: &Model, cameras: &[RigCamera]) -> Result<(), SessionError> {
+        session_repair::check_cameras(model, cameras)?;
+        if NeededReferences::of(model).any() {
+            session_repair::check_references(model, self.views.as_ref(), cameras)?;
         }
-        Ok(reference)
+        Ok(())
+    }
+
+    /// The images beside a view. Blocks. The first view of a place takes longer, because they are drawn then.
+    ///
+    /// # Errors
+    /// An image or the twin cannot be read, or drawn.
+    pub fn beside(
+        &self,
+        of: &OfflineView<'_>,
+        needed: NeededReferences,
+        drawing: OfflineDrawing<'_>,
+    ) -> Result<ViewReferences, SessionError> {
+        let Some(views) = &self.views else { return Ok(ViewReferences::default()) };
+        let Self { resident, catalog, .. } = self;
+        let OfflineDrawing { profile, backend, cache } = drawing;
+        ReferenceSupply { resident, profile, backend, catalog, cache }.beside(views, of, needed)
     }
 }

@@ -133,7 +133,7 @@ pub(crate) fn check_cameras(model: &Model, cameras: &[RigCamera]) -> Result<(), 
     let scale = model.manifest().outputs[0].scale;
     if scale != 1 {
         return Err(unavailable(format!(
-            "its output is {scale} times as large as its input; sessions take models of scale 1"
+            "its output is {scale} times as large as its input, and images keep their size here; give a model of scale 1"
         )));
     }
     for RigCamera { name, camera, .. } in cameras {
@@ -157,7 +157,11 @@ pub(crate) fn check_references(
         Err(SessionError::RepairUnavailable { name, reason })
     };
     let Some(views) = views else {
-        return refused("it needs images of a recorded drive, and the twin has none".to_owned());
+        return refused(
+            "it needs images of a recorded drive, and the twin has none; `wildcity twin drive` and `wildcity twin views` \
+             add them"
+                .to_owned(),
+        );
     };
     let is_missing = |camera: &&RigCamera| !views.has_camera(&camera.name);
     let missing = cameras.iter().find(is_missing);
