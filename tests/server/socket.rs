@@ -42,6 +42,40 @@ async fn pings_are_answered_while_a_request_runs() {
     assert_eq!(agent.seen().await.meta["step"], 1);
 }
 
+/// Not only during a step: before `hello`, and while frames of other requests are rendered.
+#[tokio::test]
+async fn pings_are_answered_whatever_runs() {
+    let server = TestServer::start().await;
+    let mut agent = Agent::connect(server.address()).await;
+    let pinged = async |agent: &mut Agent| {
+        let sent = Instant::now();
+        agent.socket.send(Message::Ping("x".into())).await.unwrap();
+        assert_eq!(frame(agent).await, Some(Message::Pong("x".into())));
+        assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+    };
+    pinged(&mut agent).await;
+    agent.hello().await;
+    pinged(&mut agent).await;
+    for name in ["a", "b"] {
+        agent.open(json!({ "session": name, "outputs": { "encoding": "raw" } })).await;
+    }
+    let of = |name: &str| json!({ "session": name, "pose": pose(1.0) });
+    agent.ask(json!({ "type": "snapshot", "session": "a", "name": "s" })).await;
+    server.painter.slow_ms.store(400, Ordering::SeqCst);
+    for request in [
+        json!({ "type": "step_many", "steps": [of("a"), of("b")] }),
+        json!({ "type": "observe", "session": "a", "poses": [pose(1.0)] }),
+        json!({ "type": "reset", "session": "a" }),
+        json!({ "type": "restore", "session": "a", "name": "s" }),
+    ] {
+        agent.send(request.clone()).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        pinged(&mut agent).await;
+        let reply = agent.receive().await;
+        assert!(matches!(reply, Reply::Binary(_)), "{request}: {reply:?}");
+    }
+}
+
 #[tokio::test]
 async fn requests_that_come_early_wait_in_order() {
     let server = TestServer::start().await;
