@@ -11,6 +11,7 @@ use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use wildcity_server::Limits;
 
 use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, pose, refused};
+use crate::viewer::{WATCH, connect};
 
 /// The next frame, whatever it is.
 async fn frame(agent: &mut Agent) -> Option<Message> {
@@ -185,5 +186,31 @@ async fn the_servers_own_close_frame_says_why() {
     assert!(!message.contains("resume") && message.contains("open"), "{message}");
     assert_eq!(close_code(&mut new).await, 1001);
     drop(new);
+    stopping.await.unwrap();
+}
+
+/// A watcher gets pongs, and the Close frame that says why its connection ends.
+#[tokio::test]
+async fn watchers_are_told_why_they_end() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let watcher = async || {
+        let watcher = connect(server.address(), "/v1/sessions/a/watch", WATCH, None).await;
+        watcher.ok().expect("a watcher")
+    };
+    let mut talker = watcher().await;
+    talker.send_text("{}").await;
+    assert_eq!(close_code(&mut talker).await, 1008);
+    let mut until_the_end = watcher().await;
+    until_the_end.socket.send(Message::Ping("x".into())).await.unwrap();
+    assert_eq!(frame(&mut until_the_end).await, Some(Message::Pong("x".into())));
+    assert_eq!(agent.ask(json!({ "type": "close" })).await["type"], "closed");
+    assert_eq!(close_code(&mut until_the_end).await, 1000);
+    agent.open(json!({ "session": "a" })).await;
+    let mut until_the_stop = watcher().await;
+    let TestServer { running, .. } = server;
+    let stopping = tokio::spawn(running.stop());
+    assert_eq!(close_code(&mut until_the_stop).await, 1001);
+    drop(agent);
     stopping.await.unwrap();
 }
