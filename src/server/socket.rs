@@ -216,7 +216,8 @@ mod tests {
         let payload = [7; 1000];
         let given_up = timeout(Duration::from_millis(20), socket.send_binary(&[&payload])).await;
         assert!(given_up.is_err(), "it does not fit");
-        let closing = tokio::spawn(socket.close(Some(CloseStatus { code: 1001, reason: "x".into() })));
+        let closing =
+            tokio::spawn(socket.close(Some(CloseStatus { code: 1001, reason: "x".into() })));
         let mut sent = Vec::new();
         client.read_to_end(&mut sent).await.unwrap();
         assert_eq!(sent, [&[FINAL_BINARY, 126, 3, 232][..], &[7; 60]].concat());

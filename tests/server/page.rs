@@ -136,8 +136,17 @@ fn ranges_of_the_schema_are_those_of_the_program() {
     let pattern = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
     assert_eq!(request("open")["twin"]["pattern"], pattern);
     for name in [
-        "step", "observe", "prefetch", "reset", "switch_version", "snapshot", "restore", "close",
-        "resume", "open", "branch",
+        "step",
+        "observe",
+        "prefetch",
+        "reset",
+        "switch_version",
+        "snapshot",
+        "restore",
+        "close",
+        "resume",
+        "open",
+        "branch",
     ] {
         assert_eq!(request(name)["session"]["pattern"], pattern, "{name}");
     }

@@ -361,9 +361,8 @@ impl<'a> Replay<'a> {
         let step = frame.step;
         let taken_us = frame.taken_us(pose);
         let episode = self.ego.episode();
-        let views_of = |cameras: &[usize]| {
-            episode.views(self.cameras, cameras, frame.poses[pose], taken_us)
-        };
+        let views_of =
+            |cameras: &[usize]| episode.views(self.cameras, cameras, frame.poses[pose], taken_us);
         let views = views_of(selected);
         let viewpoints = match &self.sensors {
             Some(sensors) => viewpoints(&views_of(&sensors.detail_for(frame, selected))),
