@@ -408,7 +408,7 @@ pub(crate) fn cameras_of_long_headers() -> Vec<serde_json::Value> {
             "width": 1, "height": 1,
             "fx": 123_456.789_012_345_67, "fy": 123_456.789_012_345_67,
             "cx": UGLY, "cy": UGLY,
-            "lens": { "model": "opencv", "k": [UGLY; 6], "p": [UGLY; 2], "s": [UGLY; 4] },
+            "lens": { "model": "opencv", "k": vec![UGLY; 6], "p": vec![UGLY; 2], "s": vec![UGLY; 4] },
             // The coefficients of φ and of θ.
             "windshield": {
                 "reference": "backward", "horizontal": coefficients(1), "vertical": coefficients(6),
