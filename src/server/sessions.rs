@@ -239,6 +239,10 @@ impl SessionRegistry {
         summary: &EpisodeSummary,
     ) {
         let mut closed = self.closed.lock();
+        // While the session was closing, its name was free: it may be another session's by now.
+        if self.entries.lock().contains_key(&name) {
+            return;
+        }
         if closed.len() >= self.limit {
             let oldest = closed.iter().min_by_key(|(_, session)| session.since);
             if let Some(name) = oldest.map(|(name, _)| name.clone()) {
@@ -447,5 +451,39 @@ impl Drop for SlotGuard {
         } else if let Some(entry) = entries.get_mut(&self.name) {
             entry.parked = Some(Parked { since: Instant::now(), outcome: self.outcome });
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The answer to `close` is not kept under a name that another session has taken in the meantime: a client that resumes
+    /// that name wants the session that is open.
+    #[test]
+    fn a_closed_session_gives_way_to_an_open_one() {
+        let registry = SessionRegistry::new(8, Duration::from_secs(60));
+        let grant = Grant::everything();
+        let summary = EpisodeSummary {
+            outcome: Outcome::Completed,
+            steps: 1,
+            time_us: 100_000,
+            distance_m: 1.0,
+            least_trust: None,
+        };
+        let remember = || {
+            let last = AnsweredRequest { seq: 3, answer: Answer::Text("closed".into()) };
+            registry.remember_closed("a".to_owned(), &grant.name, last, &summary);
+        };
+        let is_kept = || registry.closed("a", &grant.name).is_some();
+        remember();
+        assert!(is_kept());
+        let open = registry.reserve("a".to_owned(), &grant).unwrap();
+        assert!(!is_kept(), "the name is used again");
+        remember();
+        assert!(!is_kept(), "and was so before the other session had closed");
+        drop(open);
+        remember();
+        assert!(is_kept());
     }
 }

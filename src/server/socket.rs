@@ -21,6 +21,8 @@ pub(crate) struct Socket {
     send_timeout: Duration,
     /// Whether the client has sent its Close frame, after which it reads nothing.
     peer_closed: bool,
+    /// Whether a part of a frame was sent. If that was given up, nothing can follow it.
+    is_within_frame: bool,
 }
 
 /// The content of a Close frame (RFC 6455, section 7.4).
@@ -64,7 +66,7 @@ impl Socket {
             .max_write_buffer_size(limits::PONGS_BYTES);
         let stream =
             WebSocketStream::from_partially_read(stream, read_ahead, Role::Server, Some(config));
-        Self { stream: stream.await, send_timeout, peer_closed: false }
+        Self { stream: stream.await, send_timeout, peer_closed: false, is_within_frame: false }
     }
 
     /// Whether the other end is on this machine; if not, why.
@@ -126,9 +128,10 @@ impl Socket {
     /// Sends a message from the caller's memory. tungstenite would copy an observation of megabytes into
     /// its own buffer first. After an error the connection cannot be used.
     async fn send(&mut self, first_byte: u8, payload: &[&[u8]]) -> Result<(), Disconnect> {
-        if self.peer_closed {
+        if self.peer_closed || self.is_within_frame {
             return Err(Disconnect::PeerLeft);
         }
+        self.is_within_frame = true;
         let send = async {
             // A pong may still be in the library's buffer; it must be sent whole before this frame begins.
             self.stream.flush().await.map_err(io::Error::other)?;
@@ -147,7 +150,10 @@ impl Socket {
             io::Result::Ok(())
         };
         match timeout(self.send_timeout, send).await {
-            Ok(Ok(())) => Ok(()),
+            Ok(Ok(())) => {
+                self.is_within_frame = false;
+                Ok(())
+            }
             Ok(Err(_)) => Err(Disconnect::PeerLeft),
             Err(_) => Err(Disconnect::SendTimedOut),
         }
@@ -200,6 +206,24 @@ fn frame_header(first_byte: u8, len: usize) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A server that stops while a watcher reads slowly must not put its Close frame into an observation.
+    #[tokio::test]
+    async fn no_frame_begins_within_another() {
+        let (mut client, server) = tokio::io::duplex(64);
+        let stream = Stream::new(server, Err("a test"));
+        let mut socket = Socket::new(stream, Vec::new(), Duration::from_secs(5)).await;
+        let payload = [7; 1000];
+        let given_up = timeout(Duration::from_millis(20), socket.send_binary(&[&payload])).await;
+        assert!(given_up.is_err(), "it does not fit");
+        let closing =
+            tokio::spawn(socket.close(Some(CloseStatus { code: 1001, reason: "x".into() })));
+        let mut sent = Vec::new();
+        client.read_to_end(&mut sent).await.unwrap();
+        assert_eq!(sent, [&[FINAL_BINARY, 126, 3, 232][..], &[7; 60]].concat());
+        drop(client);
+        closing.await.unwrap();
+    }
 
     #[test]
     fn frame_headers_of_every_length() {

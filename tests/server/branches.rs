@@ -42,10 +42,14 @@ async fn open(agent: &mut Agent, name: &str, model: &str) {
     agent.open(fields).await;
 }
 
-/// The command of a step.
+/// The command of a step: every fourth one is a trajectory.
 fn command(model: &str, step: u64) -> Value {
     let phase = step as f64 * 0.1;
     match model {
+        _ if step % 4 == 1 => {
+            let ahead = |k: u64| json!({ "time_us": 150_000 * k, "pose": pose(0.9 * k as f64) });
+            json!({ "type": "step", "trajectory": [ahead(1), ahead(2)] })
+        }
         "teleport" => {
             let q = [(0.1 * phase.sin()).cos(), 0.0, 0.0, (0.1 * phase.sin()).sin()];
             json!({ "type": "step", "pose": { "xyz": [5.0 + 0.3 * phase, phase.sin(), 0.1], "q": q } })
@@ -103,7 +107,7 @@ async fn a_branch_that_is_driven_alike_gives_the_same_bytes() {
         let snapshot = |name: &str| json!({ "type": "snapshot", "name": name });
         let mut original = vec![agent.look(json!({ "type": "reset", "seed": 9 })).await];
         assert_eq!(agent.ask(snapshot("at-0")).await["type"], "ok");
-        for done in [37, 49, 100, 150, STEPS] {
+        for done in [37, 49, 51, 100, 150, STEPS] {
             let from = original.len() as u64 - 1;
             original.extend(drive(&mut agent, model, from, done).await);
             if done == 49 {
@@ -116,7 +120,7 @@ async fn a_branch_that_is_driven_alike_gives_the_same_bytes() {
         assert_eq!(decided.count(), 1 + STEPS as usize / 3);
 
         // The session itself, back and forth between versions.
-        for done in [100, 37, 0, 49, 150] {
+        for done in [100, 37, 0, 49, 51, 150] {
             let restore = json!({ "type": "restore", "name": format!("at-{done}") });
             let restored = agent.look(restore).await;
             if done != 49 {
@@ -128,7 +132,7 @@ async fn a_branch_that_is_driven_alike_gives_the_same_bytes() {
         }
 
         // Another session of another connection, while this one exists.
-        for done in [0, 49, 100] {
+        for done in [0, 49, 51, 100] {
             let mut other = server.agent().await;
             let from = json!({ "session": model, "snapshot": format!("at-{done}") });
             let opened = other.ask(json!({ "type": "branch", "from": from })).await;
@@ -142,7 +146,8 @@ async fn a_branch_that_is_driven_alike_gives_the_same_bytes() {
         agent.ask(json!({ "type": "close" })).await;
 
         // The record, when the session is gone.
-        for done in [0, 37, 49, 100, 101, 102, STEPS - 1] {
+        // With frames of both versions in a bundle, too.
+        for done in [0, 37, 49, 51, 70, 89, 91, 100, 101, 102, STEPS - 1] {
             let mut other = server.agent().await;
             let from = json!({ "episode": format!("{model}-1"), "step": done });
             let opened = other.ask(json!({ "type": "branch", "from": from })).await;

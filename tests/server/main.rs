@@ -25,6 +25,7 @@ mod ego;
 mod guarded;
 mod http;
 mod leases;
+mod levels;
 mod many;
 mod mcap;
 mod memory;

@@ -39,6 +39,15 @@ fn valid(seq: u64) -> Vec<Value> {
         "encoding": "raw", "quality": 90, "depth": true, "frames": 2, "period_us": { "c": 200_000 },
     });
     let planned = json!([{ "time_us": 100_000, "pose": pose(1.0) }]);
+    let effects = json!({
+        "drop": 0.1, "late": { "chance": 0.1, "by_us": 100_000 }, "freeze": { "chance": 0.1, "for_us": 200_000 },
+        "noise": { "full_well": 500.0, "read": 5.0 }, "exposure": { "stops": 0.5, "period_us": 700_000 },
+        "dirt": { "spots": 3, "radius": 0.1, "opacity": 0.5 },
+    });
+    let sensors = json!({
+        "cameras": { "front": effects }, "imu": { "gyroscope": { "noise": 0.1, "bias": 0.1 }, "bias_period_us": 1_000_000 },
+        "wheel_speed": { "noise": 0.1, "scale": 0.01 }, "delay_us": 100_000,
+    });
     vec![
         json!({ "type": "step", "seq": seq, "pose": pose(1.0), "terminate": false }),
         json!({ "type": "step", "seq": seq, "trajectory": planned }),
@@ -53,6 +62,26 @@ fn valid(seq: u64) -> Vec<Value> {
         json!({ "type": "reset", "seq": seq, "seed": 3, "start": { "trajectory": "log", "station_m": 2.5 } }),
         json!({ "type": "reset", "seq": seq, "start": { "pose": pose(2.0) } }),
         json!({ "type": "switch_version", "seq": seq, "version": 1 }),
+        json!({
+            "type": "reset", "seq": seq, "dynamics": { "model": "kinematic", "speed": 2.0 }, "speed": 3.0,
+            "start": { "random": { "trajectory": "log", "from_m": 1.0, "to_m": 8.0, "lateral_m": 0.5, "heading_rad": 0.1 } },
+        }),
+        json!({ "type": "snapshot", "seq": seq, "name": "s" }),
+        json!({ "type": "restore", "seq": seq, "name": "s" }),
+        json!({
+            "type": "branch", "seq": seq, "from": { "session": "mutated", "snapshot": "s" }, "session": "other",
+        }),
+        json!({ "type": "branch", "seq": seq, "from": { "episode": "mutated-1", "step": 0 }, "session": "other" }),
+        json!({ "type": "share_memory", "seq": seq, "proof": "x" }),
+        json!({
+            "type": "open", "seq": seq, "twin": "test", "session": "other", "sensors": sensors,
+            "trajectory": { "name": "log", "from_m": 1.0, "to_m": 5.0, "every_m": 0.5 },
+            "start": { "random": { "lateral_m": 0.5 } }, "outputs": { "frames": 2, "trust": true },
+        }),
+        json!({
+            "type": "open", "seq": seq, "twin": "test", "session": "other", "scenario": { "name": "none", "values": { "v": 1 } },
+            "repair": { "model": "none", "below": 0.7, "above": 0.8, "at_least": 0.1, "per_step": 2, "on_failure": "error" },
+        }),
         json!({ "type": "resume", "seq": seq, "session": "mutated", "last_seq": 3 }),
         json!({
             "type": "open", "seq": seq, "twin": "test", "version": 1, "session": "other", "seed": 1,
@@ -215,6 +244,9 @@ async fn mutated_requests_lose_no_session() {
         "{counts:?}"
     );
     assert!(counts.len() > 12, "{counts:?}");
+    for kind in ["opened", "ok", "switched", "out_of_range", "unknown_scenario"] {
+        assert!(counts.get(kind).is_some_and(|&count| count > 20), "{kind}: {counts:?}");
+    }
 
     // The session is the same, and takes steps.
     let seen = agent.look(json!({ "type": "reset" })).await;

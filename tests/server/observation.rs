@@ -392,22 +392,40 @@ async fn cameras_are_chosen_and_ordered_by_the_agent() {
     assert_eq!(start.meta["images"].as_array().unwrap().len(), 6);
 }
 
+/// A number that takes 24 characters.
+const UGLY: f64 = -1.234_567_890_123_456_7e-300;
+
+/// Sixteen cameras with the longest names, and lenses and windshields with the most numbers.
+pub(crate) fn cameras_of_long_headers() -> Vec<serde_json::Value> {
+    let coefficients = |first: usize| {
+        let mut all = [UGLY; 21];
+        all[first] = 1.0;
+        all.to_vec()
+    };
+    let camera = |k: usize| {
+        json!({
+            "name": format!("{k:x}{}", "c".repeat(63)),
+            "width": 1, "height": 1,
+            "fx": 123_456.789_012_345_67, "fy": 123_456.789_012_345_67,
+            "cx": UGLY, "cy": UGLY,
+            "lens": { "model": "opencv", "k": vec![UGLY; 6], "p": vec![UGLY; 2], "s": vec![UGLY; 4] },
+            // The coefficients of φ and of θ.
+            "windshield": {
+                "reference": "backward", "horizontal": coefficients(1), "vertical": coefficients(6),
+            },
+            "native_size": [1920.123_456_789_012_3, 1080.123_456_789_012_3],
+            "camera_to_rig": { "xyz": [UGLY, UGLY, UGLY], "q": [1.0, UGLY, UGLY, UGLY] },
+        })
+    };
+    (0..16).map(camera).collect()
+}
+
 /// Room for the header is reserved before the header is known: the longest header must fit.
 #[tokio::test]
 async fn the_longest_header_fits() {
     let server = TestServer::start().await;
-    let ugly = -1.234_567_890_123_456_7e-300;
-    let cameras: Vec<_> = (0..16)
-        .map(|k| {
-            json!({
-                "name": format!("{k:x}{}", "c".repeat(63)),
-                "width": 1, "height": 1,
-                "fx": 123_456.789_012_345_67, "fy": 123_456.789_012_345_67,
-                "cx": ugly, "cy": ugly,
-                "camera_to_rig": { "xyz": [ugly, ugly, ugly], "q": [1.0, ugly, ugly, ugly] },
-            })
-        })
-        .collect();
+    let cameras = cameras_of_long_headers();
+    let ugly = UGLY;
     let mut agent = server.agent().await;
     let outputs = json!({ "encoding": "raw", "depth": true, "opacity": true, "normals": true });
     let rig = json!({ "name": "r", "cameras": cameras });

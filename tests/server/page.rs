@@ -87,6 +87,7 @@ fn ranges_of_the_schema_are_those_of_the_program() {
     let cameras = wildcity_scene::Rig::MAX_CAMERAS as f64;
     let most_us = session::BUNDLE_PERIOD_US as f64;
     let dt_us = [session::DT_MIN_US as f64, session::DT_MAX_US as f64];
+    let coordinate_m = wildcity_scene::geometry::Pose::MAX_COORDINATE_M;
     let range = ["minimum", "maximum"];
     let items = ["minItems", "maxItems"];
     for (field, keywords, limits) in [
@@ -112,13 +113,45 @@ fn ranges_of_the_schema_are_those_of_the_program() {
         (&definition("Rig")["cameras"], items, [1.0, cameras]),
         (&definition("RigCamera")["width"], range, [1.0, side]),
         (&definition("Shutter")["duration_us"], range, [1.0, shutter_us]),
+        (&request("step")["until_us"], range, [dt_us[0], session::PLAN_US as f64]),
+        (&definition("SessionStep")["until_us"], range, [dt_us[0], session::PLAN_US as f64]),
+        (&request("reset")["speed"], range, [-sim::EGO_REVERSE_M_S, sim::EGO_SPEED_M_S]),
+        (&definition("RandomStart")["lateral_m"], range, [0.0, session::START_LATERAL_M]),
+        (&definition("RandomStart")["heading_rad"], range, [0.0, std::f64::consts::PI]),
+        (&definition("Outputs")["period_us"]["additionalProperties"], range, [dt_us[0], most_us]),
+        (&definition("ImagePart")["size"]["items"], range, [1.0, side]),
+        (&definition("Pose")["xyz"]["items"], range, [-coordinate_m, coordinate_m]),
+        (&definition("Sensors")["delay_us"], range, [0.0, most_us]),
+        (&definition("LensDirt")["spots"], range, [1.0, session::DIRT_SPOTS as f64]),
+        (
+            &definition("Imu")["bias_period_us"],
+            range,
+            [*session::WANDER_PERIOD_US.start() as f64, *session::WANDER_PERIOD_US.end() as f64],
+        ),
     ] {
         let found = keywords.map(|keyword| field[keyword].as_f64());
         assert_eq!(found, limits.map(Some), "{field}");
     }
     // Names: the pattern accepts what the program accepts.
-    let pattern = request("open")["twin"]["pattern"].clone();
-    assert_eq!(pattern, "^[a-z0-9_-][a-z0-9._-]{0,63}$");
+    let pattern = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
+    assert_eq!(request("open")["twin"]["pattern"], pattern);
+    for name in [
+        "step",
+        "observe",
+        "prefetch",
+        "reset",
+        "switch_version",
+        "snapshot",
+        "restore",
+        "close",
+        "resume",
+        "open",
+        "branch",
+    ] {
+        assert_eq!(request(name)["session"]["pattern"], pattern, "{name}");
+    }
+    assert_eq!(request("resume")["also"]["items"]["pattern"], pattern);
+    assert_eq!(definition("SessionStep")["session"]["pattern"], pattern);
     for (name, is_name) in
         [("a", true), (".a", false), ("-", true), ("a.b_c-9", true), ("A", false)]
     {

@@ -8,7 +8,7 @@ use wildcity_render::cpu::{Cpu, Simd};
 
 use crate::episodes::lines;
 use crate::replay::replay;
-use crate::support::{Agent, Painter, Seen, TestServer, pose, refused};
+use crate::support::{Agent, Painter, Reply, Seen, TestServer, pose, refused};
 
 /// Poses every 0.1 s: straight on by a metre each.
 fn straight(poses: u32) -> Value {
@@ -146,6 +146,62 @@ async fn a_car_follows_a_trajectory_for_several_steps() {
         let off_m = (at(0) - wanted[0]).hypot(at(1) - wanted[1]);
         assert!(off_m < 0.05, "{model}: {off_m} m off, {ego}");
     }
+}
+
+/// Every JSON value but `null` comes back from the record as it was sent, and means nothing to anything else.
+#[tokio::test]
+async fn notes_go_into_the_record_untouched() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("noted").await;
+    agent.open(json!({ "session": "beside" })).await;
+    let all = [
+        json!("a line\nand \"another\" \u{2028} \u{0} Größe 路"),
+        json!(""),
+        json!(true),
+        json!([[], {}, [[0, -1]]]),
+        json!({
+            "": {}, "z": 1, "a": { "kind": "frame", "pose": [1, 2] }, "most": u64::MAX, "least": i64::MIN,
+            "small": 5e-324, "third": 1.0 / 3.0, "large": 1e300, "whole": 2.0,
+        }),
+        json!("x".repeat(65_534)),
+    ];
+    let mut bare = Vec::new();
+    for (step, notes) in all.iter().enumerate() {
+        let x_m = step as f64;
+        if step % 2 == 0 {
+            let request =
+                json!({ "type": "step", "session": "noted", "pose": pose(x_m), "notes": notes });
+            bare.push(agent.look(request).await);
+        } else {
+            let step = json!({ "session": "noted", "pose": pose(x_m), "notes": notes });
+            agent.send(json!({ "type": "step_many", "steps": [step] })).await;
+            assert!(matches!(agent.receive().await, Reply::Binary(_)));
+        }
+        // A request that is repeated is on record once, and one that is refused is not.
+        agent.seq -= 1;
+        agent.send(json!({ "type": "close", "session": "noted" })).await;
+        assert!(matches!(agent.receive().await, Reply::Binary(_)));
+        let far = json!({ "type": "step", "session": "noted", "pose": pose(1e9), "notes": notes });
+        refused(&agent.ask(far).await, "pose_invalid");
+    }
+    // Observations do not depend on them.
+    let mut other = server.driver("bare").await;
+    for step in 0..all.len() {
+        let seen = other.step(step as f64).await;
+        if step % 2 == 0 {
+            assert_same(&seen, &bare[step / 2]);
+        }
+    }
+    agent.ask(json!({ "type": "close", "session": "noted" })).await;
+    let path = server.episodes.path().join("noted-1.jsonl");
+    let written: Vec<Value> = lines(&path)
+        .iter()
+        .filter(|line| line["kind"] == "frame")
+        .map(|line| line["notes"].clone())
+        .collect();
+    assert_eq!(written, all);
+    let report = replay(&server, &path, &Painter::default()).unwrap();
+    assert_eq!((report.diverged, report.difference), (None, None));
 }
 
 #[tokio::test]

@@ -397,3 +397,35 @@ async fn a_replay_decides_again() {
     let report = replay(&server, &path, &Painter::default()).unwrap();
     assert!(report.difference.is_some() && report.wrong_value.is_none());
 }
+
+/// Room for the header is reserved before the header is known, also for what is told of every image.
+#[tokio::test]
+async fn the_longest_header_of_sensors_fits() {
+    let server = TestServer::start().await;
+    let cameras = crate::observation::cameras_of_long_headers();
+    let effects = json!({
+        "drop": 0.3, "freeze": { "chance": 0.5, "for_us": 300_000 },
+        "noise": { "full_well": 500, "read": 10 }, "exposure": { "stops": 0.5, "period_us": 700_000 },
+        "dirt": { "spots": 3, "radius": 0.1, "opacity": 0.75 },
+    });
+    let of = |camera: &Value| (camera["name"].as_str().unwrap().to_owned(), effects.clone());
+    let by_name: serde_json::Map<String, Value> = cameras.iter().map(of).collect();
+    let open = |frames: u64| {
+        json!({
+            "session": "s".repeat(64), "seed": u64::MAX, "warm_up_us": 0,
+            "rig": { "name": "r", "cameras": cameras }, "sensors": { "cameras": by_name },
+            "outputs": { "encoding": "raw", "depth": true, "opacity": true, "frames": frames, "trust": true },
+        })
+    };
+    let mut agent = server.agent().await;
+    let refusal = agent.try_open(open(16)).await;
+    refused(&refusal, "out_of_range");
+    assert_eq!(refusal["field"], "sensors", "{refusal}");
+    agent.open(open(15)).await;
+    let mut most = 0;
+    for step in 0..20 {
+        let seen = agent.step(0.1 + f64::from(step) / 3.0).await;
+        most = most.max(images(&seen).filter(|image| image["sensor"].is_object()).count());
+    }
+    assert_eq!(most, 240);
+}

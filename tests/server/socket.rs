@@ -11,6 +11,7 @@ use tokio_tungstenite::tungstenite::protocol::CloseFrame;
 use wildcity_server::Limits;
 
 use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, pose, refused};
+use crate::viewer::{WATCH, connect};
 
 /// The next frame, whatever it is.
 async fn frame(agent: &mut Agent) -> Option<Message> {
@@ -40,6 +41,40 @@ async fn pings_are_answered_while_a_request_runs() {
         assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
     }
     assert_eq!(agent.seen().await.meta["step"], 1);
+}
+
+/// Not only during a step: before `hello`, and while frames of other requests are rendered.
+#[tokio::test]
+async fn pings_are_answered_whatever_runs() {
+    let server = TestServer::start().await;
+    let mut agent = Agent::connect(server.address()).await;
+    let pinged = async |agent: &mut Agent| {
+        let sent = Instant::now();
+        agent.socket.send(Message::Ping("x".into())).await.unwrap();
+        assert_eq!(frame(agent).await, Some(Message::Pong("x".into())));
+        assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+    };
+    pinged(&mut agent).await;
+    agent.hello().await;
+    pinged(&mut agent).await;
+    for name in ["a", "b"] {
+        agent.open(json!({ "session": name, "outputs": { "encoding": "raw" } })).await;
+    }
+    let of = |name: &str| json!({ "session": name, "pose": pose(1.0) });
+    agent.ask(json!({ "type": "snapshot", "session": "a", "name": "s" })).await;
+    server.painter.slow_ms.store(400, Ordering::SeqCst);
+    for request in [
+        json!({ "type": "step_many", "steps": [of("a"), of("b")] }),
+        json!({ "type": "observe", "session": "a", "poses": [pose(1.0)] }),
+        json!({ "type": "reset", "session": "a" }),
+        json!({ "type": "restore", "session": "a", "name": "s" }),
+    ] {
+        agent.send(request.clone()).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        pinged(&mut agent).await;
+        let reply = agent.receive().await;
+        assert!(matches!(reply, Reply::Binary(_)), "{request}: {reply:?}");
+    }
 }
 
 #[tokio::test]
@@ -151,5 +186,31 @@ async fn the_servers_own_close_frame_says_why() {
     assert!(!message.contains("resume") && message.contains("open"), "{message}");
     assert_eq!(close_code(&mut new).await, 1001);
     drop(new);
+    stopping.await.unwrap();
+}
+
+/// A watcher gets pongs, and the Close frame that says why its connection ends.
+#[tokio::test]
+async fn watchers_are_told_why_they_end() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let watcher = async || {
+        let watcher = connect(server.address(), "/v1/sessions/a/watch", WATCH, None).await;
+        watcher.ok().expect("a watcher")
+    };
+    let mut talker = watcher().await;
+    talker.send_text("{}").await;
+    assert_eq!(close_code(&mut talker).await, 1008);
+    let mut until_the_end = watcher().await;
+    until_the_end.socket.send(Message::Ping("x".into())).await.unwrap();
+    assert_eq!(frame(&mut until_the_end).await, Some(Message::Pong("x".into())));
+    assert_eq!(agent.ask(json!({ "type": "close" })).await["type"], "closed");
+    assert_eq!(close_code(&mut until_the_end).await, 1000);
+    agent.open(json!({ "session": "a" })).await;
+    let mut until_the_stop = watcher().await;
+    let TestServer { running, .. } = server;
+    let stopping = tokio::spawn(running.stop());
+    assert_eq!(close_code(&mut until_the_stop).await, 1001);
+    drop(agent);
     stopping.await.unwrap();
 }

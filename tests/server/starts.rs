@@ -131,6 +131,39 @@ async fn what_is_no_start_is_refused() {
     }
 }
 
+/// After a switch of version and a reset, `resumed` tells what holds now.
+#[tokio::test]
+async fn resumed_tells_the_settings_of_now() {
+    let server = TestServer::start().await;
+    crate::support::commit_twin_of(server.twins.path(), -1.0);
+    let mut agent = server.agent().await;
+    let outputs = json!({ "encoding": "png", "trust": true, "period_us": { "rear": 200_000 } });
+    let opened = agent
+        .open(json!({
+            "session": "a", "version": 1, "seed": 5, "warm_up_us": 200_000, "outputs": outputs,
+            "dynamics": { "model": "dynamic", "speed": 4.0 }, "sensors": { "imu": {} },
+        }))
+        .await;
+    agent.look(json!({ "type": "reset", "seed": 8 })).await;
+    let switched = agent.ask(json!({ "type": "switch_version", "version": 2 })).await;
+    drop(agent);
+    let mut again = server.agent().await;
+    let resumed = again.ask(json!({ "type": "resume", "session": "a", "last_seq": 3 })).await;
+    let mut now = resumed["opened"].clone();
+    for (field, value) in [
+        ("version", json!(2)),
+        ("version_hash", switched["version_hash"].clone()),
+        ("seed", json!(8)),
+    ] {
+        assert_ne!(opened[field], value);
+        assert_eq!(now[field], value, "{now}");
+        now[field] = opened[field].clone();
+    }
+    now["type"] = "opened".into();
+    now["reserved_bytes"] = opened["reserved_bytes"].clone();
+    assert_eq!(now, opened);
+}
+
 #[tokio::test]
 async fn resumed_repeats_what_opened_said() {
     let server = TestServer::start().await;

@@ -35,7 +35,7 @@ async fn ask(server: &TestServer, line: &str, token: &str) -> (u16, Value) {
 }
 
 /// Connects to a path, or returns the status of the refusal.
-async fn connect(
+pub(crate) async fn connect(
     address: SocketAddr,
     path: &str,
     protocol: &str,
@@ -59,7 +59,7 @@ async fn connect(
     }
 }
 
-const WATCH: &str = "wildcity.watch.v1";
+pub(crate) const WATCH: &str = "wildcity.watch.v1";
 
 #[tokio::test]
 async fn the_page_may_load_from_this_server_alone() {

@@ -14,6 +14,7 @@ pub struct Branch {
     pub from: BranchPoint,
     /// Name for the session. If absent, the server chooses one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
     pub session: Option<String>,
 }
 
@@ -25,13 +26,16 @@ pub enum BranchPoint {
     /// A snapshot of a session that still exists, on any connection of the same token.
     Snapshot {
         /// Name of the session.
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: String,
         /// Name of the snapshot.
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         snapshot: String,
     },
     /// A step of an episode that the server has recorded.
     Recorded {
         /// Name of the episode: that of its file, without `.jsonl`.
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::EPISODE_PATTERN)))]
         episode: String,
         /// Number of steps done there.
         step: u64,

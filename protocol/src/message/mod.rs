@@ -33,6 +33,25 @@ pub use sensors::{
 #[cfg(feature = "schema")]
 pub const NAME_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
 
+/// What names of recorded episodes are: the name of a session, a hyphen and a number.
+#[cfg(feature = "schema")]
+pub(crate) const EPISODE_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}-[0-9]{1,20}$";
+
+/// Says in the schema of a list that no item is there twice.
+#[cfg(feature = "schema")]
+pub(crate) fn unique_items(schema: &mut schemars::Schema) {
+    schema.insert("uniqueItems".to_owned(), true.into());
+}
+
+/// Says in the schema of a map of periods which of them are accepted.
+#[cfg(feature = "schema")]
+pub(crate) fn periods(schema: &mut schemars::Schema) {
+    if let Some(serde_json::Value::Object(period)) = schema.get_mut("additionalProperties") {
+        period.insert("minimum".to_owned(), 1_000.into());
+        period.insert("maximum".to_owned(), 10_000_000.into());
+    }
+}
+
 /// Says in the schema of a step that it has exactly one movement.
 #[cfg(feature = "schema")]
 pub(crate) fn one_movement(schema: &mut schemars::Schema) {

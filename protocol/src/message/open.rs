@@ -218,15 +218,19 @@ pub struct RandomStart {
     pub trajectory: Option<String>,
     /// Least distance from the start of the trajectory, in metres. If absent, 0, or where the warm-up ends.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0)))]
     pub from_m: Option<f64>,
     /// Largest distance from the start of the trajectory. If absent, its length.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0)))]
     pub to_m: Option<f64>,
     /// Largest distance to the left or right of the drive, in metres, 0 to 20.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = 20.0)))]
     pub lateral_m: Option<f64>,
     /// Largest angle to the drive's heading, in radians, 0 to π.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 0.0, max = std::f64::consts::PI)))]
     pub heading_rad: Option<f64>,
 }
 
@@ -336,6 +340,7 @@ pub struct Outputs {
     /// Names of the cameras to render, in this order. If absent, all.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
+    #[cfg_attr(feature = "schema", schemars(transform = super::unique_items))]
     pub cameras: Option<Vec<String>>,
     /// Crops and sizes of images that differ from the rig's, by camera name. The cameras of `opened`
     /// describe the images as sent.
@@ -371,6 +376,7 @@ pub struct Outputs {
     /// Time between two frames, by camera name, in simulated microseconds: a whole number of steps. If
     /// absent, every camera takes a frame with every step.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(transform = super::periods))]
     pub period_us: Option<BTreeMap<String, i64>>,
 }
 
@@ -404,6 +410,7 @@ pub struct ImagePart {
     pub crop: Option<[u64; 4]>,
     /// Width and height at which the crop is rendered, in pixels. If absent, those of the crop.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(inner(range(min = 1, max = 16_384))))]
     pub size: Option<[u64; 2]>,
 }
 

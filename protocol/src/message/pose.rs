@@ -7,7 +7,9 @@ use serde::{Deserialize, Serialize};
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Pose {
     /// Position, in metres.
+    #[cfg_attr(feature = "schema", schemars(inner(range(min = -1e8, max = 1e8))))]
     pub xyz: [f64; 3],
     /// Unit quaternion (w, x, y, z).
+    #[cfg_attr(feature = "schema", schemars(inner(range(min = -1.001, max = 1.001))))]
     pub q: [f64; 4],
 }

@@ -44,6 +44,7 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// `world_from_rig` at the end of the step. Only with teleport dynamics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -58,6 +59,7 @@ pub enum Request {
         /// For how long the trajectory or the action is followed, in microseconds since the start of the step: a
         /// whole number of `dt_us`. The answer is the observation at its end. If absent, `dt_us`.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 60_000_000)))]
         until_us: Option<i64>,
         /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -82,6 +84,7 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// Poses of the rig, `world_from_rig`: 1 to `limits.observe_poses`.
         #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 16)))]
@@ -94,6 +97,7 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// Poses of the rig, `world_from_rig`, in driving order. The straight lines between them count too.
         /// They replace the poses of the previous `prefetch`.
@@ -106,6 +110,7 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// Seed of the episode.
         #[serde(default)]
@@ -118,6 +123,7 @@ pub enum Request {
         dynamics: Option<DynamicsChoice>,
         /// Speed at the start of this episode, in m/s, in place of that of the dynamics.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(range(min = -10.0, max = 60.0)))]
         speed: Option<f64>,
     },
     /// Shows another version of the twin from the next step on. The episode continues. Answer: `switched`.
@@ -126,6 +132,7 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// Number of the version. If absent, the latest.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -137,8 +144,10 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// Name of the snapshot.
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         name: String,
     },
     /// Returns to a snapshot of this session. Answer: an observation of that state.
@@ -147,8 +156,10 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
         /// Name of the snapshot.
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         name: String,
     },
     /// Opens a session in a state of another episode. Answer: `opened`.
@@ -159,6 +170,7 @@ pub enum Request {
         seq: u64,
         /// Which session of the connection. If absent, its only one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
+        #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
         session: Option<String>,
     },
     /// Continues a session after a lost connection, in place of `open`. Answer: `resumed`.
@@ -173,6 +185,7 @@ pub enum Request {
         /// Names of the other sessions of the lost connection, at most 63.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         #[cfg_attr(feature = "schema", schemars(length(max = 63)))]
+        #[cfg_attr(feature = "schema", schemars(inner(regex(pattern = super::NAME_PATTERN))))]
         also: Vec<String>,
     },
 }
@@ -184,6 +197,7 @@ pub enum Request {
 #[serde(deny_unknown_fields)]
 pub struct SessionStep {
     /// Name of the session.
+    #[cfg_attr(feature = "schema", schemars(regex(pattern = super::NAME_PATTERN)))]
     pub session: String,
     /// `world_from_rig` at the end of the step. Only with teleport dynamics.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -198,6 +212,7 @@ pub struct SessionStep {
     /// For how long the trajectory or the action is followed, in microseconds since the start of the step: a
     /// whole number of `dt_us`. The answer is the observation at its end. If absent, `dt_us`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 60_000_000)))]
     pub until_us: Option<i64>,
     /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
     #[serde(default, skip_serializing_if = "Option::is_none")]

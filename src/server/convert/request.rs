@@ -373,11 +373,14 @@ fn scenario_of(
         reason: format!("scenario{field}: {reason}"),
         field: Some(format!("scenario{field}")),
     };
-    let Some(Value::String(name)) = object.remove("name") else {
-        return Err(wrong(
-            "",
-            "write the format of a scenario, or the name of one of the server's",
-        ));
+    let name = match object.remove("name") {
+        Some(Value::String(name)) => name,
+        Some(_) => return Err(wrong(".name", "write the name of one of the server's scenarios")),
+        None => {
+            let field = if object.is_empty() { "" } else { ".name" };
+            let reason = "write the format of a scenario, or the name of one of the server's";
+            return Err(wrong(field, reason));
+        }
     };
     let values = match object.remove("values") {
         None => serde_json::Map::new(),

@@ -7,6 +7,7 @@ use wildcity_render::{MAX_VIEWS, View};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::{Rig, RigCamera};
+use wildcity_twin::residency::Viewpoint;
 
 use super::encode::Encoding;
 use super::frame_history::{FrameHistory, PastFrame};
@@ -20,6 +21,7 @@ use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
 use crate::sensors::settings::{CameraSensor, Sensors};
+use crate::viewpoint::viewpoints;
 
 /// The header's length, little-endian, comes before the header.
 pub const HEADER_PREFIX_BYTES: usize = 8;
@@ -92,6 +94,8 @@ pub(crate) struct RigCapture {
     pub(crate) sensed: bool,
     /// Indices of the cameras; there may be none.
     pub(crate) cameras: Vec<usize>,
+    /// Indices of the cameras, rising, for whose views the levels of detail are chosen: these ones, or more.
+    pub(crate) detail_for: Vec<usize>,
     /// Whether the observation shows the images now. Otherwise they are rendered for the frame history.
     pub(crate) shown: bool,
 }
@@ -311,6 +315,7 @@ impl ObservationLayout {
             time_us,
             due_us,
             sensed: true,
+            detail_for: self.detail_for(&cameras),
             cameras,
             shown: due_us == now_us && self.schedule.is_decision(now_us),
         };
@@ -325,10 +330,28 @@ impl ObservationLayout {
             time_us: episode.time_us(),
             due_us: episode.time_us(),
             sensed: false,
+            detail_for: cameras.clone(),
             cameras: cameras.clone(),
             shown: true,
         };
         poses.into_iter().map(capture).collect()
+    }
+
+    /// The cameras for whose views the levels of detail of a frame are chosen that sensors take. If a camera may deliver
+    /// another picture than the one that is due, these are all of the rig: neither a picture nor the other cameras'
+    /// images then depend on which frames are lost.
+    pub(crate) fn detail_for(&self, cameras: &[usize]) -> Vec<usize> {
+        let mut sensors = self.sensors.iter().flat_map(|sensors| &sensors.cameras);
+        match sensors.any(CameraSensor::changes_times) {
+            true => (0..self.cameras.len()).collect(),
+            false => cameras.to_vec(),
+        }
+    }
+
+    /// The viewpoints for which the levels of detail of a capture are chosen.
+    pub(crate) fn viewpoints(&self, episode: &Episode, capture: &RigCapture) -> Vec<Viewpoint> {
+        let RigCapture { detail_for, world_from_rig, time_us, .. } = capture;
+        viewpoints(&episode.views(&self.cameras, detail_for, *world_from_rig, *time_us))
     }
 
     /// The views of a capture.

@@ -190,6 +190,7 @@ fn frames_taken(
         }
         for (&camera, hash) in cameras.iter().zip(&mut hashes) {
             if layout.is_shown_later(capture, camera) {
+                // With the levels of detail that it had beside the other cameras.
                 let capture = RigCapture { cameras: vec![camera], shown: false, ..capture.clone() };
                 taken.push(KeptFrame { camera, capture, hash: hash.clone() });
             }

@@ -360,8 +360,14 @@ impl<'a> Replay<'a> {
     ) -> Result<Vec<View>, ReplayError> {
         let step = frame.step;
         let taken_us = frame.taken_us(pose);
-        let views = self.ego.episode().views(self.cameras, selected, frame.poses[pose], taken_us);
-        let viewpoints = viewpoints(&views);
+        let episode = self.ego.episode();
+        let views_of =
+            |cameras: &[usize]| episode.views(self.cameras, cameras, frame.poses[pose], taken_us);
+        let views = views_of(selected);
+        let viewpoints = match &self.sensors {
+            Some(sensors) => viewpoints(&views_of(&sensors.detail_for(frame, selected))),
+            None => viewpoints(&views),
+        };
         let mut scene = self
             .resident
             .scene(&viewpoints, self.profile)

@@ -342,8 +342,8 @@ fn select_cameras(
         },
     };
     let Some(names) = &outputs.cameras else { return Ok(rig) };
-    if !(1..=rig.cameras.len()).contains(&names.len()) {
-        let must = format!("{} names; 1 to {} are accepted", names.len(), rig.cameras.len());
+    if names.is_empty() {
+        let must = format!("without names; 1 to {} are accepted", rig.cameras.len());
         return Err(SessionError::OutOfRange { field: "outputs.cameras", must });
     }
     let mut selected: Vec<RigCamera> = Vec::with_capacity(names.len());

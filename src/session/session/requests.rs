@@ -33,7 +33,6 @@ use crate::scenario::assets::FrameDetail;
 use crate::scenario::{EpisodeScenario, EpisodeTraffic};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
-use crate::viewpoint::viewpoints;
 
 /// What a frame shows beside the twin: the ego and its past, and the actors.
 #[derive(Clone, Copy)]
@@ -275,7 +274,7 @@ impl Session {
                 continue;
             }
             let views = layout.views(episode, &capture);
-            let viewpoints = viewpoints(&views);
+            let viewpoints = layout.viewpoints(episode, &capture);
             let profile = version.profile;
             let placed = traffic.map(|traffic| {
                 let detail = FrameDetail { viewpoints: &viewpoints, profile: &profile };

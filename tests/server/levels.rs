@@ -1,0 +1,161 @@
+//! Levels of detail are chosen for all cameras of a frame. What is rendered again on its own, or instead of a lost frame,
+//! must have the levels that it would have had in its frame.
+
+use std::sync::Arc;
+
+use glam::{DQuat, DVec3};
+use serde_json::{Value, json};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_scene::Gaussians;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::manifest::Provenance;
+use wildcity_scene::trajectory::{Keyframe, Trajectory};
+use wildcity_twin::store::{Catalog, NewVersion};
+
+use crate::branches::assert_all_same;
+use crate::replay::replay;
+use crate::support::{Agent, Seen, TestServer, pose};
+
+/// A server with the twin `wall`: small Gaussians of many colours, 20 to 60 m ahead of a drive of 9 m.
+async fn server() -> TestServer {
+    let backend = Cpu::new(1, Simd::Best).expect("a backend");
+    let server = TestServer::configured(|config| config.backend = Arc::new(backend)).await;
+    let count = 8000;
+    let mut state = 1_u64;
+    let mut unit = || {
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / f64::from(1_u32 << 31)
+    };
+    let mut means_m = Vec::new();
+    let mut sh = Vec::new();
+    for _ in 0..count {
+        means_m.push([20.0 + 40.0 * unit(), 20.0 * unit() - 10.0, 6.0 * unit()]);
+        sh.extend([0; 3].map(|_| (3.0 * unit() - 1.5) as f32));
+    }
+    let gaussians = Gaussians {
+        sh_degree: 0,
+        means_m,
+        quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; count],
+        ln_scales: vec![[-1.8; 3]; count],
+        logit_opacities: vec![1.0; count],
+        sh,
+    };
+    let keyframe = |k: i64| Keyframe {
+        time_us: 100_000 * k,
+        world_from_rig: Pose { position_m: DVec3::X * k as f64, rotation: DQuat::IDENTITY },
+    };
+    let log = Trajectory { name: "log".to_owned(), keyframes: (0..10).map(keyframe).collect() };
+    let new = NewVersion {
+        trajectories: vec![log],
+        ..NewVersion::of("wall", &gaussians, Provenance::of("test".to_owned()))
+    };
+    let catalog = Catalog::open(server.twins.path()).expect("a directory");
+    catalog.commit(new, &mut |_, _| {}).expect("a twin");
+    server
+}
+
+/// A wide camera and one of twenty times its focal length, for which the levels are much finer.
+fn rig(names: &[&str]) -> Value {
+    let camera = |name: &&str| {
+        let focal = if *name == "tele" { 400.0 } else { 20.0 };
+        json!({
+            "name": name, "width": 32, "height": 24, "fx": focal, "fy": focal, "cx": 16.0, "cy": 12.0,
+            "camera_to_rig": { "xyz": [0.5, 0.0, 1.5], "q": [0.5, -0.5, 0.5, -0.5] },
+        })
+    };
+    json!({ "name": "r", "cameras": names.iter().map(camera).collect::<Vec<_>>() })
+}
+
+async fn open(server: &TestServer, name: &str, cameras: &[&str], more: Value) -> Agent {
+    let mut agent = server.agent().await;
+    let mut fields = json!({
+        "twin": "wall", "session": name, "rig": rig(cameras),
+        "outputs": { "encoding": "raw", "frames": 3 },
+    });
+    fields.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
+    agent.open(fields).await;
+    agent
+}
+
+async fn drive(agent: &mut Agent, from: u64, until: u64) -> Vec<Seen> {
+    let mut seen = Vec::new();
+    for step in from..=until {
+        seen.push(agent.step(0.25 * step as f64).await);
+    }
+    seen
+}
+
+/// Hash of a camera's present image.
+fn hash<'a>(seen: &'a Seen, camera: &str) -> &'a Value {
+    let images = seen.meta["images"].as_array().unwrap();
+    &images.iter().find(|image| image["camera"] == camera).unwrap()["hash"]
+}
+
+/// The other tests of this file rest on this: beside a long focal length, the wide camera sees finer levels.
+#[tokio::test]
+async fn cameras_of_a_frame_share_its_levels() {
+    let server = server().await;
+    let mut alone = open(&server, "alone", &["wide"], json!({})).await;
+    let mut both = open(&server, "both", &["wide", "tele"], json!({})).await;
+    let alone = alone.step(1.0).await;
+    let both = both.step(1.0).await;
+    assert_ne!(hash(&alone, "wide"), hash(&both, "wide"));
+}
+
+/// A branch of a record renders the frames of its bundles again, camera by camera.
+#[tokio::test]
+async fn a_record_is_continued_with_the_levels_of_its_frames() {
+    let server = server().await;
+    let mut agent = open(&server, "original", &["wide", "tele"], json!({})).await;
+    agent.look(json!({ "type": "reset" })).await;
+    let original = drive(&mut agent, 1, 8).await;
+    agent.ask(json!({ "type": "close" })).await;
+    for done in [1, 4, 7] {
+        let mut branch = server.agent().await;
+        let from = json!({ "episode": "original-1", "step": done });
+        let opened = branch.ask(json!({ "type": "branch", "from": from })).await;
+        assert_eq!(opened["type"], "opened", "{opened}");
+        assert_all_same(&drive(&mut branch, done + 1, 8).await, &original[done as usize..]);
+    }
+}
+
+/// Where an earlier picture stands in for a lost frame, the other camera's images stay as they are without the loss.
+#[tokio::test]
+async fn a_lost_frame_does_not_change_the_other_images() {
+    let server = server().await;
+    let mut plain = open(&server, "plain", &["wide", "tele"], json!({})).await;
+    let mut truth = vec![plain.look(json!({ "type": "reset" })).await];
+    truth.extend(drive(&mut plain, 1, 20).await);
+    let tele = json!({ "drop": 0.5, "freeze": { "chance": 0.3, "for_us": 300_000 } });
+    let sensors = json!({ "sensors": { "cameras": { "tele": tele } } });
+    let mut sensed = open(&server, "sensed", &["wide", "tele"], sensors).await;
+    let mut seen = vec![sensed.look(json!({ "type": "reset" })).await];
+    seen.extend(drive(&mut sensed, 1, 20).await);
+    let mut replaced = 0;
+    for (one, true_one) in seen.iter().zip(&truth) {
+        assert_eq!(hash(one, "wide"), hash(true_one, "wide"), "step {}", one.meta["step"]);
+        let images = one.meta["images"].as_array().unwrap();
+        let sensor = &images.iter().find(|image| image["camera"] == "tele").unwrap()["sensor"];
+        let taken = sensor["taken_us"].as_u64().unwrap() as usize / 100_000;
+        assert_eq!(hash(one, "tele"), hash(&truth[taken], "tele"), "the picture of its time");
+        replaced += usize::from(sensor["taken_us"] != sensor["due_us"]);
+    }
+    assert!((5..16).contains(&replaced), "{replaced} of 21");
+
+    // The scene itself, without sensors, is that of a session without them.
+    let observe = json!({ "type": "observe", "poses": [pose(1.0)] });
+    let looks = [sensed.look(observe.clone()).await, plain.look(observe).await];
+    assert_eq!(looks[0].meta["images"], looks[1].meta["images"]);
+
+    // Continued from its record, and replayed.
+    sensed.ask(json!({ "type": "close" })).await;
+    let path = server.episodes.path().join("sensed-1.jsonl");
+    let report = replay(&server, &path, &Cpu::new(1, Simd::Best).unwrap()).unwrap();
+    assert_eq!((report.difference, report.wrong_value, report.diverged), (None, None, None));
+    let mut branch = server.agent().await;
+    let from = json!({ "episode": "sensed-1", "step": 10 });
+    let opened = branch.ask(json!({ "type": "branch", "from": from })).await;
+    assert_eq!(opened["type"], "opened", "{opened}");
+    assert_all_same(&drive(&mut branch, 11, 20).await, &seen[11..]);
+}
