@@ -189,7 +189,7 @@ impl Projected {
     /// The splats of one unit page by page, each with the place of its first: for hot loops.
     pub(super) fn pages(&self, unit: &Unit) -> impl Iterator<Item = (u32, &[Splat])> {
         let pages = (unit.first_page..).zip((0..unit.len).step_by(PAGE));
-        pages.map(|(page, start)| {
+        pages.map(move |(page, start)| {
             let splats = &self.pages[page][..PAGE.min(unit.len - start)];
             ((page << PAGE_BITS) as u32, splats)
         })
