@@ -171,21 +171,21 @@ impl Chunk {
     ) -> Self {
         let width = columns(sh_degree);
         assert_eq!(lanes.len(), count.div_ceil(LANES) * width, "lanes of another count");
-        let mut clusters = vec![Cluster::EMPTY; count.div_ceil(CLUSTER)];
-        for (index, group) in lanes.chunks_exact_mut(width).enumerate() {
-            let cluster = &mut clusters[index * LANES / CLUSTER];
-            for lane in 0..LANES {
-                let values = group.iter().map(|lanes| lanes.0[lane]);
-                if index * LANES + lane < count && is_drawable(values) {
-                    cluster.add(
-                        [0, 1, 2].map(|axis| group[column::MEAN + axis].0[lane]),
-                        [0, 1, 2].map(|axis| group[column::SCALE + axis].0[lane]),
-                    );
-                } else {
+        let mut clusters = Vec::with_capacity(count.div_ceil(CLUSTER));
+        let mut left = count;
+        for of_cluster in lanes.chunks_mut(width * CLUSTER / LANES) {
+            let mut bounds = LaneBounds::EMPTY;
+            for group in of_cluster.chunks_exact_mut(width) {
+                let mut drawable = drawable_lanes(group);
+                drawable.iter_mut().skip(left).for_each(|drawable| *drawable = false);
+                left = left.saturating_sub(LANES);
+                bounds.add(group, &drawable);
+                for lane in (0..LANES).filter(|&lane| !drawable[lane]) {
                     group.iter_mut().for_each(|lanes| lanes.0[lane] = 0.0);
                     group[column::LOG2_OPACITY].0[lane] = f32::NEG_INFINITY;
                 }
             }
+            clusters.push(bounds.cluster());
         }
         Self { cell, origin_m, sh_degree, count, lanes, clusters }
     }
@@ -334,6 +334,73 @@ impl Chunk {
     /// Memory that this chunk has allocated, in bytes.
     pub fn bytes(&self) -> usize {
         self.lanes.capacity() * size_of::<Lanes>() + self.clusters.capacity() * size_of::<Cluster>()
+    }
+}
+
+/// Bounds of every sixteenth Gaussian of a cluster: lane by lane, so that the compiler makes vector instructions of it.
+struct LaneBounds {
+    min_m: [[f32; LANES]; 3],
+    max_m: [[f32; LANES]; 3],
+    sigma_m: [f32; LANES],
+}
+
+impl LaneBounds {
+    const EMPTY: Self = Self {
+        min_m: [[f32::INFINITY; LANES]; 3],
+        max_m: [[f32::NEG_INFINITY; LANES]; 3],
+        sigma_m: [0.0; LANES],
+    };
+
+    /// Adds the drawable Gaussians of a lane group.
+    fn add(&mut self, group: &[Lanes], drawable: &[bool; LANES]) {
+        for axis in 0..3 {
+            let mean_m = &group[column::MEAN + axis].0;
+            let scale_m = &group[column::SCALE + axis].0;
+            for lane in 0..LANES {
+                let low_m = if drawable[lane] { mean_m[lane] } else { f32::INFINITY };
+                let high_m = if drawable[lane] { mean_m[lane] } else { f32::NEG_INFINITY };
+                let size_m = if drawable[lane] { scale_m[lane] } else { 0.0 };
+                let [min_m, max_m] = [&mut self.min_m[axis][lane], &mut self.max_m[axis][lane]];
+                *min_m = if low_m < *min_m { low_m } else { *min_m };
+                *max_m = if high_m > *max_m { high_m } else { *max_m };
+                let sigma_m = &mut self.sigma_m[lane];
+                *sigma_m = if size_m > *sigma_m { size_m } else { *sigma_m };
+            }
+        }
+    }
+
+    fn cluster(&self) -> Cluster {
+        let mut cluster = Cluster::EMPTY;
+        for lane in 0..LANES {
+            let corner_m = |of: &[[f32; LANES]; 3]| Vec3::new(of[0][lane], of[1][lane], of[2][lane]);
+            cluster.min_m = cluster.min_m.min(corner_m(&self.min_m));
+            cluster.max_m = cluster.max_m.max(corner_m(&self.max_m));
+            cluster.sigma_m = cluster.sigma_m.max(self.sigma_m[lane]);
+        }
+        cluster
+    }
+}
+
+/// [`is_drawable`] of each Gaussian of a lane group.
+fn drawable_lanes(group: &[Lanes]) -> [bool; LANES] {
+    let mut drawable = [true; LANES];
+    for (index, Lanes(values)) in group.iter().enumerate() {
+        match index {
+            column::LOG2_OPACITY => and_within(&mut drawable, values, |value| value <= f32::MAX),
+            column::SH.. => {
+                let most = 2.0 * sh::MAX_COEFFICIENT;
+                and_within(&mut drawable, values, |value| value.abs() <= most);
+            }
+            _ => and_within(&mut drawable, values, |value| value.abs() <= f32::MAX),
+        }
+    }
+    drawable
+}
+
+#[inline(always)]
+fn and_within(all: &mut [bool; LANES], values: &[f32; LANES], is: impl Fn(f32) -> bool) {
+    for (all, &value) in all.iter_mut().zip(values) {
+        *all &= is(value);
     }
 }
 
@@ -636,6 +703,37 @@ mod tests {
             }
             for chunk in [laid, pushed] {
                 assert_eq!(opacities(&chunk), [f32::NEG_INFINITY, -1.0], "{column} is {value}");
+            }
+        }
+    }
+
+    /// Three clusters, of which the last is partly filled, with an invalid Gaussian in the second.
+    #[test]
+    fn clusters_of_lanes_are_those_of_pushed_gaussians() {
+        let count = 2 * CLUSTER + 21;
+        let mut pushed = Chunk::new([0, 0], DVec3::ZERO, 0, count);
+        for i in 0..count {
+            let share = |k: usize| (i * k % 1_009) as f32 / 1_009.0 - 0.5;
+            let x_m = if i == CLUSTER + 7 { f32::NAN } else { 30.0 * share(37) };
+            pushed.push_activated(&ActivatedGaussian {
+                mean_m: [x_m, 30.0 * share(101), -4.0 * share(467)],
+                scale_m: [0.6 + share(911), 0.6 + share(13), 0.6 + share(211)],
+                quat_wxyz: [1.0, 0.0, 0.0, 0.0],
+                log2_opacity: -1.0,
+                sh: &[0.5; 3],
+            });
+        }
+        let groups = (0..count.div_ceil(LANES)).flat_map(|k| pushed.lane_group(k).iter().copied());
+        let mut lanes: Vec<Lanes> = groups.collect();
+        lanes[(CLUSTER + 7) / LANES * columns(0)].0[7] = f32::NAN;
+        // What lies in lanes after the last Gaussian does not count.
+        lanes.last_mut().unwrap().0[LANES - 1] = 1e30;
+        let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, count, lanes);
+        assert_eq!(laid.clusters().len(), 3);
+        assert_eq!(laid.clusters(), pushed.clusters());
+        for index in [0, CLUSTER + 7, count - 1] {
+            for column in 0..columns(0) {
+                assert_eq!(laid.value(index, column), pushed.value(index, column), "{index}");
             }
         }
     }

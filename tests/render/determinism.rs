@@ -3,10 +3,12 @@
 use std::sync::Mutex;
 
 use wildcity_render::cpu::{Cpu, CpuError, Simd};
-use wildcity_render::{Backend, Frame, RenderError, Target};
+use wildcity_render::{Backend, Frame, RenderError, Target, View};
+use wildcity_scene::geometry::camera::ShutterDirection;
 use wildcity_scene::{RenderProfile, Scene};
 
 use crate::images::{cpu, render, render_one};
+use crate::lenses::{lenses, rolling_view, street_scene};
 use crate::scene_files::gaussians;
 use crate::streets::{street, turning_views as views};
 
@@ -30,6 +32,38 @@ fn the_number_of_threads_does_not_show() {
     for threads in [2, 3, 7] {
         assert!(by(threads) == one, "{threads} threads");
     }
+}
+
+/// AVX2 and AVX-512 have the same operations, of eight and of sixteen lanes. SSE4.2 has no fused multiply-add: its images
+/// differ in last bits, and the backend says which instruction set it has.
+#[test]
+fn avx2_and_avx512_draw_the_same_bytes() {
+    let [Ok(avx2), Ok(avx512)] = [Simd::Avx2, Simd::Avx512].map(|simd| Cpu::new(2, simd)) else {
+        eprintln!("this machine lacks AVX-512 or AVX2, so that there is nothing to compare");
+        return;
+    };
+    let (street, pose) = street_scene();
+    let mut views = views();
+    for (_, camera) in lenses() {
+        views.push(View::new(camera, pose));
+        views.push(rolling_view(camera, pose, ShutterDirection::TopToBottom));
+        views.push(View::new(camera.scaled(80, 50).unwrap(), pose));
+    }
+    for profile in [
+        RenderProfile::default(),
+        RenderProfile { antialiased: true, lens_error_px: 1.0 / 64.0, ..RenderProfile::default() },
+    ] {
+        for view in &views {
+            let by = |backend: &Cpu| render_one(backend, &street, &profile, *view);
+            assert!(by(&avx2) == by(&avx512), "{view:?}");
+        }
+    }
+    assert_eq!([avx2.detail(), avx512.detail()], ["Avx2", "Avx512"]);
+    let sse = Cpu::new(2, Simd::Sse42).unwrap();
+    assert_eq!(sse.detail(), "Sse4_2");
+    let profile = RenderProfile::default();
+    let by = |backend: &Cpu| render_one(backend, &street, &profile, views[0]);
+    assert!(by(&sse) != by(&avx2), "not even a last bit");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use super::lanes::Vec3x16;
+use super::lanes::{Vec3x16, splats};
 use super::resolve::{BLOCKS, TileSums, block_corner};
 use crate::constants::BLOCK_PX;
 use wildcity_scene::appearance::{Appearance, Exposure, Overlay};
@@ -35,12 +35,15 @@ pub(super) fn apply<S: Simd>(
 /// `matrix rgb + offset`.
 #[inline(always)]
 fn expose<S: Simd>(simd: S, exposure: &Exposure, rgb: Vec3x16<S>) -> Vec3x16<S> {
-    let row = |c: usize| {
-        let [r, g, b] = exposure.matrix[c].map(|value| f32x16::splat(simd, value as f32));
-        let offset = f32x16::splat(simd, exposure.offset[c] as f32);
-        r.mul_add(rgb.x, g.mul_add(rgb.y, b.mul_add(rgb.z, offset)))
-    };
-    Vec3x16 { x: row(0), y: row(1), z: row(2) }
+    let mut exposed = [f32x16::splat(simd, 0.0); 3];
+    for (c, channel) in exposed.iter_mut().enumerate() {
+        let [r, g, b] = exposure.matrix[c];
+        let [r, g, b, offset] =
+            splats(simd, [r as f32, g as f32, b as f32, exposure.offset[c] as f32]);
+        *channel = r.mul_add(rgb.x, g.mul_add(rgb.y, b.mul_add(rgb.z, offset)));
+    }
+    let [x, y, z] = exposed;
+    Vec3x16 { x, y, z }
 }
 
 /// Blends the overlay over the block with its top left pixel at `at_px`: `(1 - alpha) rgb + alpha color`.

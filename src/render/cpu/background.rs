@@ -124,7 +124,8 @@ impl Background {
             (DrawableSky::Network(network), Some(scratch)) => {
                 let unit = direction.scale(splat(1.0) / direction.dot(direction).sqrt());
                 let rgb = network.rgb(simd, [unit.x, unit.y, unit.z], scratch);
-                [0, 1, 2].map(|c: usize| f32x16::load_array_ref(simd, &rgb[c]))
+                let Vec3x16 { x, y, z } = Vec3x16::from_arrays(simd, &rgb);
+                [x, y, z]
             }
             // `scratch` is made for every network.
             (DrawableSky::Network(_), None) => return,

@@ -28,10 +28,18 @@ pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -
         outputs.order = Some(sorted.places().map(index).collect());
     }
     if last >= Stage::Bin {
-        outputs.tiles = Some(TileLists {
-            ranges: bins.starts().windows(2).map(|tile| [tile[0], tile[1]]).collect(),
-            instances: bins.places().map(index).collect(),
-        });
+        let mut lists = TileLists::default();
+        for (view, grid) in bins.grids().iter().enumerate() {
+            for row in 0..grid.rows {
+                for column in 0..grid.columns {
+                    let start = lists.instances.len() as u32;
+                    let places = bins.tile(view, column, row).iter();
+                    lists.instances.extend(places.map(|&place| index(place)));
+                    lists.ranges.push([start, lists.instances.len() as u32]);
+                }
+            }
+        }
+        outputs.tiles = Some(lists);
     }
     outputs
 }

@@ -5,7 +5,19 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use wildcity_scene::chunk::Lanes;
+use wildcity_scene::chunk::{LANES, Lanes};
+
+/// Each value in every lane of a vector of its own.
+///
+/// A loop, and not `map` of an array: `map` remains a call, and so is compiled without the instruction set.
+#[inline(always)]
+pub(super) fn splats<S: Simd, const N: usize>(simd: S, values: [f32; N]) -> [f32x16<S>; N] {
+    let mut vectors = [f32x16::splat(simd, 0.0); N];
+    for (vector, value) in vectors.iter_mut().zip(values) {
+        *vector = f32x16::splat(simd, value);
+    }
+    vectors
+}
 
 /// Sixteen 3D vectors, component by component.
 #[derive(Clone, Copy)]
@@ -21,6 +33,16 @@ impl<S: Simd> Vec3x16<S> {
     pub(super) fn splat(simd: S, v: [f32; 3]) -> Self {
         let [x, y, z] = v;
         Self { x: f32x16::splat(simd, x), y: f32x16::splat(simd, y), z: f32x16::splat(simd, z) }
+    }
+
+    /// The columns of a block as arrays.
+    #[inline(always)]
+    pub(super) fn from_arrays(simd: S, [x, y, z]: &[[f32; LANES]; 3]) -> Self {
+        Self {
+            x: f32x16::load_array_ref(simd, x),
+            y: f32x16::load_array_ref(simd, y),
+            z: f32x16::load_array_ref(simd, z),
+        }
     }
 
     /// Three consecutive columns of a block.

@@ -1,6 +1,6 @@
 //! The cpu backend, the default: f32, SIMD chosen at run time, all cores.
 //!
-//! Each file is a stage: `project`, `sort`, `bin`, `rasterize`, `resolve`. The images are
+//! Each file is a stage: `project`, `bin`, `sort`, `rasterize`, `resolve`. The images are
 //! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
 //! splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that would
 //! exceed it together are rendered one half after the other.
@@ -150,6 +150,11 @@ impl Cpu {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
             let mut timer = StageTimer::start();
+            if last >= Stage::Sort {
+                // Frames that this backend completes need no order of whole views.
+                scratch.sorted.sort(&scratch.projected, &cutoffs);
+                timer.finish("sort", &mut stats);
+            }
             let outputs = export::stage_outputs(scratch, last, &cutoffs);
             timer.finish("hand over", &mut stats);
             Ok((outputs, stats))
@@ -175,8 +180,8 @@ impl Lane {
 }
 
 impl Scratch {
-    /// Runs the stages up to and including `last`. Each stage overwrites its part, so what an earlier frame
-    /// left there, even one that panicked, does not matter.
+    /// Projects, and bins and sorts if `last` is [`Stage::Bin`]. Each stage overwrites its part, so what an earlier
+    /// frame left there, even one that panicked, does not matter.
     fn run(
         &mut self,
         level: Level,
@@ -185,18 +190,16 @@ impl Scratch {
         last: Stage,
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
-        let Self { projected, sorted, bins } = self;
+        let Self { projected, bins, .. } = self;
         let mut timer = StageTimer::start();
         projected.project(level, frame, cutoffs);
         timer.finish("project", stats);
         stats.visible_pairs += projected.len() as u64;
-        if last >= Stage::Sort {
-            sorted.sort(projected, cutoffs);
-            timer.finish("sort", stats);
-        }
         if last >= Stage::Bin {
-            bins.bin(level, projected, sorted, frame.views, cutoffs)?;
+            bins.bin(level, projected, frame.views, cutoffs)?;
             timer.finish("bin", stats);
+            bins.sort();
+            timer.finish("sort", stats);
             stats.instances += bins.instances() as u64;
         }
         Ok(())

@@ -137,6 +137,9 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
     // An image's size need not be a multiple of 16 px: pixels beyond its edges are not written.
     let columns = edge.min(band.width.saturating_sub(column));
     let rows = edge.min(band.rows.saturating_sub(row));
+    if columns == 0 || rows == 0 {
+        return;
+    }
     let each = |write: &mut dyn FnMut(usize, usize)| {
         for y in 0..rows {
             for x in 0..columns {
@@ -158,10 +161,22 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
         let r = to_8_bit(simd, &sums.rgb[0][block]);
         let g = to_8_bit(simd, &sums.rgb[1][block]);
         let b = to_8_bit(simd, &sums.rgb[2][block]);
-        each(&mut |pixel, lane| {
-            let bytes = [r[lane] as u8, g[lane] as u8, b[lane] as u8];
-            rgb8[3 * pixel..3 * pixel + 3].copy_from_slice(&bytes);
-        });
+        let pixels = (r | g << 8 | b << 16).to_array();
+        for (y, of_row) in pixels.chunks_exact(edge).take(rows).enumerate() {
+            let first = 3 * ((row + y) * band.width + column);
+            // Four pixels of three bytes each.
+            let mut bytes = [0; 3 * BLOCK_PX as usize];
+            let [a, b, c, d] = [of_row[0], of_row[1], of_row[2], of_row[3]];
+            bytes[..4].copy_from_slice(&(a | b << 24).to_le_bytes());
+            bytes[4..8].copy_from_slice(&(b >> 8 | c << 16).to_le_bytes());
+            bytes[8..].copy_from_slice(&(c >> 16 | d << 8).to_le_bytes());
+            let to = &mut rgb8[first..first + 3 * columns];
+            // Of a fixed length, so that the compiler makes few stores of it.
+            match <&mut [u8; 3 * BLOCK_PX as usize]>::try_from(&mut *to) {
+                Ok(to) => *to = bytes,
+                Err(_) => to.copy_from_slice(&bytes[..to.len()]),
+            }
+        }
     }
     if let Some(depth_m) = &mut band.depth_m {
         let sum = &sums.depth_m[block];
@@ -177,9 +192,8 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
 
 /// Clamps to [0, 1] and rounds to the nearest of 0 to 255.
 #[inline(always)]
-fn to_8_bit<S: Simd>(simd: S, linear: &[f32; LANES]) -> [u32; LANES] {
+fn to_8_bit<S: Simd>(simd: S, linear: &[f32; LANES]) -> u32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
     let clamped = f32x16::load_array_ref(simd, linear).max(splat(0.0)).min(splat(1.0));
-    let rounded: u32x16<S> = clamped.mul_add(splat(255.0), splat(0.5)).to_int();
-    rounded.to_array()
+    clamped.mul_add(splat(255.0), splat(0.5)).to_int()
 }

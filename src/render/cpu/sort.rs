@@ -1,4 +1,5 @@
-//! Stage sort: all views' splats in order of (view, depth, global id).
+//! Orders of splats: of one macro tile by depth ([`sort_by_depth`]), and of all views by (view, depth, global id), which
+//! is the output of stage sort for another backend.
 //!
 //! **A radix sort of 28-bit depths, from the lowest digit.** Splats are projected in order of (view, global id), so each
 //! view has its own range of places already. Every pass keeps the order of equal digits, so equal depths keep the order of
@@ -97,19 +98,6 @@ impl Sorted {
         self.keys[..self.used].iter().map(|key| key.load(Relaxed) as u32)
     }
 
-    /// Keys of one view's splats, from the nearest; the low half is the place in the projection.
-    pub(super) fn view(&self, view: usize) -> &[AtomicU64] {
-        let first = self.segments.partition_point(|segment| segment.view < view);
-        let after = self.segments.partition_point(|segment| segment.view <= view);
-        match &self.segments[first..after] {
-            [] => &[],
-            segments => {
-                let end = segments[segments.len() - 1].keys.end;
-                &self.keys[segments[0].keys.start..end]
-            }
-        }
-    }
-
     /// Cuts the units of a projection into segments.
     fn cut(&mut self, units: &[Unit]) {
         let mut spare = std::mem::take(&mut self.segments).into_iter();
@@ -133,6 +121,45 @@ impl Sorted {
                 }
             }
         }
+    }
+}
+
+/// Sorts keys with the depth in their upper half and an index, from 0 in this order, in the lower half. `other` is scratch
+/// memory.
+pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
+    // Below, counters cost more than comparisons.
+    const FEW: usize = 256;
+    if keys.len() < FEW {
+        keys.sort_unstable();
+        return;
+    }
+    // Three digits of the bits in which the depths differ.
+    let first = keys[0];
+    let differ = keys.iter().fold(0, |differ, key| differ | (key ^ first)) >> 32;
+    let digit_bits = (u64::BITS - differ.leading_zeros()).div_ceil(PASSES).max(1);
+    let digit = |key: u64, pass: u32| {
+        (key >> (32 + pass * digit_bits)) as usize & ((1 << digit_bits) - 1) & (DIGITS - 1)
+    };
+    let mut cursors = [[0_u32; DIGITS]; PASSES as usize];
+    for &key in &*keys {
+        for (cursors, pass) in cursors.iter_mut().zip(0..) {
+            cursors[digit(key, pass)] += 1;
+        }
+    }
+    other.resize(keys.len(), 0);
+    for (cursors, pass) in cursors.iter_mut().zip(0..) {
+        let mut end = 0;
+        for cursor in &mut cursors[..1 << digit_bits] {
+            let start = end;
+            end += *cursor;
+            *cursor = start;
+        }
+        for &key in &*keys {
+            let cursor = &mut cursors[digit(key, pass)];
+            other[*cursor as usize] = key;
+            *cursor += 1;
+        }
+        std::mem::swap(keys, other);
     }
 }
 
@@ -166,6 +193,31 @@ fn allocate(segments: &mut [Segment]) {
                 let count = segment.cursors[digit];
                 segment.cursors[digit] = next;
                 next += count;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Of depths that differ in no bit, in few and in all, in lists on both sides of the change of method.
+    #[test]
+    fn keys_are_sorted_by_depth_and_then_by_index() {
+        let mut state = 1_u64;
+        for count in [0, 1, 255, 256, 1_000, 40_000] {
+            for depth_bits in [0, 1, 2, 11, 27, DEPTH_BITS] {
+                let mut keys: Vec<u64> = (0..count)
+                    .map(|index| {
+                        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                        ((state >> 33) & ((1 << depth_bits) - 1)) << 32 | index
+                    })
+                    .collect();
+                let mut sorted = keys.clone();
+                sorted.sort_unstable();
+                sort_by_depth(&mut keys, &mut vec![7; 3]);
+                assert!(keys == sorted, "{count} keys of {depth_bits} bits");
             }
         }
     }

@@ -17,7 +17,7 @@
 use fearless_simd::{f32x16, prelude::*};
 
 use super::{ExposedPixels, LensPixels, LensProjection, Model, RoundDerivatives};
-use crate::cpu::lanes::Vec3x16;
+use crate::cpu::lanes::{Vec3x16, splats};
 
 /// Places and displacements on the image, in pixels.
 #[derive(Clone, Copy)]
@@ -117,7 +117,7 @@ impl LensProjection {
         let unclamped = shutter.unclamped_remaining_at(simd, x_px, y_px);
         let rolls = unclamped.simd_gt(splat(0.0)) & unclamped.simd_lt(splat(1.0));
         let rolls = rolls.select(splat(1.0), splat(0.0));
-        let [x, y] = shutter.remaining_per_px().map(splat);
+        let [x, y] = splats(simd, shutter.remaining_per_px());
         let per_px = Px { x, y };
         let gain = splat(1.0) / (splat(1.0) - per_px.dot(motion_px));
         let to_limit = unclamped.abs().min((splat(1.0) - unclamped).abs());
@@ -244,7 +244,7 @@ impl LensProjection {
                 let inverse = one / z;
                 let x = x * inverse;
                 let y = y * inverse;
-                let [fx, fy] = focal_px.map(splat);
+                let [fx, fy] = splats(simd, *focal_px);
                 let in_front = z.simd_gt(zero);
                 let room = splat(max_slope2.sqrt()) - x.mul_add(x, y * y).sqrt();
                 let room = in_front.select(room, splat(-1.0));
@@ -259,9 +259,9 @@ impl LensProjection {
                 let yy = y * y;
                 let xy = x * y;
                 let r2 = xx + yy;
-                let [k1, k2, k3, k4, k5, k6] = k.map(splat);
-                let [p1, p2] = p.map(splat);
-                let [s1, s2, s3, s4] = s.map(splat);
+                let [k1, k2, k3, k4, k5, k6] = splats(simd, *k);
+                let [p1, p2] = splats(simd, *p);
+                let [s1, s2, s3, s4] = splats(simd, *s);
                 let twice = |v: f32x16<S>| v + v;
                 let numerator = k3.mul_add(r2, k2).mul_add(r2, k1).mul_add(r2, one);
                 let denominator = k6.mul_add(r2, k5).mul_add(r2, k4).mul_add(r2, one);
@@ -276,7 +276,7 @@ impl LensProjection {
                 let across = twice(xy * rise + p1 * x + p2 * y);
                 let along_x = radial + twice(xx * rise + p1 * y) + splat(6.0) * p2 * x;
                 let along_y = radial + twice(yy * rise + p2 * x) + splat(6.0) * p1 * y;
-                let [fx, fy] = focal_px.map(splat);
+                let [fx, fy] = splats(simd, *focal_px);
                 let plane = [
                     [fx * (along_x + twice(prism_x * x)), fx * (across + twice(prism_x * y))],
                     [fy * (across + twice(prism_y * x)), fy * (along_y + twice(prism_y * y))],

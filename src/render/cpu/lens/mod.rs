@@ -21,7 +21,7 @@ mod windshield;
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 
-use super::lanes::Vec3x16;
+use super::lanes::{Vec3x16, splats};
 use crate::View;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::Lens;
@@ -287,7 +287,7 @@ impl LensProjection {
                     y_slope = within.select(y_slope, y * slope);
                     margin = within.select(margin, Tangent::margin(simd, t));
                 }
-                let [fx, fy] = focal_px.map(splat);
+                let [fx, fy] = splats(simd, *focal_px);
                 LensPixels {
                     x_px: x_slope.mul_add(fx, cx),
                     y_px: y_slope.mul_add(fy, cy),
@@ -304,9 +304,9 @@ impl LensProjection {
                 let yy = y * y;
                 let xy2 = (x + x) * y;
                 let r2 = xx + yy;
-                let [k1, k2, k3, k4, k5, k6] = k.map(splat);
-                let [p1, p2] = p.map(splat);
-                let [s1, s2, s3, s4] = s.map(splat);
+                let [k1, k2, k3, k4, k5, k6] = splats(simd, *k);
+                let [p1, p2] = splats(simd, *p);
+                let [s1, s2, s3, s4] = splats(simd, *s);
                 let one = splat(1.0);
                 let numerator = k3.mul_add(r2, k2).mul_add(r2, k1).mul_add(r2, one);
                 let denominator = k6.mul_add(r2, k5).mul_add(r2, k4).mul_add(r2, one);
@@ -315,7 +315,7 @@ impl LensProjection {
                 let tangential_y = p2.mul_add(xy2, p1 * (r2 + yy + yy));
                 let prism_x = s2.mul_add(r2, s1) * r2;
                 let prism_y = s4.mul_add(r2, s3) * r2;
-                let [fx, fy] = focal_px.map(splat);
+                let [fx, fy] = splats(simd, *focal_px);
                 LensPixels {
                     x_px: (x.mul_add(radial, tangential_x) + prism_x).mul_add(fx, cx),
                     y_px: (y.mul_add(radial, tangential_y) + prism_y).mul_add(fy, cy),

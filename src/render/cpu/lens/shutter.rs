@@ -7,7 +7,7 @@
 
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 
-use crate::cpu::lanes::Vec3x16;
+use crate::cpu::lanes::{Vec3x16, splats};
 use crate::cpu::math::sin;
 use crate::view::ShutterMotion;
 
@@ -64,7 +64,7 @@ impl SimdShutter {
         x_px: f32x16<S>,
         y_px: f32x16<S>,
     ) -> f32x16<S> {
-        let [a, b, c] = self.remaining.map(|value| f32x16::splat(simd, value));
+        let [a, b, c] = splats(simd, self.remaining);
         x_px.mul_add(a, y_px.mul_add(b, c))
     }
 

@@ -11,7 +11,11 @@ pub(super) type F64x16<S> = (f64x8<S>, f64x8<S>);
 /// One coordinate of 16 points in another frame, in metres: `row · (x, y, z, 1)`, in f64.
 #[inline(always)]
 pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4]) -> F64x16<S> {
-    let [rx, ry, rz, translation_m] = row.map(|value| f64x8::splat(simd, value));
+    let [rx, ry, rz, translation_m] = row;
+    let rx = f64x8::splat(simd, rx);
+    let ry = f64x8::splat(simd, ry);
+    let rz = f64x8::splat(simd, rz);
+    let translation_m = f64x8::splat(simd, translation_m);
     let x = points.x.widen();
     let y = points.y.widen();
     let z = points.z.widen();

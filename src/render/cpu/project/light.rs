@@ -59,9 +59,11 @@ impl Light<'_> {
 #[inline(always)]
 fn shadow_factor<S: Simd>(simd: S, mean: Vec3x16<S>, shadow: &ChunkShadow) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
-    let [x, y, z] = shadow.actor_from_chunk.map(|[x, y, z, translation_m]| {
-        Vec3x16::splat(simd, [x, y, z]).dot(mean) + splat(translation_m)
-    });
+    let [mut x, mut y, mut z] = [splat(0.0); 3];
+    for (place, row) in [&mut x, &mut y, &mut z].into_iter().zip(shadow.actor_from_chunk) {
+        let [x, y, z, translation_m] = row;
+        *place = Vec3x16::splat(simd, [x, y, z]).dot(mean) + splat(translation_m);
+    }
     let [half_length_m, half_width_m] = shadow.half_m;
     let fade_m = ContactShadow::FADE_M;
     let along = falling(simd, half_length_m - fade_m, half_length_m + fade_m, x.abs());

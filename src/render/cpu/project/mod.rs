@@ -94,6 +94,13 @@ struct Job<'a> {
     instance: u16,
 }
 
+impl Job<'_> {
+    /// Which Gaussians it projects: the address of their chunk, and the first cluster. Only the schedule depends on it.
+    fn gaussians(&self) -> (usize, usize) {
+        (std::ptr::from_ref(self.chunk).addr(), self.clusters.start)
+    }
+}
+
 /// What the jobs of one chunk in one view share.
 #[derive(Clone, Copy)]
 struct JobOwner<'a> {
@@ -131,19 +138,26 @@ impl Projected {
             add_actors(index, frame, actor_views.of(index), from_actors, &mut jobs);
         }
 
-        // In parallel: each job fills pages of its own.
-        let filled: Vec<(usize, Vec<Page>)> = jobs
+        // In parallel: each job fills pages of its own. Views that see the same Gaussians follow each other, so that
+        // these are read from memory once.
+        let mut order: Vec<usize> = (0..jobs.len()).collect();
+        order.sort_by_key(|&index| jobs[index].gaussians());
+        let filled: Vec<(usize, Vec<Page>)> = order
             .par_iter()
-            .map_init(Vec::new, |splats, job| {
+            .map_init(Vec::new, |splats, &index| {
                 splats.clear();
-                dispatch!(level, simd => project_unit(simd, job, cutoffs, splats));
+                dispatch!(level, simd => project_unit(simd, &jobs[index], cutoffs, splats));
                 (splats.len(), copy_to_pages(splats, free))
             })
             .collect();
+        let mut by_job: Vec<(usize, Vec<Page>)> = vec![(0, Vec::new()); jobs.len()];
+        for (index, filled) in order.into_iter().zip(filled) {
+            by_job[index] = filled;
+        }
 
         // In the order of the jobs: list the pages.
         units.clear();
-        for (job, (len, mut filled)) in jobs.iter().zip(filled) {
+        for (job, (len, mut filled)) in jobs.iter().zip(by_job) {
             let Job { view, instance, .. } = *job;
             units.push(Unit { view, len, first_page: pages.len(), instance });
             pages.append(&mut filled);
@@ -170,6 +184,15 @@ impl Projected {
         let first = (unit.first_page << PAGE_BITS) as u32;
         let pages = &self.pages[unit.first_page..];
         (first..).zip(pages.iter().flat_map(|page| page.iter()).take(unit.len))
+    }
+
+    /// The splats of one unit page by page, each with the place of its first: for hot loops.
+    pub(super) fn pages(&self, unit: &Unit) -> impl Iterator<Item = (u32, &[Splat])> {
+        let pages = (unit.first_page..).zip((0..unit.len).step_by(PAGE));
+        pages.map(move |(page, start)| {
+            let splats = &self.pages[page][..PAGE.min(unit.len - start)];
+            ((page << PAGE_BITS) as u32, splats)
+        })
     }
 
     /// Whose splat is at a place, as in [`Target::instances`](crate::Target::instances).

@@ -87,12 +87,12 @@ impl<S: Simd> Ellipse<S> {
         let blur_share;
         let shrink_share;
         if filter.is_shrunk() {
-            // det(C + diag(u, v)) = det C + u C_yy + v C_xx + u v, a sum of positives, too.
-            let det_with =
-                |x: f32x16<S>, y: f32x16<S>| x.mul_add(yy + y, y.mul_add(xx, det_before));
             let blur_y = area(filter.total_px2.y);
-            let det_native = det_with(area(filter.native_px2.x), area(filter.native_px2.y));
-            det = det_with(blur_x, blur_y);
+            let native_x = area(filter.native_px2.x);
+            let native_y = area(filter.native_px2.y);
+            // det(C + diag(u, v)) = det C + u C_yy + v C_xx + u v, a sum of positives, too.
+            let det_native = native_x.mul_add(yy + native_y, native_y.mul_add(xx, det_before));
+            det = blur_x.mul_add(yy + blur_y, blur_y.mul_add(xx, det_before));
             sigma_x = (xx + blur_x).sqrt();
             sigma_y = (yy + blur_y).sqrt();
             blur_share = det_before / det_native;
@@ -166,14 +166,10 @@ impl<S: Simd> ProjectedBlock<S> {
         let extent_x = reach.mul_add(ellipse.sigma_x, splat(EXTENT_SLACK_PX));
         let extent_y = reach.mul_add(ellipse.sigma_y, splat(EXTENT_SLACK_PX));
 
-        // Pixel centres lie at 0.5 to size - 0.5.
-        let on_image = |mean: f32x16<S>, extent: f32x16<S>, size_px: f32| {
-            (mean + extent).simd_ge(splat(0.5)) & (mean - extent).simd_le(splat(size_px - 0.5))
-        };
         let visible = in_range
             & power.simd_ge(splat(0.0))
-            & on_image(mean_x, extent_x, size_px[0])
-            & on_image(mean_y, extent_y, size_px[1]);
+            & on_image(simd, mean_x, extent_x, size_px[0])
+            & on_image(simd, mean_y, extent_y, size_px[1]);
         if visible.all_false() {
             return SplatBlock::default();
         }
@@ -191,6 +187,19 @@ impl<S: Simd> ProjectedBlock<S> {
             ..SplatBlock::default()
         }
     }
+}
+
+/// Which splats reach a pixel's centre of an image of this size along one axis: these lie at 0.5 to size - 0.5.
+#[inline(always)]
+fn on_image<S: Simd>(
+    simd: S,
+    mean: f32x16<S>,
+    extent: f32x16<S>,
+    size_px: f32,
+) -> mask32x16<S> {
+    let first = f32x16::splat(simd, 0.5);
+    let last = f32x16::splat(simd, size_px - 0.5);
+    (mean + extent).simd_ge(first) & (mean - extent).simd_le(last)
 }
 
 /// Sixteen splats as columns (the fields of [`Splat`]), and which of them are visible, one bit each.

@@ -14,7 +14,7 @@ use super::color::color;
 use super::splat_block::{Ellipse, LOG2_UNIT, Moments, ProjectedBlock, SplatBlock};
 use crate::View;
 use crate::constants::EXTENT_SLACK_PX;
-use crate::cpu::lanes::Vec3x16;
+use crate::cpu::lanes::{Vec3x16, splats};
 use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensPixels, LensProjection, Remainder};
 use crate::expansion::ExpansionBound;
 use crate::layout::{Cutoffs, Filtered, PixelFilter};
@@ -104,8 +104,8 @@ pub(super) fn project_block<S: Simd>(
     if splats.visible == 0 {
         return None;
     }
-    let [x, y, z] = toward_m.each_ref().map(|axis| f32x16::load_array_ref(simd, axis));
-    splats.set_colors(color(simd, columns, sh_degree, Vec3x16 { x, y, z }));
+    let toward = Vec3x16::from_arrays(simd, &toward_m);
+    splats.set_colors(color(simd, columns, sh_degree, toward));
     Some(splats)
 }
 
@@ -151,7 +151,7 @@ fn project_lanes<S: Simd>(
     if let Some(shutter) = lens.shutter() {
         toward = toward.plus(shutter.translation_world(simd, remaining));
     }
-    *toward_m = [toward.x, toward.y, toward.z].map(|axis| axis.to_array());
+    *toward_m = [toward.x.to_array(), toward.y.to_array(), toward.z.to_array()];
 
     // Near and far. While the shutter rolls the depth is known only where the row was found; the f64 path
     // decides for the others.
@@ -211,7 +211,11 @@ struct CenteredBlock<S: Simd> {
 /// The rows of camera_from_chunk's rotation.
 #[inline(always)]
 fn rotation_rows<S: Simd>(simd: S, view: &UnscentedChunkView<'_>) -> [Vec3x16<S>; 3] {
-    view.camera_from_chunk.map(|[x, y, z, _]| Vec3x16::splat(simd, [x as f32, y as f32, z as f32]))
+    let mut rows = [Vec3x16::splat(simd, [0.0; 3]); 3];
+    for (row, [x, y, z, _]) in rows.iter_mut().zip(view.camera_from_chunk) {
+        *row = Vec3x16::splat(simd, [x as f32, y as f32, z as f32]);
+    }
+    rows
 }
 
 /// The splats of those Gaussians for which the expansion is close enough to six points, and the others that may
@@ -238,7 +242,11 @@ fn expand<S: Simd>(
     if close.all_false() {
         return none;
     }
-    let moments = moments_of_root(simd, columns.map(|column| [column.x, column.y]));
+    let mut root = [[f32x16::splat(simd, 0.0); 2]; 6];
+    for (of_root, column) in root.iter_mut().zip(columns) {
+        *of_root = [column.x, column.y];
+    }
+    let moments = moments_of_root(simd, root);
     let projected = ProjectedBlock {
         mean_x: pixels.x_px + mean_shift.x,
         mean_y: pixels.y_px + mean_shift.y,
@@ -412,7 +420,7 @@ impl<S: Simd> CenterAngles<S> {
         let bound = view.unscented.cull_bound();
         let widened = f32x16::splat(simd, if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 });
         let reach_px = self.reach_px(simd, (self.spread + self.motion) * widened, bound);
-        let [width, height] = view.size_px.map(|side| f32x16::splat(simd, side));
+        let [width, height] = splats(simd, view.size_px);
         let beyond = |at: f32x16<S>, side: f32x16<S>| (-at).max(at - side);
         let off_px = beyond(center_px.x_px, width).max(beyond(center_px.y_px, height));
         self.far & self.continued & off_px.simd_gt(reach_px)
