@@ -1,5 +1,5 @@
 //! The fuzz targets with simple mutations, for a bounded time, on stable. A failure prints the target, the seed and
-//! the bytes. `FUZZ_SECONDS=600 FUZZ_SEED=7 cargo test --release --test fuzz` runs longer.
+//! the bytes. `FUZZ_SECONDS=600 FUZZ_SEED=7 cargo test --test fuzz` runs longer.
 
 #[path = "../support/root.rs"]
 mod root;

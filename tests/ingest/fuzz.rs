@@ -5,7 +5,7 @@
 //! default; to run it for a night:
 //!
 //! ```text
-//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test --release -p wildcity-twin --test ingest random_damage
+//! WILDCITY_FUZZ_SECONDS=30000 WILDCITY_FUZZ_SEED=7 cargo test -p wildcity-twin --test ingest random_damage
 //! ```
 //!
 //! A failure prints seed, round, format and the damaged file's bytes in hex.

@@ -233,7 +233,7 @@ pub(crate) fn paired(name: &str, a: &dyn Fn() -> StepMs, b: &dyn Fn() -> StepMs)
 
 /// `alpamayo2` against six pinholes and with the expansion, and rolling shutters against global ones.
 #[test]
-#[ignore = "times: cargo test --release -p wildcity-render --test render lenses_and_shutters_cost -- --ignored --nocapture"]
+#[ignore = "times: cargo test -p wildcity-render --test render lenses_and_shutters_cost -- --ignored --nocapture"]
 fn lenses_and_shutters_cost_little_more_than_pinholes() {
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let scene = Scene::from_gaussians(&street.gaussians);

@@ -183,7 +183,7 @@ fn a_part_of_a_small_image_is_the_image_of_the_part() {
 
 /// Small images against images of the same size with the blur of their own pixels.
 #[test]
-#[ignore = "times: cargo test --release -p wildcity-render --test render small_images_cost -- --ignored --nocapture"]
+#[ignore = "times: cargo test -p wildcity-render --test render small_images_cost -- --ignored --nocapture"]
 fn small_images_cost_nothing() {
     let backend = cpu();
     let profile = RenderProfile::default();

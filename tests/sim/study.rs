@@ -1,5 +1,5 @@
 //! Error against run time of ways to integrate the same car, for BENCHMARKS.md: run by hand, as
-//! `cargo test --release -p wildcity-sim --test sim study -- --ignored --nocapture`. Writes
+//! `cargo test -p wildcity-sim --test sim study -- --ignored --nocapture`. Writes
 //! `ego_integrators.csv` and the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or beside the built program.
 
 use std::fmt::Write as _;

@@ -56,7 +56,7 @@ fn cases_are_numbered_in_order() {
 }
 
 #[test]
-#[ignore = "gigabytes of memory and a minute: cargo test --release -p wildcity-stress --test stress t21 -- --ignored"]
+#[ignore = "gigabytes of memory and a minute: cargo test -p wildcity-stress --test stress t21 -- --ignored"]
 fn t21_seventy_million_sort_keys() {
     let outcome = case("T21").run(&cpu(), true);
     assert_eq!(outcome.verdict, Verdict::Held, "{outcome:?}");
@@ -481,7 +481,7 @@ fn a_refusal_is_a_limit_of_devices_alone_and_where_a_case_names_it() {
 }
 
 #[test]
-#[ignore = "gigabytes of memory: cargo test --release -p wildcity-stress --test stress t21 -- --ignored"]
+#[ignore = "gigabytes of memory: cargo test -p wildcity-stress --test stress t21 -- --ignored"]
 fn t21_may_be_refused_by_a_device() {
     let run = |name| case("T21").run(&Refusing(name, TOO_MANY), true).verdict;
     assert_eq!(run("gpu"), Verdict::Refused);

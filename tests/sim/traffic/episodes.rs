@@ -347,7 +347,7 @@ fn episode_hash(steps: u32, place: &dyn Fn(usize) -> usize) -> u64 {
 
 /// 100,000 steps of 50 actors: alone, and then in three orders at the same time, each on a thread of its own.
 #[test]
-#[ignore = "a minute; run it after a change of traffic: cargo test --release -p wildcity-sim --test sim -- --ignored hundred_thousand"]
+#[ignore = "a minute; run it after a change of traffic: cargo test -p wildcity-sim --test sim -- --ignored hundred_thousand"]
 fn a_hundred_thousand_steps_are_deterministic() {
     const STEPS: u32 = 100_000;
     let alone = episode_hash(STEPS, &|index| index);
