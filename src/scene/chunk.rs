@@ -372,7 +372,8 @@ impl LaneBounds {
     fn cluster(&self) -> Cluster {
         let mut cluster = Cluster::EMPTY;
         for lane in 0..LANES {
-            let corner_m = |of: &[[f32; LANES]; 3]| Vec3::new(of[0][lane], of[1][lane], of[2][lane]);
+            let corner_m =
+                |of: &[[f32; LANES]; 3]| Vec3::new(of[0][lane], of[1][lane], of[2][lane]);
             cluster.min_m = cluster.min_m.min(corner_m(&self.min_m));
             cluster.max_m = cluster.max_m.max(corner_m(&self.max_m));
             cluster.sigma_m = cluster.sigma_m.max(self.sigma_m[lane]);

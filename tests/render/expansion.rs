@@ -260,9 +260,11 @@ fn lenses_and_shutters_cost_little_more_than_pinholes() {
     let ratio = paired("vehicle6, rolling and global", &|| step(&default, &rolled), &|| {
         step(&default, &global)
     });
-    paired("vehicle6, rolling, expanded and by six points", &|| step(&expanded(), &rolled), &|| {
-        step(&default, &rolled)
-    });
+    paired(
+        "vehicle6, rolling, expanded and by six points",
+        &|| step(&expanded(), &rolled),
+        &|| step(&default, &rolled),
+    );
     if ratio > 1.5 {
         wrong.push(format!("rolling: {ratio:.2}"));
     }

@@ -235,9 +235,8 @@ impl Bins {
         let mut segments = 0;
         let mut splats = 0;
         for (index, unit) in units.iter().enumerate() {
-            let is_next = segments == 0
-                || splats >= SEGMENT
-                || self.segments[segments - 1].view != unit.view;
+            let is_next =
+                segments == 0 || splats >= SEGMENT || self.segments[segments - 1].view != unit.view;
             if is_next {
                 if self.segments.len() == segments {
                     self.segments.push(Segment::default());

@@ -16,8 +16,8 @@ use rayon::prelude::*;
 
 use super::appearance;
 use super::background::Background;
-use super::lanes::splats;
 use super::bin::{Bins, Grid};
+use super::lanes::splats;
 use super::math::{EXP2_TERMS, Exp2};
 use super::project::Projected;
 use super::resolve::{self, BLOCKS, Band, HalvedBy, NOT_HALVED, TileSums};

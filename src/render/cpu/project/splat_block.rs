@@ -191,12 +191,7 @@ impl<S: Simd> ProjectedBlock<S> {
 
 /// Which splats reach a pixel's centre of an image of this size along one axis: these lie at 0.5 to size - 0.5.
 #[inline(always)]
-fn on_image<S: Simd>(
-    simd: S,
-    mean: f32x16<S>,
-    extent: f32x16<S>,
-    size_px: f32,
-) -> mask32x16<S> {
+fn on_image<S: Simd>(simd: S, mean: f32x16<S>, extent: f32x16<S>, size_px: f32) -> mask32x16<S> {
     let first = f32x16::splat(simd, 0.5);
     let last = f32x16::splat(simd, size_px - 0.5);
     (mean + extent).simd_ge(first) & (mean - extent).simd_le(last)
