@@ -29,7 +29,9 @@ pub use files::create_dirs;
 pub use real_disk::RealDisk;
 
 use directory::{OpenObject, SEPARATOR, STAGING};
-use files::{BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, read_all, sync, sync_parent};
+use files::{
+    BUFFER_BYTES, HashingFile, WRITING, create_parent, entries, read_all, sync, sync_parent,
+};
 use staging::LocalStaging;
 
 impl ObjectBackend for Local {
