@@ -129,7 +129,7 @@ impl Local {
     /// publish lock.
     ///
     /// A process that was stopped, or that failed to sync, may have left a record, or its removal, that a power cut
-    /// takes back. Whoever removes objects, or takes a number, because of what the log says, would then have relied
+    /// takes back. A removal of objects, or a new number, that followed from what the log said would then have relied
     /// on what never was: the versions before the lost one would be without objects, or the log would have a gap.
     pub(super) fn settle(&self, name: &str) -> Result<(), StoreError> {
         let twin = self.root.join(name);

@@ -455,7 +455,9 @@ impl<'a> World<'a> {
         let now_us = self.clock.now_us();
         let age_us = AGE_S * 1_000_000;
         for (name, known) in &self.known {
-            if now_us - known.written_us >= age_us - SLACK_US {
+            // The clock may have jumped back before the last use.
+            let last_us = known.used_us.min(known.written_us);
+            if now_us - last_us >= age_us - SLACK_US {
                 allowed.gone.insert(*name);
             }
             let is_over = now_us - known.used_us >= age_us + SLACK_US;
