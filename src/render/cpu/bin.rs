@@ -331,7 +331,9 @@ impl Segment {
         if left >> x_bits == right >> x_bits && top >> y_bits == bottom >> y_bits {
             let first_column = left >> x_bits << x_bits;
             let first_row = top >> y_bits << y_bits;
+            let last_column = first_column + (1 << x_bits) - 1;
             let mut tiles = 0;
+            let mut fits = true;
             for_each_row(
                 splat,
                 area,
@@ -339,18 +341,25 @@ impl Segment {
                 log2_cut,
                 #[inline(always)]
                 |row, first, last| {
+                    // A row may be rounded beyond the box.
+                    if first < first_column || last > last_column {
+                        fits = false;
+                        return;
+                    }
                     let line = tiles_of_line(first - first_column, last - first_column);
                     tiles |= line << ((row - first_row) << x_bits);
                 },
             );
-            if tiles != 0 {
+            if fits && tiles != 0 {
                 let number = (top >> y_bits) * macro_columns + (left >> x_bits);
                 let counts = &mut self.counts[number as usize];
                 counts.pairs += 1;
                 counts.instances += tiles.count_ones();
                 pairs.push((number, Pair { tiles, ..pair }));
             }
-            return tiles.count_ones();
+            if fits {
+                return tiles.count_ones();
+            }
         }
 
         // The first pair of this row of macro tiles.
@@ -548,12 +557,8 @@ fn for_each_row(
         let left_dy = (-widest_dy).clamp(band_top, band_bottom);
         let high = skew * right_dy + half_width(right_dy) + EXTENT_SLACK_PX;
         let low = skew * left_dy - half_width(left_dy) - EXTENT_SLACK_PX;
-        // Not beyond the box, however it was rounded.
-        if let Some((first, last)) = tiles(x, low, high, grid.size_px[0])
-            && first <= right
-            && last >= left
-        {
-            visit(row, first.max(left), last.min(right));
+        if let Some((first, last)) = tiles(x, low, high, grid.size_px[0]) {
+            visit(row, first, last);
         }
     }
 }
