@@ -36,6 +36,8 @@ struct Prepared {
     commit: Commit,
     base: u64,
     cells: Cells,
+    /// Whether an upload may have failed, which an object store tells when the push is published.
+    may_fail: bool,
 }
 
 /// The machine, and the promises.
@@ -134,6 +136,10 @@ impl World {
         let is_full = matches!(step.fault, Some((_, Fault::Full)));
         let done = self.carry_out(step.operation);
         self.medium.settle(&self.catalog);
+        let prepares = matches!(step.operation, Operation::Prepare { .. });
+        if let Some(prepared) = self.prepared.as_mut().filter(|_| prepares) {
+            prepared.may_fail = is_full && !self.medium.has_locks();
+        }
         if self.medium.is_stopped() {
             return self.restart(step.seed);
         }
@@ -271,12 +277,13 @@ impl World {
         let Some(latest) = self.latest()? else { return Ok(()) };
         let mut commit = self.catalog.begin(TWIN, CommitKind::Push, storage())?;
         commit.put(&gaussians_of(&cells), None, &mut |_, _| {})?;
-        self.prepared = Some(Prepared { commit, base: latest.number, cells });
+        self.prepared = Some(Prepared { commit, base: latest.number, cells, may_fail: false });
         Ok(())
     }
 
     fn publish_prepared(&mut self) -> Result<(), StoreError> {
-        let Some(Prepared { commit, base, cells }) = self.prepared.take() else { return Ok(()) };
+        let Some(prepared) = self.prepared.take() else { return Ok(()) };
+        let Prepared { commit, base, cells, may_fail } = prepared;
         let Some(latest) = self.latest()? else { return Ok(()) };
         let published = self.commit(
             latest.number,
@@ -287,6 +294,7 @@ impl World {
         match published {
             // Others changed the same cells, or the base is gone.
             Err(StoreError::Overlap { .. }) if latest.number != base => Ok(()),
+            Err(StoreError::Io { .. }) if may_fail => Ok(()),
             Err(StoreError::GarbageCollected { .. }) if self.collectable.contains(&base) => Ok(()),
             published => published,
         }
