@@ -315,9 +315,39 @@ mod tests {
         assert_eq!(x_m(&track, 50_000), Some(0.25));
         assert!((x_m(&track, 250_000).unwrap() - 1.25).abs() < 1e-12, "it goes on at 5 m/s");
         assert!((x_m(&track, -100_000).unwrap() + 0.5).abs() < 1e-12);
-        for time_us in [-100_001, 300_001, 1_000_000, 1_950_000, 2_500_000] {
+        for time_us in [-100_001, 300_001, 1_000_000, 1_950_000, 2_050_000, 2_500_000] {
             assert_eq!(x_m(&track, time_us), None, "{time_us}");
         }
+    }
+
+    #[test]
+    fn between_two_rows_size_and_velocity_change_too() {
+        let wide = row(1_000_000, 8.0, ", \"velocity\": [1.5, 0, 0]").replace("4, 2", "5, 3");
+        let track = row(0, 0.0, ", \"velocity\": [0.5, 0, 0]") + &wide;
+        let boxes = Boxes::parse(&track).unwrap();
+        assert!(boxes.moving_at(490_000).is_empty(), "0.99 m/s");
+        let moving = boxes.moving_at(750_000)[0];
+        assert_eq!(moving.size_m, DVec3::new(4.75, 2.75, 1.5));
+        assert_eq!(moving.world_from_box.position_m.x, 6.0);
+        // Its own velocity also counts where the track ends, before that of the rows.
+        assert!((x_m(&track, 1_100_000).unwrap() - 8.15).abs() < 1e-12);
+    }
+
+    #[test]
+    fn boxes_go_to_other_axes_and_another_unit() {
+        let rotation = glam::DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2);
+        let new_from_old = Pose { position_m: DVec3::new(1.0, 2.0, 3.0), rotation };
+        let alignment = Alignment { new_from_old, metres_per_unit: 2.0 };
+        let text = row(0, 5.0, ", \"velocity\": [0.75, 0, 0]");
+        let plain = Boxes::parse(&text).unwrap();
+        assert!(plain.moving_at(0).is_empty(), "0.75 units of a second");
+        let moving = plain.aligned(&alignment).moving_at(100_000)[0];
+        assert_eq!(moving.size_m, DVec3::new(8.0, 4.0, 3.0));
+        // 1.5 m/s along y.
+        let wanted = alignment.point_m(DVec3::new(5.0, 0.0, 10.0)) + DVec3::Y * 0.15;
+        let away_m = moving.world_from_box.position_m.distance(wanted);
+        assert!(away_m < 1e-12, "{moving:?} {wanted}");
+        assert!(moving.world_from_box.rotation.angle_between(rotation) < 1e-7, "{moving:?}");
     }
 
     #[test]

@@ -67,7 +67,7 @@ const CONVENTIONS: [(&str, &str); 14] = [
     ),
     (
         "flicker",
-        "mean absolute difference of a view and the view 0.5 m before it on the same line, brought into it likewise",
+        "mean absolute difference of a view and the view 0.8 m before it on the same line, brought into it likewise",
     ),
 ];
 

@@ -81,5 +81,7 @@ mod tests {
         assert!((fit.apply([100.0 / 255.0; 3])[0] - 200.0 / 255.0).abs() < 1e-12, "{fit:?}");
         let hidden = Pair::new([1, 1], vec![9; 3], vec![0; 3], Some(vec![false])).unwrap();
         assert_eq!(Exposure::fit(&hidden), Exposure { gain: [1.0; 3], offset: [0.0; 3] });
+        let bright = Exposure { gain: [2.0; 3], offset: [-0.2; 3] };
+        assert_eq!(bright.apply([0.05, 0.9, 0.5]), [0.0, 1.0, 0.8]);
     }
 }

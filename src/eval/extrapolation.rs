@@ -131,7 +131,7 @@ mod tests {
         let view = |trust, rendered, repaired| ExtrapolatedView {
             name: "a".into(),
             trust,
-            covered: 1.0,
+            covered: 0.9,
             rendered,
             repaired: Some(repaired),
         };
@@ -144,6 +144,10 @@ mod tests {
         );
         assert_eq!((made.rendered.reprojection_psnr_db, made.trust), (20.0, 0.6));
         assert_eq!(made.repaired.unwrap().reprojection_psnr_db, 25.0);
+        assert!((made.covered - 0.9).abs() < 1e-12, "{made:?}");
+        let Reprojection { flip, share, .. } = scores(1.0, 1.0).reprojection;
+        let means = [made.rendered.reprojection_flip, made.rendered.reprojection_share];
+        assert_eq!(means, [flip, share]);
         assert!((made.flicker_ratio.unwrap() - 1.5).abs() < 1e-12, "{made:?}");
         assert!(Extrapolation::new(1.0, Vec::new()).rendered.flicker.is_nan());
     }

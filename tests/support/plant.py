@@ -75,7 +75,9 @@ def chosen(faults: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
 def report(faults: list[Fault], output: str) -> int:
     ran = set()
     failed = defaultdict(list)
-    for index, test, result in re.findall(r"^test planted::m(\d+)::tests::(\S+) \.\.\. (\w+)", output, re.MULTILINE):
+    # Tests of a copy: those beside it, and those in its own files.
+    pattern = r"^test planted::m(\d+)::(?:mutant::(?:\w+::)*?)?tests::(\S+) \.\.\. (\w+)"
+    for index, test, result in re.findall(pattern, output, re.MULTILINE):
         ran.add(int(index))
         if result == "FAILED":
             failed[int(index)].append(test)

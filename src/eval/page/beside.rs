@@ -19,7 +19,7 @@ pub(super) fn section(evaluation: &Evaluation) -> Markup {
         p {
             "There is no real image there. Trust is 1 on the drive. Reprojection brings the view back onto the real image that \
              it was moved from, where the rendered depths agree: PSNR, FLIP, and the share of the pixels that came back. \
-             Flicker is the mean change to the view 0.5 m further back, from 0 to 1, where it shows the same surface."
+             Flicker is the mean change to the view 0.8 m further back, from 0 to 1, where it shows the same surface."
         }
         div.wide {
             table {
