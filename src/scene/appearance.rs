@@ -97,6 +97,20 @@ impl Exposure {
     }
 }
 
+impl Exposure {
+    /// Changes an image, `[height, width, 3]` in 8 bits, as the renderer changes its colours.
+    pub fn change_rgb8(&self, rgb8: &mut [u8]) {
+        for pixel in rgb8.chunks_exact_mut(3) {
+            let before = [0, 1, 2].map(|channel| f64::from(pixel[channel]) / 255.0);
+            for (channel, out) in pixel.iter_mut().enumerate() {
+                let [r, g, b] = self.matrix[channel];
+                let value = r * before[0] + g * before[1] + b * before[2] + self.offset[channel];
+                *out = (255.0 * value.clamp(0.0, 1.0)).round() as u8;
+            }
+        }
+    }
+}
+
 impl AppearanceError {
     /// The camera field at fault: `exposure` or `overlay`.
     pub fn field(&self) -> &'static str {
@@ -315,6 +329,17 @@ const DATA_URI: &str = "data:image/png;base64,";
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_exposure_changes_the_colours_of_an_image() {
+        let swap = Exposure {
+            matrix: [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
+            offset: [0.2, 0.0, 0.0],
+        };
+        let mut rgb8 = [10, 100, 60, 0, 255, 200];
+        swap.change_rgb8(&mut rgb8);
+        assert_eq!(rgb8, [151, 10, 120, 255, 0, 255]);
+    }
 
     #[test]
     fn json_round_trips() {

@@ -15,7 +15,8 @@ use crate::geometry::{Camera, CameraError, Pose};
 /// An image that a camera took on a recorded drive.
 ///
 /// JSON: `{"trajectory", "station_m", "camera", "width", "height", "fx", "fy", "cx", "cy", "world_from_camera":
-/// {"xyz", "q"}, "image": {"object", "bytes"}}` and, as in rig files, `lens`, `windshield` and `native_size`.
+/// {"xyz", "q"}, "image": {"object", "bytes"}}` and perhaps `mask`, like `image`, and `exposure_stops`; and, as in rig files, `lens`,
+/// `windshield` and `native_size`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "ViewFields", into = "ViewFields")]
 pub struct RecordedView {
@@ -33,6 +34,9 @@ pub struct RecordedView {
     pub exposure_stops: Option<f64>,
     /// The JPEG or PNG.
     pub image: ObjectRef,
+    /// A PNG of the image's size, if not all pixels count: those darker than half show what the twin does not have, such as
+    /// the hood of the own vehicle.
+    pub mask: Option<ObjectRef>,
 }
 
 /// Why a table of recorded images was refused.
@@ -51,6 +55,12 @@ pub enum ViewError {
     Number {
         /// `station_m` or `exposure_stops`.
         field: &'static str,
+        /// The refused value.
+        value: f64,
+    },
+    /// An exposure that no camera has.
+    #[error("exposure_stops is {value}; give -{most} to {most}", most = MOST_STOPS)]
+    Stops {
         /// The refused value.
         value: f64,
     },
@@ -88,7 +98,12 @@ struct ViewFields {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     exposure_stops: Option<f64>,
     image: ObjectRef,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    mask: Option<ObjectRef>,
 }
+
+/// Largest exposure of an image against the twin's, in stops.
+pub const MOST_STOPS: f64 = 16.0;
 
 impl RecordedView {
     /// Checks names, numbers and the camera.
@@ -108,9 +123,25 @@ impl RecordedView {
                 return Err(ViewError::Number { field, value });
             }
         }
+        if let Some(value) = self.exposure_stops.filter(|stops| stops.abs() > MOST_STOPS) {
+            return Err(ViewError::Stops { value });
+        }
         let wrong = |cause| ViewError::Camera { name: self.camera_name.clone(), cause };
         self.camera.check().map_err(wrong)
     }
+}
+
+/// A mask in a smaller size, `[height, width]`: a pixel counts if all of those that it is made of do.
+pub fn reduced_mask(counts: &[bool], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<bool> {
+    let [width, height] = from_px.map(|side| side as usize);
+    let [to_width, to_height] = to_px.map(|side| side as usize);
+    let mut reduced = vec![true; to_width * to_height];
+    for (pixel, _) in counts.iter().enumerate().filter(|(_, counts)| !**counts) {
+        let row = pixel / width * to_height / height;
+        let column = pixel % width * to_width / width;
+        reduced[row * to_width + column] = false;
+    }
+    reduced
 }
 
 impl From<RecordedView> for ViewFields {
@@ -136,6 +167,7 @@ impl From<RecordedView> for ViewFields {
             world_from_camera: from.world_from_camera,
             exposure_stops: from.exposure_stops,
             image: from.image,
+            mask: from.mask,
         }
     }
 }
@@ -163,6 +195,7 @@ impl TryFrom<ViewFields> for RecordedView {
             world_from_camera: fields.world_from_camera,
             exposure_stops: fields.exposure_stops,
             image: fields.image,
+            mask: fields.mask,
         };
         view.check()?;
         Ok(view)
@@ -175,6 +208,15 @@ mod tests {
     use crate::geometry::camera::Pinhole;
 
     #[test]
+    fn a_pixel_of_a_smaller_mask_counts_if_all_of_its_pixels_do() {
+        let mut counts = vec![true; 5 * 4];
+        counts[5 * 2 + 4] = false;
+        let reduced = reduced_mask(&counts, [5, 4], [2, 2]);
+        assert_eq!(reduced, [true, true, true, false]);
+        assert_eq!(reduced_mask(&counts, [5, 4], [5, 4]), counts);
+    }
+
+    #[test]
     fn a_view_is_read_as_it_was_written_and_checked() {
         let pinhole = Pinhole { fx: 100.0, fy: 101.0, cx: 50.0, cy: 40.0 };
         let view = RecordedView {
@@ -183,8 +225,9 @@ mod tests {
             camera_name: "front".into(),
             camera: Camera::from_pinhole(100, 80, pinhole),
             world_from_camera: Pose::IDENTITY,
-            exposure_stops: None,
+            exposure_stops: Some(-1.5),
             image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+            mask: Some(ObjectRef { object: "1".repeat(64), bytes: 4 }),
         };
         let text = serde_json::to_string(&view).unwrap();
         assert_eq!(serde_json::from_str::<RecordedView>(&text).unwrap(), view);
@@ -194,5 +237,12 @@ mod tests {
         let flat = text.replace("\"height\":80", "\"height\":0");
         let error = serde_json::from_str::<RecordedView>(&flat).unwrap_err();
         assert!(error.to_string().contains("height"), "{error}");
+        let bright = text.replace("-1.5", "17.0");
+        let error = serde_json::from_str::<RecordedView>(&bright).unwrap_err();
+        assert!(error.to_string().contains("exposure_stops is 17; give -16 to 16"), "{error}");
+        let bare = RecordedView { exposure_stops: None, mask: None, ..view };
+        let text = serde_json::to_string(&bare).unwrap();
+        assert!(!text.contains("mask") && !text.contains("stops"), "{text}");
+        assert_eq!(serde_json::from_str::<RecordedView>(&text).unwrap(), bare);
     }
 }

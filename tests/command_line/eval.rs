@@ -398,3 +398,31 @@ fn another_programs_image_of_a_real_capture_is_met() {
         "{image}"
     );
 }
+
+#[test]
+fn an_image_whose_exposure_is_known_is_compared_in_it() {
+    let dir = capture();
+    let at = dir.path();
+    let path = at.join("images/front/a.png");
+    let mut image = image::open(&path).unwrap().into_rgb8();
+    wildcity_scene::srgb::change_stops(&mut image, -1.0);
+    image.save(&path).unwrap();
+    let db = |images: &str| {
+        let (_, made) = eval(at, "scene.ply", images, &[]);
+        made["images"][0]["psnr_db"].clone()
+    };
+    assert!(db("views.jsonl").as_f64().unwrap() < 30.0);
+    let list = fs::read_to_string(at.join("views.jsonl")).unwrap();
+    let known = list.replacen("{", "{\"exposure_stops\": -1, ", 1);
+    fs::write(at.join("known.jsonl"), known).unwrap();
+    assert_eq!(db("known.jsonl"), "inf");
+    let frames = transforms(&json!({"exposure_stops": -1}));
+    fs::write(at.join("transforms.json"), frames).unwrap();
+    // The poses of the two lists differ in their last bits.
+    let frames_db = db("transforms.json");
+    assert!(frames_db == "inf" || frames_db.as_f64().unwrap() > 50.0, "{frames_db}");
+    let frames = transforms(&json!({"exposure_stops": -17}));
+    fs::write(at.join("transforms.json"), frames).unwrap();
+    let said = refused(at, &["eval", "scene.ply", "--images", "transforms.json"]);
+    assert!(said.contains("frames[0].exposure_stops: -17; give -16 to 16"), "{said}");
+}

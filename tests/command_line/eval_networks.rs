@@ -230,7 +230,7 @@ fn views_beside_the_drive_are_told_without_a_real_image() {
     let with_model = ["--repair", &model, "--onnxruntime", &library];
     let street = [&["eval", "street"][..], &IMAGES, &["--twins", "twins"]].concat();
     let said = refused(at, &[&street[..], &with_model].concat());
-    assert!(said.contains("images of a recorded drive, which this twin does not have"), "{said}");
+    assert!(said.contains("images of a recorded drive, and the twin has none"), "{said}");
 
     let views = [
         "twin",

@@ -73,6 +73,7 @@ fn images_are_stored_scaled_along_the_drive_and_removed() {
         let grey = 40 * index as u8;
         assert!(image.iter().all(|value| value.abs_diff(grey) <= 3), "{index}");
     }
+    assert!(stored.iter().all(|view| view.mask.is_none() && view.exposure_stops.is_none()));
     let said = done(at, &["inspect", "street", "--twins", "twins"]);
     assert!(said.contains("views       6 recorded images"), "{said}");
 
@@ -81,4 +82,59 @@ fn images_are_stored_scaled_along_the_drive_and_removed() {
     let said = done(at, &["twin", "views", "street", "--twins", "twins", "--remove"]);
     assert!(said.starts_with("twin street version 3: no recorded images"), "{said}");
     assert_eq!(catalog.version("street", None).unwrap().manifest.views, None);
+}
+
+#[test]
+fn masks_and_exposures_of_the_list_are_stored_and_a_bend_leaves_no_gap() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    capture(at);
+    // The first row of the first image's mask is black; the second image is brighter.
+    let mut mask = RgbImage::from_pixel(200, 100, Rgb([255; 3]));
+    (0..200).for_each(|column| mask.put_pixel(column, 0, Rgb([0; 3])));
+    mask.save(at.join("mask.png")).unwrap();
+    RgbImage::from_pixel(200, 100, Rgb([255; 3])).save(at.join("white.png")).unwrap();
+    let text = fs::read_to_string(at.join("list.jsonl")).unwrap();
+    let lines = text.lines().enumerate().map(|(index, line)| {
+        let mut camera: serde_json::Value = serde_json::from_str(line).unwrap();
+        camera["mask"] = json!(if index == 0 { "mask.png" } else { "white.png" });
+        if index == 4 {
+            camera["exposure_stops"] = json!(1.25);
+        }
+        // 1.95 m apart along the drive, as in a bend.
+        camera["position"][0] = json!(0.4875 * index as f64);
+        format!("{camera}\n")
+    });
+    fs::write(at.join("list.jsonl"), lines.collect::<String>()).unwrap();
+    let catalog = Catalog::open(&at.join("twins")).unwrap();
+    let keyframe = |i: i64| Keyframe {
+        time_us: 100_000 * i,
+        world_from_rig: Pose { position_m: DVec3::X * i as f64, ..Pose::IDENTITY },
+    };
+    let log = Trajectory { name: "log".to_owned(), keyframes: (0..20).map(keyframe).collect() };
+    let scene = gaussians(100, 0, 10.0, 1);
+    let street = NewVersion {
+        trajectories: vec![log],
+        ..NewVersion::of("street", &scene, Provenance::of("test".to_owned()))
+    };
+    catalog.commit(street, &mut |_, _| {}).unwrap();
+    let views = ["twin", "views", "street", "--twins", "twins", "--images", "list.jsonl"];
+    done(at, &[&views[..], &["--every", "2m", "--side", "100"]].concat());
+    let version = catalog.version("street", None).unwrap();
+    let stored = catalog.views(&version).unwrap();
+    assert_eq!(stored.len(), 6, "{stored:?}");
+    let stops: Vec<Option<f64>> = stored.iter().map(|view| view.exposure_stops).collect();
+    assert_eq!(stops, [None, Some(1.25), None, None, None, None]);
+    assert!(stored[1..].iter().all(|view| view.mask.is_none()), "all pixels count");
+    let bytes = catalog.view_mask(&version, &stored[0]).unwrap().unwrap();
+    let mask = image::load_from_memory(&bytes).unwrap().into_luma8();
+    assert_eq!(mask.dimensions(), (100, 50));
+    let dark = mask.enumerate_pixels().filter(|(_, _, value)| value.0[0] < 128);
+    let rows: Vec<u32> = dark.map(|(_, row, _)| row).collect();
+    assert_eq!(rows, [0; 100]);
+
+    let text = fs::read_to_string(at.join("list.jsonl")).unwrap();
+    fs::write(at.join("list.jsonl"), text.replace("1.25", "125")).unwrap();
+    let said = refused(at, &views);
+    assert!(said.contains("exposure_stops is 125; give -16 to 16"), "{said}");
 }

@@ -115,6 +115,7 @@ fn record(catalog: &Catalog, truth: &Arc<Resident>) {
                 world_from_camera: view.world_from_camera,
                 exposure_stops: None,
                 image: commit.put_image(&jpeg).unwrap(),
+                mask: None,
             });
         }
     }

@@ -132,13 +132,30 @@ fn view_at(width_px: u32, x_m: f64, y_m: f64) -> View {
 
 /// What the model should return for a camera beside the drive: references at 0, 2 and 4 m, of both cameras.
 fn expected(width_px: u32, y_m: f64, paint: Option<[u8; 3]>, stations: &[f64]) -> Vec<u8> {
+    expected_of(width_px, y_m, paint, stations, false)
+}
+
+/// The same; if `masked`, without the left halves of the references.
+fn expected_of(
+    width_px: u32,
+    y_m: f64,
+    paint: Option<[u8; 3]>,
+    stations: &[f64],
+    masked: bool,
+) -> Vec<u8> {
     let view = view_at(width_px, 3.0, y_m);
     let (rendered, depth_m) = Wall::picture(&view);
     let mut references = Vec::new();
     for station_m in stations {
         for width_px in [24, 20] {
             let view = view_at(width_px, *station_m, 0.0);
-            let (mut image, depth_m) = Wall::picture(&view);
+            let (mut image, mut depth_m) = Wall::picture(&view);
+            let is_left = |pixel: usize| pixel % (width_px as usize) < width_px as usize / 2;
+            depth_m
+                .iter_mut()
+                .enumerate()
+                .filter(|(pixel, _)| masked && is_left(*pixel))
+                .for_each(|(_, depth_m)| *depth_m = 0.0);
             if let Some(paint) = paint {
                 image.rgb8 = paint.repeat(depth_m.len());
             }
@@ -219,6 +236,17 @@ fn replayed(server: &TestServer, folder: &Folder, episode: &str, repaired: u64) 
 
 /// Commits a version of the twin with uniformly painted images of both cameras at some stations.
 fn add_views(server: &TestServer, paint: [u8; 3], stations: &[f64], names: [&str; 2]) {
+    add_views_of(server, paint, stations, names, None);
+}
+
+/// The same; with an exposure in stops, and a mask of their left halves, if there is one.
+fn add_views_of(
+    server: &TestServer,
+    paint: [u8; 3],
+    stations: &[f64],
+    names: [&str; 2],
+    exposure_stops: Option<f64>,
+) {
     let catalog = Catalog::open(server.twins.path()).unwrap();
     let base = catalog.version("test", None).unwrap();
     let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
@@ -235,8 +263,14 @@ fn add_views(server: &TestServer, paint: [u8; 3], stations: &[f64], names: [&str
                 camera_name: name.to_owned(),
                 camera: view.camera,
                 world_from_camera: view.world_from_camera,
-                exposure_stops: None,
+                exposure_stops,
                 image: commit.put_image(&png).unwrap(),
+                mask: exposure_stops.map(|_| {
+                    let white =
+                        |at: u32| if at % width_px < width_px / 2 { [0; 3] } else { [255; 3] };
+                    let mask: Vec<u8> = (0..16 * width_px).flat_map(white).collect();
+                    commit.put_image(&wildcity_session::png(&mask, width_px, 16).unwrap()).unwrap()
+                }),
             });
         }
     }
@@ -264,6 +298,25 @@ async fn recorded_images_are_warped_and_replayed() {
     assert_eq!(names[0].as_str().unwrap().split('/').next(), Some("log@2.50"), "{names}");
     // Two images, and the depth of two references.
     assert_eq!(wall.views.load(Ordering::SeqCst) - before, 4);
+    agent.ask(json!({"type": "close"})).await;
+    replayed(&server, &folder, "a-1", 2);
+}
+
+#[tokio::test]
+async fn masked_pixels_are_not_brought_and_exposures_are_taken_back() {
+    let folder = warped_model();
+    let (server, _) = server(&[&folder]).await;
+    add_views_of(&server, [200, 10, 90], &[2.5], ["left", "right"], Some(1.0));
+    let mut agent = server.agent().await;
+    open(&mut agent, "a", "warped").await;
+    let seen = step(&mut agent, 2.0).await;
+    // Half as bright in linear light: 0.2888, 0.0015 and 0.0511 of 1.
+    let dark = [146, 5, 64];
+    let wanted = expected_of(24, 2.0, Some(dark), &[2.5], true);
+    assert_eq!(pixels(&seen, "left"), wanted);
+    let count = |image: &[u8]| image.chunks(3).filter(|pixel| *pixel == dark).count();
+    let whole = expected(24, 2.0, Some(dark), &[2.5]);
+    assert!((50..count(&whole)).contains(&count(&wanted)), "{}", count(&wanted));
     agent.ask(json!({"type": "close"})).await;
     replayed(&server, &folder, "a-1", 2);
 }

@@ -16,6 +16,9 @@ use crate::scene_files::gaussians;
 
 const IMAGES: [&[u8]; 2] = [b"the first image", b"the second image, which is longer"];
 
+/// Of the second image.
+const MASK: &[u8] = b"what counts";
+
 fn begin(catalog: &Catalog) -> Commit {
     catalog.begin("street", CommitKind::Import, StorageOptions::default()).unwrap()
 }
@@ -33,6 +36,7 @@ fn table(commit: &mut Commit) -> Vec<RecordedView> {
         },
         exposure_stops: None,
         image: commit.put_image(image).unwrap(),
+        mask: (at == 1).then(|| commit.put_image(MASK).unwrap()),
     };
     IMAGES.iter().enumerate().map(view).collect()
 }
@@ -61,15 +65,17 @@ fn images_come_back_and_later_versions_share_them() {
         assert_eq!((catalog.views(&first).unwrap().len(), &first.manifest.views), (0, &None));
         let (second, views) = with_views(&catalog);
         let named = second.manifest.views.clone().unwrap();
-        assert_eq!((named.images, named.image_bytes), (2, 15 + 33));
+        assert_eq!((named.images, named.image_bytes), (2, 15 + 33 + 11));
         assert_eq!(
             second.manifest.stored_bytes(),
-            first.manifest.stored_bytes() + 48 + named.bytes
+            first.manifest.stored_bytes() + 59 + named.bytes
         );
         assert_eq!(catalog.views(&second).unwrap(), views);
         for (view, image) in views.iter().zip(IMAGES) {
             assert_eq!(catalog.view_image(&second, view).unwrap(), image);
         }
+        let masks = views.iter().map(|view| catalog.view_mask(&second, view).unwrap());
+        assert_eq!(masks.collect::<Vec<_>>(), [None, Some(MASK.to_vec())]);
         // Another change keeps them, and the same images take no room.
         let objects = place.objects().len();
         let third = change(&catalog, [0, 0], 2).change(second.number, cells_alone()).unwrap();
@@ -108,9 +114,11 @@ fn images_are_garbage_with_their_last_version() {
         let kept = collect(2).removed;
         assert_eq!(kept.objects, 0, "{kept:?}");
         assert_eq!(catalog.view_image(&second, &views[1]).unwrap(), IMAGES[1]);
+        assert_eq!(catalog.view_mask(&second, &views[1]).unwrap(), Some(MASK.to_vec()));
         let removed = collect(1).removed;
-        // Two images, their table and a manifest.
-        assert_eq!(removed.objects, 4, "{removed:?}");
+        // Two images, a mask, their table and a manifest.
+        assert_eq!(removed.objects, 5, "{removed:?}");
+        catalog.view_mask(&second, &views[1]).unwrap_err();
         catalog.view_image(&second, &views[1]).unwrap_err();
         assert!(catalog.fsck("street", &mut |_, _| {}).unwrap().is_sound());
     });
@@ -123,7 +131,8 @@ fn a_damaged_image_or_table_is_found() {
     let catalog = street(&place);
     let (second, views) = with_views(&catalog);
     let table = second.manifest.views.as_ref().unwrap().object.clone();
-    for object in [&views[0].image.object, &table] {
+    let mask = &views[1].mask.as_ref().unwrap().object;
+    for object in [&views[0].image.object, mask, &table] {
         let path = place.twins().join("street/objects").join(&object[..2]).join(object);
         let before = std::fs::read(&path).unwrap();
         let mut permissions = std::fs::metadata(&path).unwrap().permissions();

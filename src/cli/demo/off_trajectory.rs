@@ -84,6 +84,7 @@ async fn record_images(
                     world_from_camera: *world_from_rig * mounted.rig_from_camera,
                     exposure_stops: None,
                     image: commit.put_image(&file.map_err(anyhow::Error::msg)?)?,
+                    mask: None,
                 });
             }
         }

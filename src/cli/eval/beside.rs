@@ -11,7 +11,9 @@ use wildcity_repair::reference::{
     Projection, Rays, Reference, WarpTarget, Warped, opaque_depth, warp,
 };
 use wildcity_scene::RenderProfile;
-use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::srgb::change_stops;
 use wildcity_session::RenderedImage;
 
 use super::drive::{DrivePlace, Drives};
@@ -58,7 +60,10 @@ pub(super) struct Tools<'a> {
 /// A real image, from which views beside the drive are moved.
 pub(super) struct OnDrive<'a> {
     pub(super) name: &'a str,
-    pub(super) camera_name: &'a str,
+    pub(super) camera: &'a RigCamera,
+    pub(super) lens: &'a Lens,
+    /// Exposure of the real image in stops against the twin's, if it is known.
+    pub(super) exposure_stops: Option<f64>,
     pub(super) view: &'a View,
     pub(super) profile: &'a RenderProfile,
     pub(super) truth: &'a [u8],
@@ -90,12 +95,20 @@ struct Drawn {
     view: View,
     rendered: RenderedImage,
     repaired: Option<Vec<u8>>,
+    /// Name of the nearest recorded image, if the model saw it.
+    nearest: Option<String>,
 }
 
 /// The camera of the views of an image, as the warp needs it.
-struct Lens {
-    rays: Rays,
+pub(super) struct Lens {
+    pub(super) rays: Rays,
     projection: Arc<Projection>,
+}
+
+impl Lens {
+    pub(super) fn of(camera: &Camera) -> Self {
+        Self { rays: Rays::of(camera), projection: Arc::new(Projection::of(camera)) }
+    }
 }
 
 impl Beside {
@@ -111,13 +124,11 @@ impl Beside {
         tools: Tools<'_>,
         image: &OnDrive<'_>,
     ) -> anyhow::Result<Vec<BesideImage>> {
-        let place = tools.drives.place(image.camera_name, &image.view.world_from_camera);
+        let place = tools.drives.place(&image.camera.name, &image.view.world_from_camera);
         let Some(place) = place else { return Ok(Vec::new()) };
-        let camera = &image.view.camera;
-        let lens = Lens { rays: Rays::of(camera), projection: Arc::new(Projection::of(camera)) };
         let mut drawn = Vec::with_capacity(self.0.len());
         for line in &mut self.0 {
-            drawn.push(line.add(tools, image, &place, &lens)?);
+            drawn.push(line.add(tools, image, &place)?);
         }
         Ok(drawn)
     }
@@ -138,14 +149,16 @@ impl Line {
         tools: Tools<'_>,
         image: &OnDrive<'_>,
         place: &DrivePlace<'_>,
-        lens: &Lens,
     ) -> anyhow::Result<BesideImage> {
+        let lens = image.lens;
         let moved_m = self.offset_m * place.left();
-        let now = draw(tools, image, place, &|pose| moved(pose, moved_m))?;
+        // The view before is drawn first, and the one after it keeps its nearest recorded image, as in a session.
         let step = place.step_back();
         let before =
-            step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m)));
+            step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None));
         let before = before.transpose()?;
+        let kept = before.as_ref().and_then(|before| before.nearest.as_deref());
+        let now = draw(tools, image, place, &|pose| moved(pose, moved_m), kept)?;
 
         // The geometry is that of what was rendered, also for the repaired pixels.
         let onto_now = |of: &dyn Fn(&Drawn) -> Vec<u8>| match &before {
@@ -205,6 +218,7 @@ fn draw(
     image: &OnDrive<'_>,
     place: &DrivePlace<'_>,
     moved: &dyn Fn(&Pose) -> Pose,
+    kept: Option<&str>,
 ) -> anyhow::Result<Drawn> {
     let Tools { renderer, repairer, drives } = tools;
     let view = View::new(image.view.camera, moved(&image.view.world_from_camera));
@@ -212,14 +226,21 @@ fn draw(
     let mut rendered = renderer.render(&view, image.profile)?;
     rendered.trust = drives.trust(&world_from_rig, &view, &rendered);
     let placed = PlacedImage {
-        camera_name: image.camera_name,
+        camera: image.camera,
+        rays: &image.lens.rays,
         view: &view,
         world_from_rig: &world_from_rig,
         rendered: &rendered,
         profile: image.profile,
+        kept,
     };
     let repaired = repairer.map(|repairer| repairer.repair(renderer, &placed)).transpose()?;
-    Ok(Drawn { view, rendered, repaired })
+    let (mut repaired, nearest) = repaired.map(|it| (it.rgb8, it.nearest)).unzip();
+    if let Some(stops) = image.exposure_stops {
+        change_stops(&mut rendered.rgb8, stops);
+        repaired.iter_mut().for_each(|rgb8: &mut Vec<u8>| change_stops(rgb8, stops));
+    }
+    Ok(Drawn { view, rendered, repaired, nearest: nearest.flatten() })
 }
 
 /// Brings pixels of one view into another by the depths that were rendered of both.

@@ -5,13 +5,11 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use wildcity_render::View;
+use wildcity_report::repair::FRAME_M;
 use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::{RenderedImage, TrainingCoverage};
 use wildcity_twin::store::Version;
-
-/// Distance of two views whose change is flicker, along the drive, in metres.
-const STEP_M: f64 = 0.5;
 
 /// The recorded drives of a twin.
 pub(super) struct Drives {
@@ -76,15 +74,15 @@ impl DrivePlace<'_> {
         self.drive.rotation * DVec3::Y
     }
 
-    /// The motion to the place [`STEP_M`] before this one, or behind it at the start of the drive: a pose of the world is
+    /// The motion to the place [`FRAME_M`] before this one, or behind it at the start of the drive: a pose of the world is
     /// moved by multiplying it from the left. `None` if the drive is shorter.
     pub(super) fn step_back(&self) -> Option<Pose> {
-        let from_m = match self.station_m >= STEP_M {
-            true => self.station_m - STEP_M,
-            false => self.station_m + STEP_M,
+        let from_m = match self.station_m >= FRAME_M {
+            true => self.station_m - FRAME_M,
+            false => self.station_m + FRAME_M,
         };
         let before = self.trajectory.at_station(from_m);
-        let is_moved = before.position_m.distance(self.drive.position_m) > 0.5 * STEP_M;
+        let is_moved = before.position_m.distance(self.drive.position_m) > 0.5 * FRAME_M;
         is_moved.then(|| before * self.drive.inverse())
     }
 }

@@ -6,33 +6,34 @@ mod labels;
 mod networks;
 mod renderer;
 mod repairer;
+mod summary;
 
 use std::io::{self, Write};
 use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 
-use wildcity_eval::{
-    EvaluatedImage, Evaluation, Extrapolation, Gain, LidarMeans, Means, Pair, PairScores,
-    ScoreMeans, Subject, Thumbnails,
-};
+use wildcity_eval::{EvaluatedImage, Evaluation, Pair, PairScores, Subject, Thumbnails};
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::srgb::change_stops;
 use wildcity_session::RenderedImage;
 
-use self::beside::{Beside, BesideImage, Offsets, OnDrive, Tools};
+use self::beside::{Beside, BesideImage, Lens, Offsets, OnDrive, Tools};
 use self::drive::Drives;
 use self::labels::{LabelOptions, Labels};
 use self::networks::{FeatureSet, NetworkOptions, Networks};
 use self::renderer::{Maps, Renderer, covered};
 use self::repairer::{PlacedImage, Repairer, RepairerOptions};
+use self::summary::{decibels, print_beside, print_means};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::profile_options::ProfileOptions;
-use super::real_images::{ImageList, RealImage, camera_names, picture};
+use super::real_images::{ImageList, RealImage, camera_names, own_vehicle, picture};
 use super::scene_source::Source;
 use super::{output, placement, progress};
 
@@ -160,7 +161,9 @@ struct Compared {
     rendered: RenderedImage,
     repaired: Option<Vec<u8>>,
     counts: Option<Vec<bool>>,
-    camera_name: String,
+    camera: RigCamera,
+    /// Of the images that are repaired or moved beside the drive.
+    lens: Option<Lens>,
 }
 
 impl Eval {
@@ -251,7 +254,18 @@ impl Eval {
         let size_px = [camera.width_px, camera.height_px];
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
+        let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
+        let shown = RigCamera::new(camera_name, camera, Pose::IDENTITY);
         let mut rendered = renderer.render(&view, &profile)?;
+        // A model repairs in the exposure of the twin; compared is in that of the real image.
+        let exposed = |mut rgb8: Vec<u8>| {
+            image.exposure_stops.iter().for_each(|stops| change_stops(&mut rgb8, *stops));
+            rgb8
+        };
+        let rendered_rgb8 = exposed(rendered.rgb8.clone());
+        let needs_lens = repairer.is_some() || self.extrapolate.is_some();
+        let lens = needs_lens.then(|| Lens::of(&camera));
+        let mask = own_vehicle::both(mask, own_vehicle::outside(rig, camera_name, size_px));
         let mut counts = counted(&view, mask);
         let hidden = labels.hide(image, &view, &renderer.alignment);
         let moving = hidden.as_ref().map(|(_, share)| *share);
@@ -264,9 +278,9 @@ impl Eval {
         }
         let covered = covered(&rendered);
         let lpips = |rgb8: &[u8]| networks.lpips(size_px, rgb8, &truth, counts.as_deref());
-        let pair = Pair::new(size_px, truth.clone(), rendered.rgb8.clone(), counts.clone())?;
+        let pair = Pair::new(size_px, truth.clone(), rendered_rgb8.clone(), counts.clone())?;
         let mut compared = PairScores::of(&pair, self.align_exposure);
-        compared.scores.lpips = lpips(&rendered.rgb8)?;
+        compared.scores.lpips = lpips(&rendered_rgb8)?;
         if self.save_images {
             self.save(&image.name, ["rendered", "errors"], &pair, &compared.error_map)?;
         }
@@ -276,7 +290,7 @@ impl Eval {
         let mut repaired_rgb8 = None;
         let mut thumbnails =
             Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
-        if let Some(repairer) = repairer {
+        if let Some((repairer, lens)) = repairer.as_ref().zip(lens.as_ref()) {
             let place = drives.as_ref().and_then(|drives| {
                 let place = drives.place(camera_name, &view.world_from_camera)?;
                 Some((place.world_from_rig, drives))
@@ -285,13 +299,15 @@ impl Eval {
             rendered.trust =
                 place.map_or(1.0, |(rig, drives)| drives.trust(&rig, &view, &rendered));
             let placed = PlacedImage {
-                camera_name,
+                camera: &shown,
+                rays: &lens.rays,
                 view: &view,
                 world_from_rig: &world_from_rig,
                 rendered: &rendered,
                 profile: &profile,
+                kept: None,
             };
-            let repaired = repairer.repair(renderer, &placed)?;
+            let repaired = exposed(repairer.repair(renderer, &placed)?.rgb8);
             let pair = Pair::new(size_px, truth.clone(), repaired.clone(), counts.clone())?;
             let mut compared = PairScores::of(&pair, self.align_exposure);
             compared.scores.lpips = lpips(&repaired)?;
@@ -309,9 +325,10 @@ impl Eval {
             thumbnails = with.map_err(anyhow::Error::msg)?;
         }
         scores.thumbnails = Some(thumbnails);
-        let camera_name = camera_name.to_owned();
         let repaired = repaired_rgb8;
-        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera_name })
+        let camera = shown;
+        rendered.rgb8 = rendered_rgb8;
+        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
     }
 
     /// Draws the views beside the drive that belong to an image.
@@ -323,12 +340,16 @@ impl Eval {
         image: &RealImage,
         is_shown: bool,
     ) -> anyhow::Result<Vec<BesideImage>> {
-        let Some(drives) = &setup.drives else { return Ok(Vec::new()) };
+        let (Some(drives), Some(lens)) = (&setup.drives, &compared.lens) else {
+            return Ok(Vec::new());
+        };
         let repairer = setup.repairer.as_ref();
         let tools = Tools { renderer: &setup.renderer, repairer, drives };
         let on_drive = OnDrive {
             name: &image.name,
-            camera_name: &compared.camera_name,
+            camera: &compared.camera,
+            lens,
+            exposure_stops: image.exposure_stops,
             view: &compared.view,
             profile: &compared.profile,
             truth: &compared.truth,
@@ -501,66 +522,4 @@ fn counted(view: &View, mask: Option<Vec<bool>>) -> Option<Vec<bool>> {
     let mut counts = mask.unwrap_or_else(|| vec![true; view.camera.pixels()]);
     field.clear_outside(&view.camera, 1, &mut counts);
     Some(counts)
-}
-
-fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()> {
-    let images = means.images;
-    print_scores(out, &format!("mean of {images} images"), &means.rendered)?;
-    if let Some(repaired) = &means.repaired {
-        print_scores(out, "repaired", repaired)?;
-    }
-    if let Some(lidar) = &means.lidar {
-        let LidarMeans { points, mean_m, median_m, .. } = lidar;
-        writeln!(
-            out,
-            "depth against {points} LiDAR points: mean {mean_m:.3} m, median {median_m:.3} m"
-        )?;
-    }
-    if let Some(gain) = &means.gain {
-        let Gain { psnr_db, ssim, flip, .. } = gain;
-        writeln!(out, "gain: PSNR {psnr_db:+.2} dB, SSIM {ssim:+.4}, FLIP {flip:+.4}")?;
-    }
-    Ok(())
-}
-
-fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Result<()> {
-    let ScoreMeans { psnr_db, ssim, ssim_mirrored, flip, .. } = means;
-    let psnr = decibels(*psnr_db);
-    writeln!(
-        out,
-        "{what}: PSNR {psnr}, SSIM {ssim:.4} (mirrored edges: {ssim_mirrored:.4}), FLIP {flip:.4}"
-    )?;
-    if let Some(lpips) = means.lpips {
-        writeln!(out, "  LPIPS {lpips:.4}")?;
-    }
-    if let Some(aligned) = &means.aligned {
-        let psnr = decibels(aligned.psnr_db);
-        writeln!(out, "with aligned exposure: PSNR {psnr}, SSIM {:.4}", aligned.ssim)?;
-    }
-    Ok(())
-}
-
-fn print_beside(out: &mut impl Write, one: &Extrapolation) -> io::Result<()> {
-    let Extrapolation { offset_m, trust, covered, .. } = one;
-    writeln!(
-        out,
-        "{offset_m} m beside the drive: trust {trust:.2}, covered {:.1} %",
-        100.0 * covered
-    )?;
-    let means = [("rendered", Some(&one.rendered)), ("repaired", one.repaired.as_ref())];
-    for (what, means) in means {
-        let Some(means) = means else { continue };
-        writeln!(
-            out,
-            "  {what}: reprojection {} ({:.1} % came back), flicker {:.4}",
-            decibels(means.reprojection_psnr_db),
-            100.0 * means.reprojection_share,
-            means.flicker
-        )?;
-    }
-    Ok(())
-}
-
-fn decibels(db: f64) -> String {
-    if db == f64::INFINITY { "exact".to_owned() } else { format!("{db:.2} dB") }
 }

@@ -3,14 +3,19 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 
 use wildcity_eval::RepairSubject;
 use wildcity_render::View;
-use wildcity_repair::{LoadOptions, Model};
+use wildcity_repair::reference::{Rays, ReferenceCache};
+use wildcity_repair::{InputRole, LoadOptions, Model};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
-use wildcity_session::{ReferenceSource, RenderedImage, StillRepair, StillToRepair};
+use wildcity_scene::rig::RigCamera;
+use wildcity_session::{
+    NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, ReferenceSource,
+    RenderedImage, ViewReferences,
+};
 
 use super::renderer::Renderer;
 use crate::cli::directories::Twins;
@@ -39,15 +44,31 @@ pub(super) struct RepairerOptions {
 }
 
 /// A model and the images that it compares with.
-pub(super) struct Repairer(StillRepair);
+pub(super) struct Repairer {
+    model: Arc<Model>,
+    needed: NeededReferences,
+    /// Of a twin.
+    references: Option<OfflineReferences>,
+    cache: ReferenceCache,
+}
 
 /// An image to repair, with where it is.
 pub(super) struct PlacedImage<'a> {
-    pub(super) camera_name: &'a str,
+    pub(super) camera: &'a RigCamera,
+    pub(super) rays: &'a Rays,
     pub(super) view: &'a View,
     pub(super) world_from_rig: &'a Pose,
     pub(super) rendered: &'a RenderedImage,
     pub(super) profile: &'a RenderProfile,
+    /// Name of the nearest recorded image of the view before, which stays unless another is much nearer.
+    pub(super) kept: Option<&'a str>,
+}
+
+/// A repaired image.
+pub(super) struct Repaired {
+    pub(super) rgb8: Vec<u8>,
+    /// Name of the nearest recorded image, if the model saw it.
+    pub(super) nearest: Option<String>,
 }
 
 impl RepairerOptions {
@@ -78,47 +99,86 @@ impl RepairerOptions {
     ) -> anyhow::Result<Repairer> {
         let options = self.load_options();
         let model = Arc::new(Model::load(manifest, &options)?);
-        let twin = match source {
-            Source::Twin(resident) => Some((twins.catalog()?, resident.clone())),
-            Source::File(_) => None,
+        let needed = NeededReferences::of(&model);
+        let name = &model.manifest().name;
+        let references = match source {
+            Source::Twin(resident) => {
+                let cameras = resident.version.manifest.rig.as_ref().map(|rig| &rig.cameras[..]);
+                let cameras = cameras.unwrap_or_default();
+                let catalog = twins.catalog()?;
+                let references =
+                    OfflineReferences::open(resident.clone(), catalog, cameras, held_out)?;
+                // The sizes of the images are known later.
+                references.check(&model, &[])?;
+                Some(references)
+            }
+            Source::File(_) => {
+                ensure!(
+                    !needed.any(),
+                    "the model {name:?} needs images of a recorded drive, which a scene file does not have: give a twin, or a \
+                     model without this input"
+                );
+                OfflineReferences::check_scale(&model)?;
+                None
+            }
         };
-        Ok(Repairer(StillRepair::open(model, twin, held_out, options.reference_bytes)?))
+        let has_drive = source.version().is_some_and(|it| !it.manifest.trajectories.is_empty());
+        ensure!(
+            has_drive || !model.needs(InputRole::Trust),
+            "the model {name:?} needs the trust, which only a twin with a recorded drive has: `wildcity twin drive` adds one"
+        );
+        let cache = ReferenceCache::new(options.reference_bytes);
+        Ok(Repairer { model, needed, references, cache })
     }
 }
 
 impl Repairer {
     pub(super) fn needs_depth(&self) -> bool {
-        self.0.needs_depth()
+        self.needed.warped || self.needs_normals() || self.model.needs(InputRole::Depth)
     }
 
     pub(super) fn needs_normals(&self) -> bool {
-        self.0.needs_normals()
+        self.model.needs(InputRole::Normals)
     }
 
     /// What the page and eval.json say of it.
     pub(super) fn subject(&self) -> RepairSubject {
-        let model = self.0.model();
-        let references = self.0.source().map(|source| match source {
+        let manifest = self.model.manifest();
+        let references = self.references.as_ref().filter(|_| self.needed.any());
+        let source = references.and_then(OfflineReferences::source).map(|source| match source {
             ReferenceSource::Recorded => "recorded",
             ReferenceSource::Rendered => "rendered",
         });
         RepairSubject {
-            model: model.manifest().name.clone(),
-            version: model.manifest().version.clone(),
-            repair_hash: model.repair_hash().to_hex().to_string(),
-            references,
-            left_out: self.0.left_out(),
+            model: manifest.name.clone(),
+            version: manifest.version.clone(),
+            repair_hash: self.model.repair_hash().to_hex().to_string(),
+            references: source,
+            left_out: references.map_or(0, OfflineReferences::left_out),
         }
     }
 
-    /// The repaired pixels of an image.
+    /// Repairs an image.
     pub(super) fn repair(
         &self,
         renderer: &Renderer,
         image: &PlacedImage<'_>,
-    ) -> anyhow::Result<Vec<u8>> {
-        let &PlacedImage { camera_name, view, world_from_rig, rendered, profile } = image;
-        let image = StillToRepair { camera_name, view, world_from_rig, rendered };
-        Ok(self.0.repair(&image, profile, &*renderer.backend)?)
+    ) -> anyhow::Result<Repaired> {
+        let &PlacedImage { camera, rays, view, world_from_rig, rendered, profile, kept } = image;
+        let of = OfflineView { camera, rays, view, world_from_rig, rendered, kept };
+        let drawing = OfflineDrawing { profile, backend: &*renderer.backend, cache: &self.cache };
+        let beside = match &self.references {
+            Some(references) => references.beside(&of, self.needed, drawing)?,
+            None => ViewReferences::default(),
+        };
+        let nearest = beside.nearest().map(str::to_owned);
+        ensure!(
+            nearest.is_some() || !self.needed.nearest,
+            "the model {:?} needs a recorded image of the camera {:?} within 30 m; there is none",
+            self.model.manifest().name,
+            camera.name
+        );
+        let (rgb8, _) = beside.repaired(&self.model, &of)?;
+        Ok(Repaired { rgb8, nearest })
     }
 }

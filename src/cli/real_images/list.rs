@@ -23,6 +23,8 @@ pub(in crate::cli) struct RealImage {
     pub(in crate::cli) near: Option<f64>,
     /// When it was taken, in microseconds, if the list says so.
     pub(in crate::cli) time_us: Option<i64>,
+    /// Its exposure in stops against the scene's, if the list says so.
+    pub(in crate::cli) exposure_stops: Option<f64>,
 }
 
 /// Real images, in the order of their names.
@@ -38,6 +40,7 @@ struct ListedImage {
     mask: Option<String>,
     near: Option<f64>,
     time_us: Option<i64>,
+    exposure_stops: Option<f64>,
 }
 
 /// A list before its files are looked for.
@@ -63,7 +66,7 @@ impl ImageList {
             read(source).with_context(|| format!("--images {}", source.display()))?;
         let folder = image_dir.unwrap_or(&folder);
         let mut found = Vec::with_capacity(images.len());
-        for ListedImage { posed, mask, near, time_us } in images {
+        for ListedImage { posed, mask, near, time_us, exposure_stops } in images {
             let PosedImage { name, camera, world_from_camera } = posed;
             let file = image_file(folder, &name)?;
             let mask = match (masks, mask) {
@@ -71,7 +74,16 @@ impl ImageList {
                 (None, Some(mask)) => Some(folder.join(mask)),
                 (None, None) => None,
             };
-            found.push(RealImage { name, file, mask, camera, world_from_camera, near, time_us });
+            found.push(RealImage {
+                name,
+                file,
+                mask,
+                camera,
+                world_from_camera,
+                near,
+                time_us,
+                exposure_stops,
+            });
         }
         found.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(Self { images: found, is_in_scene_axes })
@@ -88,15 +100,21 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
     let is_dir = source.is_dir();
     if is_dir && !source.join("transforms.json").is_file() {
         let images = capture::read_colmap(source)?;
-        let listed = |posed| ListedImage { posed, mask: None, near: None, time_us: None };
+        let listed = |posed| ListedImage {
+            posed,
+            mask: None,
+            near: None,
+            time_us: None,
+            exposure_stops: None,
+        };
         let images = images.into_iter().map(listed).collect();
         return Ok(Listed { images, folder: colmap_images(source), is_in_scene_axes: false });
     }
     if is_dir || has_frames(source)? {
         let images = capture::read_nerfstudio_frames(source)?;
         let listed = |frame: capture::FrameImage| {
-            let capture::FrameImage { posed, mask, time_us } = frame;
-            ListedImage { posed, mask, near: None, time_us }
+            let capture::FrameImage { posed, mask, time_us, exposure_stops } = frame;
+            ListedImage { posed, mask, near: None, time_us, exposure_stops }
         };
         let images = images.into_iter().map(listed).collect();
         let folder = if is_dir { source.to_owned() } else { beside };
@@ -104,8 +122,17 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
     }
     let listed = cameras::read(source)?.into_iter().map(|listed| {
         let name = listed.image.unwrap_or(listed.name);
-        let cameras::ListedCamera { camera, world_from_camera, mask, near, time_us, .. } = listed;
-        ListedImage { posed: PosedImage { name, camera, world_from_camera }, mask, near, time_us }
+        let cameras::ListedCamera {
+            camera,
+            world_from_camera,
+            mask,
+            near,
+            time_us,
+            exposure_stops,
+            ..
+        } = listed;
+        let posed = PosedImage { name, camera, world_from_camera };
+        ListedImage { posed, mask, near, time_us, exposure_stops }
     });
     Ok(Listed { images: listed.collect(), folder: beside, is_in_scene_axes: true })
 }

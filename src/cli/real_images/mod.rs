@@ -2,6 +2,7 @@
 
 mod list;
 mod names;
+pub(super) mod own_vehicle;
 pub(super) mod picture;
 
 pub(super) use list::{ImageList, RealImage};

@@ -44,6 +44,7 @@ mod tests {
             world_from_camera: Pose::IDENTITY,
             near: None,
             time_us: None,
+            exposure_stops: None,
         };
         let images: Vec<RealImage> = names.iter().map(image).collect();
         camera_names(&images.iter().collect::<Vec<_>>())

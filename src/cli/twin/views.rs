@@ -10,12 +10,12 @@ use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::manifest::ObjectRef;
 use wildcity_scene::trajectory::NearestPlace;
-use wildcity_scene::views::RecordedView;
+use wildcity_scene::views::{RecordedView, reduced_mask};
 use wildcity_scene::{Manifest, Trajectory};
 use wildcity_twin::store::{Commit, CommitKind, StorageOptions, VersionChange};
 
 use crate::cli::directories::{TwinVersion, Twins};
-use crate::cli::real_images::{ImageList, RealImage, camera_names, picture};
+use crate::cli::real_images::{ImageList, RealImage, camera_names, own_vehicle, picture};
 use crate::cli::{placement, progress};
 
 use super::change;
@@ -24,6 +24,8 @@ use super::change;
 ///
 /// A repair model can compare a rendered image with recorded ones (docs/repair.md). The images are stored as JPEG in
 /// the size that --side says, with their cameras. Each belongs to the place of the drive that is nearest to its camera.
+/// Their masks are kept: pixels that do not count are not brought into a view. Nor are those that the overlay of the rig's
+/// camera of the same name covers.
 /// Open sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
@@ -50,7 +52,7 @@ pub(in crate::cli) struct Views {
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 
-    /// Least distance of two images of a camera along the drive, in metres: 2 or 2m.
+    /// Least distance of two images of a camera along the drive, in metres, within a tenth: 2 or 2m.
     #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
     every: f64,
 
@@ -75,6 +77,10 @@ Examples:
   wildcity twin views street --images capture/transforms.json
   wildcity twin views street --images capture --image-dir capture/images_2 --every 4m --side 480
   wildcity twin views street --remove";
+
+/// Images may be so much nearer than --every, as a share of it: in a bend a camera that is outside or inside of it makes another way
+/// than the drive, and images every 2 m would otherwise be kept every 4 m.
+const SLACK: f64 = 0.1;
 
 /// An image of the list with its place on the drive.
 struct Placed<'a> {
@@ -147,7 +153,7 @@ impl Views {
         for one in placed {
             let is_near = kept.last().is_some_and(|last| {
                 order(last) == order(&one)
-                    && one.place.station_m - last.place.station_m < self.every - 1e-6
+                    && one.place.station_m - last.place.station_m < (1.0 - SLACK) * self.every
             });
             if !is_near {
                 kept.push(one);
@@ -158,15 +164,17 @@ impl Views {
         let mut views = Vec::with_capacity(kept.len());
         for one in kept {
             let about = || format!("image {}", one.image.name);
-            let (camera, image) = self.store(commit, manifest, one.image).with_context(about)?;
+            let stored = self.store(commit, manifest, &one).with_context(about)?;
+            let (camera, image, mask) = stored;
             views.push(RecordedView {
                 trajectory: one.trajectory.name.clone(),
                 station_m: one.place.station_m,
                 camera_name: one.camera_name,
                 camera,
                 world_from_camera: one.alignment.pose(&one.image.world_from_camera),
-                exposure_stops: None,
+                exposure_stops: one.image.exposure_stops,
                 image,
+                mask,
             });
             bar.inc(1);
         }
@@ -174,16 +182,20 @@ impl Views {
         Ok(views)
     }
 
-    /// Stores an image in its size. Returns its camera then.
+    /// Stores an image in its size, and its mask if not all pixels count. Returns its camera then.
     fn store(
         &self,
         commit: &mut Commit,
         manifest: &Manifest,
-        image: &RealImage,
-    ) -> anyhow::Result<(Camera, ObjectRef)> {
+        Placed { image, camera_name, .. }: &Placed<'_>,
+    ) -> anyhow::Result<(Camera, ObjectRef, Option<ObjectRef>)> {
         let background = manifest.profile.background;
         let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
         let [width, height] = [camera.width_px, camera.height_px];
+        let mask = image.mask.as_deref();
+        let mask = mask.map(|file| picture::mask(file, [width, height])).transpose()?;
+        let outside = own_vehicle::outside(manifest.rig.as_ref(), camera_name, [width, height]);
+        let mut counts = own_vehicle::both(mask, outside);
         let longest = width.max(height);
         if longest > self.side {
             let scaled = |side: u32| {
@@ -196,9 +208,18 @@ impl Views {
             let large = RgbImage::from_raw(width, height, rgb8);
             let large = large.context("an image has 3 bytes per pixel")?;
             rgb8 = imageops::resize(&large, small[0], small[1], FilterType::Lanczos3).into_raw();
+            counts = counts.map(|counts| reduced_mask(&counts, [width, height], small));
         }
-        let file = wildcity_session::jpeg(&rgb8, camera.width_px, camera.height_px, self.quality);
-        Ok((camera, commit.put_image(&file.map_err(anyhow::Error::msg)?)?))
+        let [width, height] = [camera.width_px, camera.height_px];
+        let file = wildcity_session::jpeg(&rgb8, width, height, self.quality);
+        let stored = commit.put_image(&file.map_err(anyhow::Error::msg)?)?;
+        let Some(counts) = counts.filter(|counts| counts.contains(&false)) else {
+            return Ok((camera, stored, None));
+        };
+        let white = |counts: &bool| if *counts { [255; 3] } else { [0; 3] };
+        let shown: Vec<u8> = counts.iter().flat_map(white).collect();
+        let file = wildcity_session::png(&shown, width, height).map_err(anyhow::Error::msg)?;
+        Ok((camera, stored, Some(commit.put_image(&file)?)))
     }
 }
 

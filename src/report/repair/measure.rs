@@ -157,8 +157,7 @@ impl<'a> Bench<'a> {
         let RepairBenchmark { resident, catalog, .. } = *given;
         let coverage = TrainingCoverage::new(&resident.version.manifest);
         let coverage = coverage.ok_or(ReportError::NoDrive)?;
-        let offline =
-            OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
+        let offline = OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
         given.models.iter().try_for_each(|model| offline.check(model, cameras))?;
         let optics = |camera: &RigCamera| {
             (Arc::new(Projection::of(&camera.camera)), Rays::of(&camera.camera))
@@ -329,8 +328,7 @@ impl<'a> Bench<'a> {
         let RepairBenchmark { resident, backend, references, models, .. } = *self.given;
         let mounted = &self.cameras[camera];
         let (_, rays) = &self.optics[camera];
-        let of =
-            OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept: None };
+        let of = OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept: None };
         let nearest = models.iter().any(|model| model.needs(InputRole::Reference));
         let profile = &resident.version.manifest.profile;
         let drawing = OfflineDrawing { profile, backend, cache: references };

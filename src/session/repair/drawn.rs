@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use image::{ImageReader, Limits};
+use image::{DynamicImage, ImageReader, Limits};
 
 use wildcity_render::{Backend, Frame, RenderError, Target, View};
 use wildcity_repair::Image;
@@ -10,7 +10,10 @@ use wildcity_repair::reference::{
     LEAST_OPACITY, Projection, Rays, Reference, WarpTarget, opaque_depth, overlaps, resized, warp,
 };
 use wildcity_scene::geometry::Camera;
+use wildcity_scene::manifest::ObjectRef;
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::srgb::change_stops;
+use wildcity_scene::views::reduced_mask;
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
@@ -83,13 +86,14 @@ impl Sight<'_> {
         }
     }
 
-    /// Those of some references that overlap with it.
+    /// Those of some references that overlap with it, in about its resolution.
     pub(crate) fn overlapping(&self, references: Vec<ReferenceView>) -> Vec<ReferenceView> {
         let depth_m = self.depth_m();
         let target = self.target(&depth_m);
         let is_seen =
             |view: &ReferenceView| overlaps(&target, &view.camera, &view.world_from_camera);
-        references.into_iter().filter(is_seen).collect()
+        let seen = references.into_iter().filter(is_seen);
+        seen.map(|view| view.exposed_for(self.camera).reduced_for(&self.camera.camera)).collect()
     }
 
     /// Brings references, with their names, into it.
@@ -108,41 +112,78 @@ impl Sight<'_> {
     }
 }
 
-/// Reads the recorded image of a reference; `None` if it has none. Blocks.
+/// A recorded image that was read.
+pub(crate) struct ReadImage {
+    image: Image,
+    /// Which pixels count; all if there is none.
+    counts: Option<Vec<bool>>,
+}
+
+/// Reads the recorded image of a reference, in the reference's size and exposure, and its mask; `None` if it has none. Blocks.
 ///
 /// # Errors
-/// The image cannot be read, or is not one of its camera's size.
+/// The image or the mask cannot be read, or is not one of its camera's size.
 pub(crate) fn read(
     catalog: &Catalog,
     version: &Version,
     view: &ReferenceView,
-) -> Result<Option<Image>, StoreError> {
+) -> Result<Option<ReadImage>, StoreError> {
     let Some(recorded) = &view.recorded else { return Ok(None) };
     let bytes = catalog.view_image(version, recorded)?;
+    let rgb8 = decoded(&bytes, &recorded.camera, &view.name, &recorded.image)?.into_rgb8();
+    let recorded_px = [recorded.camera.width_px, recorded.camera.height_px];
+    let [width, height] = recorded_px.map(|side| side as usize);
+    let image = Image { width, height, rgb8: rgb8.into_raw() };
+    let size_px = [view.camera.width_px, view.camera.height_px];
+    let mut image = resized(&image, size_px[0] as usize, size_px[1] as usize);
+    if let Some(stops) = recorded.exposure_stops {
+        change_stops(&mut image.rgb8, -stops);
+        if let Some(exposure) = &view.appearance.exposure {
+            exposure.change_rgb8(&mut image.rgb8);
+        }
+    }
+    let mask = catalog.view_mask(version, recorded)?.zip(recorded.mask.as_ref());
+    let counts = match mask {
+        None => None,
+        Some((bytes, object)) => {
+            let luma = decoded(&bytes, &recorded.camera, &view.name, object)?.into_luma8();
+            let counts: Vec<bool> = luma.as_raw().iter().map(|luma| *luma >= 128).collect();
+            Some(reduced_mask(&counts, recorded_px, size_px))
+        }
+    };
+    Ok(Some(ReadImage { image, counts }))
+}
+
+/// Decodes the image or the mask of a recorded view.
+fn decoded(
+    bytes: &[u8],
+    camera: &Camera,
+    name: &str,
+    object: &ObjectRef,
+) -> Result<DynamicImage, StoreError> {
     let damaged = |reason: String| StoreError::Damaged {
-        path: format!("recorded image {} ({})", view.name, recorded.image.object).into(),
+        path: format!("recorded image {name} ({})", object.object).into(),
         reason,
     };
-    let mut reader = ImageReader::new(std::io::Cursor::new(&bytes));
+    let [width, height] = [camera.width_px, camera.height_px];
+    let mut reader = ImageReader::new(std::io::Cursor::new(bytes));
     let mut limits = Limits::default();
-    limits.max_image_width = Some(view.camera.width_px);
-    limits.max_image_height = Some(view.camera.height_px);
+    limits.max_image_width = Some(width);
+    limits.max_image_height = Some(height);
     reader.limits(limits);
     let reader = reader.with_guessed_format().map_err(|error| damaged(error.to_string()))?;
-    let image = reader.decode().map_err(|error| damaged(error.to_string()))?.into_rgb8();
-    let [width, height] = [view.camera.width_px, view.camera.height_px];
+    let image = reader.decode().map_err(|error| damaged(error.to_string()))?;
     if [image.width(), image.height()] != [width, height] {
         let [w, h] = [image.width(), image.height()];
         return Err(damaged(format!("it has {w} x {h} px; its camera has {width} x {height}")));
     }
-    let [width, height] = [width as usize, height as usize];
-    Ok(Some(Image { width, height, rgb8: image.into_raw() }))
+    Ok(image)
 }
 
 /// Draws the depth of a reference, and its pixels if it has no recorded ones.
 pub(crate) fn draw(
     view: &ReferenceView,
-    recorded: Option<Image>,
+    recorded: Option<ReadImage>,
     projection: Arc<Projection>,
     scene: &Scene,
     profile: &RenderProfile,
@@ -153,11 +194,13 @@ pub(crate) fn draw(
     let mut depth_m = vec![0.0; pixels];
     let mut opacity = vec![0.0; pixels];
     let is_drawn = recorded.is_none();
-    let mut image = recorded.unwrap_or_else(|| Image {
+    let blank = || Image {
         width: view.camera.width_px as usize,
         height: view.camera.height_px as usize,
         rgb8: vec![0; 3 * pixels],
-    });
+    };
+    let (image, counts) = recorded.map(|read| (read.image, read.counts)).unzip();
+    let mut image = image.unwrap_or_else(blank);
     let target = Target {
         rgb8: is_drawn.then_some(&mut image.rgb8[..]),
         depth_m: Some(&mut depth_m),
@@ -170,6 +213,12 @@ pub(crate) fn draw(
         if *opacity < LEAST_OPACITY {
             *depth_m = 0.0;
         }
+    }
+    // What does not count has no depth: it fits to no point.
+    for (depth_m, _) in
+        depth_m.iter_mut().zip(counts.flatten().iter().flatten()).filter(|(_, counts)| !**counts)
+    {
+        *depth_m = 0.0;
     }
     let world_from_camera = view.world_from_camera;
     Ok(Reference { image, depth_m, projection, world_from_camera })

@@ -120,7 +120,7 @@ impl ReferenceSupply<'_> {
         let mut found = ViewReferences::default();
         if needed.nearest {
             let pose = &view.world_from_camera;
-            let nearest = views.nearest(&camera.name, pose, world_from_rig, kept);
+            let nearest = views.nearest(camera, pose, world_from_rig, kept);
             if let Some(nearest) = nearest {
                 let reference = self.timed(views, &nearest, &mut found)?;
                 found.beside.set_reference(&nearest.name, &reference, &camera.camera);
@@ -222,6 +222,14 @@ impl OfflineReferences {
     /// Number of recorded images that are left out.
     pub fn left_out(&self) -> usize {
         self.left_out
+    }
+
+    /// Checks that the images of a model have the size of what it gets.
+    ///
+    /// # Errors
+    /// [`SessionError::RepairUnavailable`].
+    pub fn check_scale(model: &Model) -> Result<(), SessionError> {
+        session_repair::check_cameras(model, &[])
     }
 
     /// Checks that a model can repair the images of some cameras.

@@ -106,8 +106,44 @@ impl ReferenceView {
         let image = self.recorded.as_ref().map(|view| &view.image.object);
         let Self { name, camera, world_from_camera, .. } = self;
         let exposure = &self.appearance.exposure;
-        let text = format!("{name} {camera:?} {world_from_camera:?} {image:?} {exposure:?}");
+        let stops = self.recorded.as_ref().and_then(|view| view.exposure_stops);
+        let mask = self.recorded.as_ref().and_then(|view| view.mask.as_ref());
+        let text = format!(
+            "{name} {camera:?} {world_from_camera:?} {image:?} {exposure:?} {stops:?} {mask:?}"
+        );
         *hasher.update(text.as_bytes()).finalize().as_bytes()
+    }
+
+    /// The same image with the exposure of a camera, if its own is known.
+    pub(crate) fn exposed_for(mut self, camera: &RigCamera) -> Self {
+        if self.recorded.as_ref().is_some_and(|view| view.exposure_stops.is_some()) {
+            self.appearance.exposure = camera.appearance.exposure;
+        }
+        self
+    }
+
+    /// The same image for a view of a camera: halved until it has about as many pixels per radian as the view, since an image
+    /// with more is sampled with gaps, and what falls into them changes from view to view. Also less is drawn and kept.
+    pub(crate) fn reduced_for(mut self, camera: &Camera) -> Self {
+        let px_per_rad = |camera: &Camera| (camera.pinhole.fx * camera.pinhole.fy).sqrt();
+        let ratio = px_per_rad(&self.camera) / px_per_rad(camera);
+        // The nearest power of two: what remains is between 0.7 and 1.4.
+        let halvings = ratio.log2().round().clamp(0.0, 8.0) as i32;
+        if halvings == 0 {
+            return self;
+        }
+        let factor = 2.0_f64.powi(halvings);
+        let side = |px: u32| ((f64::from(px) / factor).round() as u64).max(1);
+        let [width_px, height_px] = [self.camera.width_px, self.camera.height_px].map(side);
+        // A camera that cannot be smaller stays as it is.
+        self.camera = self.camera.scaled(width_px, height_px).unwrap_or(self.camera);
+        self
+    }
+
+    /// Its name, size and exposure: what tells it from all others of a version.
+    pub(crate) fn id(&self) -> String {
+        let Self { name, camera, appearance, .. } = self;
+        format!("{name} {}x{} {:?}", camera.width_px, camera.height_px, appearance.exposure)
     }
 
     /// How it is drawn.
@@ -201,7 +237,7 @@ impl ReferenceViews {
     /// same direction within 30°. The one that was used before, by its name, stays until another is 0.5 m nearer.
     pub(crate) fn nearest(
         &self,
-        camera: &str,
+        camera: &RigCamera,
         world_from_camera: &Pose,
         world_from_rig: &Pose,
         kept: Option<&str>,
@@ -213,11 +249,11 @@ impl ReferenceViews {
                 && view.angle_rad(world_from_camera) <= REFERENCE_RAD
         };
         let all: Vec<ReferenceView> =
-            self.of_camera(&place, camera).into_iter().filter(fits).collect();
+            self.of_camera(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
         let kept = all.iter().find(|view| Some(&*view.name) == kept);
         let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < KEPT_M);
-        Some(kept.unwrap_or(nearest).clone())
+        Some(kept.unwrap_or(nearest).clone().exposed_for(camera))
     }
 
     /// How a camera projects.
@@ -343,7 +379,7 @@ fn name(trajectory: &str, station_m: f64, camera: &str) -> String {
 mod tests {
     use super::*;
     use glam::DQuat;
-    use wildcity_scene::geometry::Camera;
+    use wildcity_scene::appearance::Exposure;
     use wildcity_scene::geometry::camera::Pinhole;
     use wildcity_scene::manifest::ObjectRef;
 
@@ -358,6 +394,7 @@ mod tests {
             world_from_camera: Pose { position_m: DVec3::X, ..Pose::IDENTITY },
             exposure_stops: None,
             image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+            mask: None,
         };
         let at = |x_m: f64, turn_rad: f64| Pose {
             position_m: DVec3::X * x_m,
@@ -374,5 +411,55 @@ mod tests {
             assert_eq!(is_held_out(&view, &[at(9.0, 0.0), at(x_m, turn_rad)]), is_same, "{x_m}");
         }
         assert!(!is_held_out(&view, &[]));
+    }
+
+    fn reference(width_px: u32, focal_px: f64, exposure_stops: Option<f64>) -> ReferenceView {
+        let middle = 0.5 * f64::from(width_px);
+        let pinhole = Pinhole { fx: focal_px, fy: focal_px, cx: middle, cy: middle };
+        recorded(&Arc::new(RecordedView {
+            trajectory: "log".into(),
+            station_m: 2.0,
+            camera_name: "front".into(),
+            camera: Camera::from_pinhole(width_px, width_px, pinhole),
+            world_from_camera: Pose::IDENTITY,
+            exposure_stops,
+            image: ObjectRef { object: "0".repeat(64), bytes: 3 },
+            mask: None,
+        }))
+    }
+
+    #[test]
+    fn a_reference_is_halved_until_it_has_the_resolution_of_the_view() {
+        let view = reference(100, 80.0, None).camera;
+        for (width_px, focal_px, wanted_px) in [
+            (100, 80.0, 100),
+            (50, 40.0, 50),
+            (140, 112.0, 140),
+            (143, 115.0, 72),
+            (200, 160.0, 100),
+            (400, 160.0, 200),
+            (403, 320.0, 101),
+        ] {
+            let reduced = reference(width_px, focal_px, None).reduced_for(&view);
+            assert_eq!(reduced.camera.width_px, wanted_px, "{width_px} px, {focal_px}");
+            let factor = f64::from(wanted_px) / f64::from(width_px);
+            assert!((reduced.camera.pinhole.fx - factor * focal_px).abs() < 1e-9);
+            assert_eq!(reduced.name, "log@2.00/front");
+        }
+        let large = reference(200, 160.0, None);
+        assert_ne!(large.id(), large.clone().reduced_for(&view).id());
+    }
+
+    #[test]
+    fn only_a_known_exposure_is_changed_for_a_camera() {
+        let mut camera = RigCamera::new("front", reference(100, 80.0, None).camera, Pose::IDENTITY);
+        camera.appearance.exposure = Exposure::new(None, Some([0.5; 3]), [0.0; 3]).ok();
+        let known = reference(100, 80.0, Some(-1.0)).exposed_for(&camera);
+        assert_eq!(known.appearance.exposure, camera.appearance.exposure);
+        let unknown = reference(100, 80.0, None).exposed_for(&camera);
+        assert_eq!(unknown.appearance.exposure, None);
+        assert_ne!(known.id(), unknown.id());
+        let hash = blake3::hash(b"");
+        assert_ne!(known.key("v", &hash), unknown.key("v", &hash));
     }
 }

@@ -47,10 +47,10 @@ impl Session {
         builder = found;
         let mut references = HashMap::with_capacity(wanted.len());
         for view in wanted {
-            let name = view.name.clone();
+            let id = view.id();
             let reference = self.reference(version, views, view, deadline);
-            let reference = reference.instrument(debug_span!("reference", name));
-            references.insert(name, reference.await?);
+            let reference = reference.instrument(debug_span!("reference", id));
+            references.insert(id, reference.await?);
         }
         builder.add_references(references, started.elapsed());
         Ok(builder)

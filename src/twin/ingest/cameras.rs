@@ -10,6 +10,7 @@ use serde::de::IgnoredAny;
 use crate::limits;
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::{Camera, CameraError, Pose, PoseError};
+use wildcity_scene::views::MOST_STOPS;
 
 use super::file::{self, FileError};
 use wildcity_scene::rig::MAX_NAME_BYTES;
@@ -31,6 +32,8 @@ pub struct ListedCamera {
     pub mask: Option<String>,
     /// When the image was taken, in microseconds, if the list says so.
     pub time_us: Option<i64>,
+    /// The exposure of the image in stops against the scene's, if the list says one.
+    pub exposure_stops: Option<f64>,
 }
 
 /// Why a camera list was refused.
@@ -91,6 +94,14 @@ pub enum CamerasError {
         /// What is wrong.
         cause: PoseError,
     },
+    /// An exposure that no camera has.
+    #[error("camera {name:?}: exposure_stops is {stops}; give -{most} to {most}", most = MOST_STOPS)]
+    Stops {
+        /// The camera's name.
+        name: String,
+        /// The refused value.
+        stops: f64,
+    },
     /// A field that only cameras of a rig have.
     #[error(
         "camera {name:?}: a camera in a list has no {field}, because it is at rest; leave {field} out, or mount \
@@ -133,6 +144,7 @@ struct Entry {
     image: Option<String>,
     mask: Option<String>,
     time_us: Option<i64>,
+    exposure_stops: Option<f64>,
     position: Option<[f64; 3]>,
     position_ply: Option<[f64; 3]>,
     #[serde(rename = "R_world_to_cam")]
@@ -176,6 +188,10 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     let Entry { name, width, height, fx, fy, cx, cy, lens, windshield, near, image, mask, .. } =
         entry;
     let time_us = entry.time_us;
+    let exposure_stops = entry.exposure_stops;
+    if let Some(stops) = exposure_stops.filter(|stops| !(stops.abs() <= MOST_STOPS)) {
+        return Err(CamerasError::Stops { name, stops });
+    }
     let of_rigs = [
         ("shutter", entry.shutter.is_some()),
         ("exposure", entry.exposure.is_some()),
@@ -217,5 +233,5 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     };
     let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
     let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
-    Ok(ListedCamera { name, camera, world_from_camera, near, image, mask, time_us })
+    Ok(ListedCamera { name, camera, world_from_camera, near, image, mask, time_us, exposure_stops })
 }

@@ -211,8 +211,9 @@ impl Commit {
                 uncached.objects.check_present(&commit.name, &views.object, views.bytes)?;
             }
             for view in uncached.views_of(&manifest)? {
-                let image = &view.image;
-                uncached.objects.check_present(&commit.name, &image.object, image.bytes)?;
+                for image in super::views::objects(&view) {
+                    uncached.objects.check_present(&commit.name, &image.object, image.bytes)?;
+                }
             }
             Ok(HashedManifest { manifest, hash })
         })

@@ -12,7 +12,7 @@ use super::{Catalog, Commit, StoreError, Version};
 use crate::limits;
 
 impl Commit {
-    /// Writes an image, a JPEG or PNG, which [`Commit::put_views`] then names.
+    /// Writes an image or a mask, a JPEG or PNG, which [`Commit::put_views`] then names.
     ///
     /// # Errors
     /// [`StoreError::ViewSize`], or it cannot be written.
@@ -34,7 +34,7 @@ impl Commit {
             object,
             bytes,
             images: views.len() as u64,
-            image_bytes: views.iter().map(|view| view.image.bytes).sum(),
+            image_bytes: views.iter().flat_map(objects).map(|object| object.bytes).sum(),
         })
     }
 }
@@ -61,6 +61,20 @@ impl Catalog {
         self.objects.read_object(twin, &view.image.object, limits::VIEW_IMAGE_BYTES)
     }
 
+    /// Reads the mask of a recorded image, as [`Catalog::view_image`]; `None` if all of its pixels count.
+    ///
+    /// # Errors
+    /// As [`Catalog::view_image`].
+    pub fn view_mask(
+        &self,
+        version: &Version,
+        view: &RecordedView,
+    ) -> Result<Option<Vec<u8>>, StoreError> {
+        let Some(mask) = &view.mask else { return Ok(None) };
+        let twin = &version.manifest.twin;
+        self.objects.read_object(twin, &mask.object, limits::VIEW_IMAGE_BYTES).map(Some)
+    }
+
     pub(super) fn views_of(&self, manifest: &Manifest) -> Result<Vec<RecordedView>, StoreError> {
         let Some(named) = &manifest.views else { return Ok(Vec::new()) };
         let twin = &manifest.twin;
@@ -71,18 +85,25 @@ impl Catalog {
         };
         let views: Vec<RecordedView> =
             serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
-        match views.iter().find(|view| !is_hash(&view.image.object)) {
-            Some(view) => Err(damaged(format!("{:?} is not a hash", view.image.object))),
+        let wrong = views.iter().flat_map(objects).find(|object| !is_hash(&object.object));
+        match wrong.map(|object| object.object.clone()) {
+            Some(object) => Err(damaged(format!("{object:?} is not a hash"))),
             None => Ok(views),
         }
     }
 
-    /// The objects of a manifest's recorded images: the table and each image.
+    /// The objects of a manifest's recorded images: the table, and each image and mask.
     pub(super) fn view_objects(&self, manifest: &Manifest) -> Result<BTreeSet<String>, StoreError> {
-        let images = self.views_of(manifest)?.into_iter().map(|view| view.image.object);
+        let views = self.views_of(manifest)?;
+        let images = views.iter().flat_map(objects).map(|object| object.object.clone());
         let table = manifest.views.iter().map(|views| views.object.clone());
         Ok(images.chain(table).collect())
     }
+}
+
+/// The image of a view, and its mask.
+pub(super) fn objects(view: &RecordedView) -> impl Iterator<Item = &ObjectRef> {
+    [Some(&view.image), view.mask.as_ref()].into_iter().flatten()
 }
 
 /// The views after the world was turned, moved and scaled.

@@ -36,7 +36,7 @@ pub(crate) struct ObservationRepair {
     candidates: Vec<Candidate>,
     /// The memory of the candidates.
     share: Option<BudgetShare>,
-    /// The references of the candidates, by their names.
+    /// The references of the candidates, by [`ReferenceView::id`].
     references: HashMap<String, Arc<Reference>>,
 }
 
@@ -52,10 +52,10 @@ struct Candidate {
     raw_at: Option<usize>,
     view: View,
     world_from_rig: Pose,
-    /// Names of the references that are brought into it, in order.
-    around: Vec<String>,
-    /// Name of the reference of the same camera.
-    nearest: Option<String>,
+    /// The references that are brought into it, in order.
+    around: Vec<ReferenceView>,
+    /// The reference of the same camera.
+    nearest: Option<ReferenceView>,
 }
 
 /// A capture that is rendered.
@@ -162,13 +162,15 @@ impl Candidate {
     ) -> Beside {
         let mut beside = Beside::default();
         if session.needs_reference()
-            && let Some(name) = &self.nearest
-            && let Some(reference) = references.get(name)
+            && let Some(nearest) = &self.nearest
+            && let Some(reference) = references.get(&nearest.id())
         {
-            beside.set_reference(name, reference, &camera.camera);
+            beside.set_reference(&nearest.name, reference, &camera.camera);
         }
         if session.needs_warped() {
-            let named = |name: &String| Some((name.clone(), references.get(name)?.clone()));
+            let named = |view: &ReferenceView| {
+                Some((view.name.clone(), references.get(&view.id())?.clone()))
+            };
             let around: Vec<(String, Arc<Reference>)> =
                 self.around.iter().filter_map(named).collect();
             let rays = session.rays(self.camera, camera);
@@ -213,9 +215,9 @@ impl ObservationBuilder {
         let Some(repair) = &mut self.repair else { return Vec::new() };
         let session = repair.session.clone();
         let mut wanted: Vec<ReferenceView> = Vec::new();
-        let mut want = |view: ReferenceView| {
-            if wanted.iter().all(|other| other.name != view.name) {
-                wanted.push(view);
+        let mut want = |view: &ReferenceView| {
+            if wanted.iter().all(|other| other.id() != view.id()) {
+                wanted.push(view.clone());
             }
         };
         for candidate in repair.candidates.iter_mut().filter(|candidate| candidate.is_chosen) {
@@ -225,24 +227,22 @@ impl ObservationBuilder {
                 let Candidate { view, image, .. } = &*candidate;
                 let rays = session.rays(candidate.camera, camera);
                 let sight = Sight { camera, rays, view, image };
-                let around = sight.overlapping(views.around(world_from_rig));
-                candidate.around = around.iter().map(|view| view.name.clone()).collect();
-                around.into_iter().for_each(&mut want);
+                candidate.around = sight.overlapping(views.around(world_from_rig));
+                candidate.around.iter().for_each(&mut want);
             }
             if session.needs_reference() {
                 let world_from_camera = &candidate.view.world_from_camera;
                 // A pose that the ego is not at has no history.
                 let kept = repair.state.references[candidate.camera].as_deref();
                 let kept = kept.filter(|_| repair.has_history);
-                let nearest = views.nearest(&camera.name, world_from_camera, world_from_rig, kept);
-                candidate.nearest = nearest.as_ref().map(|view| view.name.clone());
-                nearest.into_iter().for_each(&mut want);
+                candidate.nearest = views.nearest(camera, world_from_camera, world_from_rig, kept);
+                candidate.nearest.iter().for_each(&mut want);
             }
         }
         wanted
     }
 
-    /// Adds references by their names, and how long reading and drawing them took.
+    /// Adds references by [`ReferenceView::id`], and how long reading and drawing them took.
     pub(crate) fn add_references(
         &mut self,
         references: HashMap<String, Arc<Reference>>,
@@ -281,7 +281,7 @@ impl ObservationBuilder {
                         status = RepairStatus::Repaired;
                         names = beside.names;
                         pixels = repaired;
-                        repair.state.references[camera].clone_from(&candidate.nearest);
+                        repair.state.references[camera] = beside.nearest;
                     }
                     Err(cause) if session.on_failure == OnFailure::Error => {
                         let camera = mounted.name.clone();

@@ -12,6 +12,7 @@ use serde_json::Value;
 
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::views::MOST_STOPS;
 
 use super::{CaptureError, Place, PosedImage, rotation_of};
 use crate::ingest::file::read_whole;
@@ -31,6 +32,7 @@ struct Frame {
     transform_matrix: Vec<Vec<f64>>,
     mask_path: Option<String>,
     time_us: Option<i64>,
+    exposure_stops: Option<f64>,
     #[serde(flatten)]
     intrinsics: Intrinsics,
 }
@@ -44,6 +46,8 @@ pub struct FrameImage {
     pub mask: Option<String>,
     /// When it was taken (`time_us`), in microseconds, if the file says so.
     pub time_us: Option<i64>,
+    /// Its exposure (`exposure_stops`) in stops against the scene's, if the file says so.
+    pub exposure_stops: Option<f64>,
 }
 
 /// Numbers of a camera, by their names in the file.
@@ -81,8 +85,14 @@ pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
     let frames = file.frames.into_iter().enumerate();
     let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
-        let time_us = frame.time_us;
-        Ok(FrameImage { posed: posed(path, index, frame, &file.intrinsics)?, mask, time_us })
+        let Frame { time_us, exposure_stops, .. } = frame;
+        if let Some(stops) = exposure_stops.filter(|stops| !(stops.abs() <= MOST_STOPS)) {
+            let place = Place::Field(format!("frames[{index}].exposure_stops"));
+            let reason = format!("{stops}; give -{MOST_STOPS} to {MOST_STOPS}");
+            return Err(CaptureError::at(path, place, reason));
+        }
+        let posed = posed(path, index, frame, &file.intrinsics)?;
+        Ok(FrameImage { posed, mask, time_us, exposure_stops })
     };
     frames.map(read).collect()
 }

@@ -1,0 +1,67 @@
+//! What the command says of an evaluation.
+
+use std::io::{self, Write};
+
+use wildcity_eval::{Extrapolation, Gain, LidarMeans, Means, ScoreMeans};
+
+pub(super) fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()> {
+    let images = means.images;
+    print_scores(out, &format!("mean of {images} images"), &means.rendered)?;
+    if let Some(repaired) = &means.repaired {
+        print_scores(out, "repaired", repaired)?;
+    }
+    if let Some(lidar) = &means.lidar {
+        let LidarMeans { points, mean_m, median_m, .. } = lidar;
+        writeln!(
+            out,
+            "depth against {points} LiDAR points: mean {mean_m:.3} m, median {median_m:.3} m"
+        )?;
+    }
+    if let Some(gain) = &means.gain {
+        let Gain { psnr_db, ssim, flip, .. } = gain;
+        writeln!(out, "gain: PSNR {psnr_db:+.2} dB, SSIM {ssim:+.4}, FLIP {flip:+.4}")?;
+    }
+    Ok(())
+}
+
+fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Result<()> {
+    let ScoreMeans { psnr_db, ssim, ssim_mirrored, flip, .. } = means;
+    let psnr = decibels(*psnr_db);
+    writeln!(
+        out,
+        "{what}: PSNR {psnr}, SSIM {ssim:.4} (mirrored edges: {ssim_mirrored:.4}), FLIP {flip:.4}"
+    )?;
+    if let Some(lpips) = means.lpips {
+        writeln!(out, "  LPIPS {lpips:.4}")?;
+    }
+    if let Some(aligned) = &means.aligned {
+        let psnr = decibels(aligned.psnr_db);
+        writeln!(out, "with aligned exposure: PSNR {psnr}, SSIM {:.4}", aligned.ssim)?;
+    }
+    Ok(())
+}
+
+pub(super) fn print_beside(out: &mut impl Write, one: &Extrapolation) -> io::Result<()> {
+    let Extrapolation { offset_m, trust, covered, .. } = one;
+    writeln!(
+        out,
+        "{offset_m} m beside the drive: trust {trust:.2}, covered {:.1} %",
+        100.0 * covered
+    )?;
+    let means = [("rendered", Some(&one.rendered)), ("repaired", one.repaired.as_ref())];
+    for (what, means) in means {
+        let Some(means) = means else { continue };
+        writeln!(
+            out,
+            "  {what}: reprojection {} ({:.1} % came back), flicker {:.4}",
+            decibels(means.reprojection_psnr_db),
+            100.0 * means.reprojection_share,
+            means.flicker
+        )?;
+    }
+    Ok(())
+}
+
+pub(super) fn decibels(db: f64) -> String {
+    if db == f64::INFINITY { "exact".to_owned() } else { format!("{db:.2} dB") }
+}
