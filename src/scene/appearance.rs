@@ -12,8 +12,6 @@ use image::imageops::{FilterType, resize};
 use image::{ExtendedColorType, ImageEncoder, ImageFormat, ImageReader, Rgba, Rgba32FImage};
 use serde::{Deserialize, Serialize};
 
-use crate::srgb::{linear_from_stored, stored_from_linear};
-
 /// Per-camera changes to a rendered image: first the exposure, then the overlay.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Appearance {
@@ -100,33 +98,14 @@ impl Exposure {
 }
 
 impl Exposure {
-    /// Twice as bright for each stop.
-    pub fn of_stops(stops: f64) -> Self {
-        let gain = stops.exp2();
-        let matrix = [[gain, 0.0, 0.0], [0.0, gain, 0.0], [0.0, 0.0, gain]];
-        Self { matrix, offset: [0.0; 3] }
-    }
-
-    /// This one, applied to what another one gives.
-    #[must_use]
-    pub fn after(&self, first: &Self) -> Self {
-        let apply = |row: [f64; 3], to: [f64; 3]| row[0] * to[0] + row[1] * to[1] + row[2] * to[2];
-        let column = |c: usize| [0, 1, 2].map(|r| first.matrix[r][c]);
-        let matrix = self.matrix.map(|row| [0, 1, 2].map(|c| apply(row, column(c))));
-        let offset = [0, 1, 2].map(|r| apply(self.matrix[r], first.offset) + self.offset[r]);
-        Self { matrix, offset }
-    }
-
-    /// Changes an image, `[height, width, 3]` in 8 bits of sRGB.
+    /// Changes an image, `[height, width, 3]` in 8 bits, as the renderer changes its colours.
     pub fn change_rgb8(&self, rgb8: &mut [u8]) {
-        let linear: Vec<f64> =
-            (0..=255_u8).map(|byte| linear_from_stored(f64::from(byte) / 255.0)).collect();
         for pixel in rgb8.chunks_exact_mut(3) {
-            let before = [0, 1, 2].map(|channel| linear[usize::from(pixel[channel])]);
+            let before = [0, 1, 2].map(|channel| f64::from(pixel[channel]) / 255.0);
             for (channel, out) in pixel.iter_mut().enumerate() {
                 let [r, g, b] = self.matrix[channel];
                 let value = r * before[0] + g * before[1] + b * before[2] + self.offset[channel];
-                *out = (255.0 * stored_from_linear(value.clamp(0.0, 1.0))).round() as u8;
+                *out = (255.0 * value.clamp(0.0, 1.0)).round() as u8;
             }
         }
     }
@@ -352,22 +331,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exposures_are_applied_in_linear_light_one_after_the_other() {
-        let mut rgb8 = [0, 10, 128, 188, 255, 255];
-        Exposure::of_stops(-1.0).change_rgb8(&mut rgb8);
-        // 188 is half of 255 in linear light.
-        assert_eq!(rgb8, [0, 5, 92, 137, 188, 188]);
-        let mut bright = [188, 60, 255];
-        Exposure::of_stops(1.0).change_rgb8(&mut bright);
-        assert_eq!(bright, [255, 85, 255]);
+    fn an_exposure_changes_the_colours_of_an_image() {
         let swap = Exposure {
             matrix: [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 2.0]],
-            offset: [0.1, 0.0, 0.0],
+            offset: [0.2, 0.0, 0.0],
         };
-        let first = Exposure { matrix: swap.matrix, offset: [0.0, 0.2, 0.4] };
-        let both = swap.after(&first);
-        assert_eq!(both.matrix, [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 4.0]]);
-        assert_eq!(both.offset.map(|value| (value * 10.0_f64).round()), [3.0, 0.0, 8.0]);
+        let mut rgb8 = [10, 100, 60, 0, 255, 200];
+        swap.change_rgb8(&mut rgb8);
+        assert_eq!(rgb8, [151, 10, 120, 255, 0, 255]);
     }
 
     #[test]

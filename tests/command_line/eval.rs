@@ -405,22 +405,22 @@ fn an_image_whose_exposure_is_known_is_compared_in_it() {
     let at = dir.path();
     let path = at.join("images/front/a.png");
     let mut image = image::open(&path).unwrap().into_rgb8();
-    wildcity_scene::appearance::Exposure::of_stops(-1.0).change_rgb8(&mut image);
+    wildcity_scene::srgb::change_stops(&mut image, -1.0);
     image.save(&path).unwrap();
     let db = |images: &str| {
         let (_, made) = eval(at, "scene.ply", images, &[]);
-        made["images"][0]["psnr_db"].as_f64().unwrap()
+        made["images"][0]["psnr_db"].clone()
     };
-    let unknown = db("views.jsonl");
+    assert!(db("views.jsonl").as_f64().unwrap() < 30.0);
     let list = fs::read_to_string(at.join("views.jsonl")).unwrap();
     let known = list.replacen("{", "{\"exposure_stops\": -1, ", 1);
     fs::write(at.join("known.jsonl"), known).unwrap();
-    let found = db("known.jsonl");
-    // Twice rounded to 8 bits.
-    assert!(found > 50.0 && unknown < 30.0, "{found} {unknown}");
+    assert_eq!(db("known.jsonl"), "inf");
     let frames = transforms(&json!({"exposure_stops": -1}));
     fs::write(at.join("transforms.json"), frames).unwrap();
-    assert!((db("transforms.json") - found).abs() < 1e-6);
+    // The poses of the two lists differ in their last bits.
+    let frames_db = db("transforms.json");
+    assert!(frames_db == "inf" || frames_db.as_f64().unwrap() > 50.0, "{frames_db}");
     let frames = transforms(&json!({"exposure_stops": -17}));
     fs::write(at.join("transforms.json"), frames).unwrap();
     let said = refused(at, &["eval", "scene.ply", "--images", "transforms.json"]);

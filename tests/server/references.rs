@@ -290,7 +290,7 @@ async fn recorded_images_are_warped_and_replayed() {
     assert_eq!(opened["repair"]["references"], "recorded");
     let before = wall.views.load(Ordering::SeqCst);
     let seen = step(&mut agent, 2.0).await;
-    // 2.5 m is the nearest to each place.
+    // 2.5 m is within 1.5 m of the place 0.5 m behind the rig, and of no other.
     let wanted = expected(24, 2.0, Some([200, 10, 90]), &[2.5]);
     assert_eq!(pixels(&seen, "left"), wanted);
     assert!(wanted.chunks(3).filter(|pixel| *pixel == [200, 10, 90]).count() > 150);

@@ -13,6 +13,7 @@ use wildcity_repair::reference::{
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::srgb::change_stops;
 use wildcity_session::RenderedImage;
 
 use super::drive::{DrivePlace, Drives};
@@ -61,6 +62,8 @@ pub(super) struct OnDrive<'a> {
     pub(super) name: &'a str,
     pub(super) camera: &'a RigCamera,
     pub(super) lens: &'a Lens,
+    /// Exposure of the real image in stops against the twin's, if it is known.
+    pub(super) exposure_stops: Option<f64>,
     pub(super) view: &'a View,
     pub(super) profile: &'a RenderProfile,
     pub(super) truth: &'a [u8],
@@ -220,7 +223,7 @@ fn draw(
     let Tools { renderer, repairer, drives } = tools;
     let view = View::new(image.view.camera, moved(&image.view.world_from_camera));
     let world_from_rig = moved(&place.world_from_rig);
-    let mut rendered = renderer.render(&view, image.profile, &image.camera.appearance)?;
+    let mut rendered = renderer.render(&view, image.profile)?;
     rendered.trust = drives.trust(&world_from_rig, &view, &rendered);
     let placed = PlacedImage {
         camera: image.camera,
@@ -232,7 +235,11 @@ fn draw(
         kept,
     };
     let repaired = repairer.map(|repairer| repairer.repair(renderer, &placed)).transpose()?;
-    let (repaired, nearest) = repaired.map(|it| (it.rgb8, it.nearest)).unzip();
+    let (mut repaired, nearest) = repaired.map(|it| (it.rgb8, it.nearest)).unzip();
+    if let Some(stops) = image.exposure_stops {
+        change_stops(&mut rendered.rgb8, stops);
+        repaired.iter_mut().for_each(|rgb8: &mut Vec<u8>| change_stops(rgb8, stops));
+    }
     Ok(Drawn { view, rendered, repaired, nearest: nearest.flatten() })
 }
 

@@ -17,10 +17,10 @@ use wildcity_eval::{EvaluatedImage, Evaluation, Pair, PairScores, Subject, Thumb
 use wildcity_render::View;
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
-use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::RigCamera;
+use wildcity_scene::srgb::change_stops;
 use wildcity_session::RenderedImage;
 
 use self::beside::{Beside, BesideImage, Lens, Offsets, OnDrive, Tools};
@@ -255,13 +255,14 @@ impl Eval {
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
         let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
-        let mounted = rig.and_then(|rig| rig.cameras.iter().find(|one| one.name == camera_name));
-        let exposure = image.exposure().or(mounted.and_then(|one| one.appearance.exposure));
-        let shown = RigCamera {
-            appearance: Appearance { exposure, overlay: None },
-            ..RigCamera::new(camera_name, camera, Pose::IDENTITY)
+        let shown = RigCamera::new(camera_name, camera, Pose::IDENTITY);
+        let mut rendered = renderer.render(&view, &profile)?;
+        // A model repairs in the exposure of the twin; compared is in that of the real image.
+        let exposed = |mut rgb8: Vec<u8>| {
+            image.exposure_stops.iter().for_each(|stops| change_stops(&mut rgb8, *stops));
+            rgb8
         };
-        let mut rendered = renderer.render(&view, &profile, &shown.appearance)?;
+        let rendered_rgb8 = exposed(rendered.rgb8.clone());
         let needs_lens = repairer.is_some() || self.extrapolate.is_some();
         let lens = needs_lens.then(|| Lens::of(&camera));
         let mask = own_vehicle::both(mask, own_vehicle::outside(rig, camera_name, size_px));
@@ -277,9 +278,9 @@ impl Eval {
         }
         let covered = covered(&rendered);
         let lpips = |rgb8: &[u8]| networks.lpips(size_px, rgb8, &truth, counts.as_deref());
-        let pair = Pair::new(size_px, truth.clone(), rendered.rgb8.clone(), counts.clone())?;
+        let pair = Pair::new(size_px, truth.clone(), rendered_rgb8.clone(), counts.clone())?;
         let mut compared = PairScores::of(&pair, self.align_exposure);
-        compared.scores.lpips = lpips(&rendered.rgb8)?;
+        compared.scores.lpips = lpips(&rendered_rgb8)?;
         if self.save_images {
             self.save(&image.name, ["rendered", "errors"], &pair, &compared.error_map)?;
         }
@@ -306,7 +307,7 @@ impl Eval {
                 profile: &profile,
                 kept: None,
             };
-            let repaired = repairer.repair(renderer, &placed)?.rgb8;
+            let repaired = exposed(repairer.repair(renderer, &placed)?.rgb8);
             let pair = Pair::new(size_px, truth.clone(), repaired.clone(), counts.clone())?;
             let mut compared = PairScores::of(&pair, self.align_exposure);
             compared.scores.lpips = lpips(&repaired)?;
@@ -326,6 +327,7 @@ impl Eval {
         scores.thumbnails = Some(thumbnails);
         let repaired = repaired_rgb8;
         let camera = shown;
+        rendered.rgb8 = rendered_rgb8;
         Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
     }
 
@@ -347,6 +349,7 @@ impl Eval {
             name: &image.name,
             camera: &compared.camera,
             lens,
+            exposure_stops: image.exposure_stops,
             view: &compared.view,
             profile: &compared.profile,
             truth: &compared.truth,

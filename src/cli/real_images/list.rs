@@ -7,7 +7,6 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use wildcity_scene::align::PosedImage;
-use wildcity_scene::appearance::Exposure;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::ingest::{self, cameras, capture};
 
@@ -26,13 +25,6 @@ pub(in crate::cli) struct RealImage {
     pub(in crate::cli) time_us: Option<i64>,
     /// Its exposure in stops against the scene's, if the list says so.
     pub(in crate::cli) exposure_stops: Option<f64>,
-}
-
-impl RealImage {
-    /// Its exposure: twice as bright, in linear light, for each stop.
-    pub(in crate::cli) fn exposure(&self) -> Option<Exposure> {
-        self.exposure_stops.map(Exposure::of_stops)
-    }
 }
 
 /// Real images, in the order of their names.

@@ -65,7 +65,7 @@ mod tests {
         let whole = outside(Some(&rig), &name, [8, 4]).unwrap();
         assert_eq!(whole, [vec![true; 16], vec![false; 16]].concat());
         assert_eq!(outside(Some(&rig), &name, [4, 3]), None, "another shape");
-        assert_eq!(outside(Some(&rig), "nobody", [4, 2]), None);
+        assert_eq!(outside(Some(&rig), "unknown", [4, 2]), None);
         assert_eq!(outside(None, &name, [4, 2]), None);
     }
 

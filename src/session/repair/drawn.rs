@@ -9,11 +9,11 @@ use wildcity_repair::Image;
 use wildcity_repair::reference::{
     LEAST_OPACITY, Projection, Rays, Reference, WarpTarget, opaque_depth, overlaps, resized, warp,
 };
-use wildcity_scene::appearance::Exposure;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::manifest::ObjectRef;
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::views::{RecordedView, reduced_mask};
+use wildcity_scene::srgb::change_stops;
+use wildcity_scene::views::reduced_mask;
 use wildcity_scene::{RenderProfile, Scene};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
@@ -137,9 +137,10 @@ pub(crate) fn read(
     let size_px = [view.camera.width_px, view.camera.height_px];
     let mut image = resized(&image, size_px[0] as usize, size_px[1] as usize);
     if let Some(stops) = recorded.exposure_stops {
-        let own = Exposure::of_stops(-stops);
-        let exposure = view.appearance.exposure.map_or(own, |wanted| wanted.after(&own));
-        exposure.change_rgb8(&mut image.rgb8);
+        change_stops(&mut image.rgb8, -stops);
+        if let Some(exposure) = &view.appearance.exposure {
+            exposure.change_rgb8(&mut image.rgb8);
+        }
     }
     let mask = catalog.view_mask(version, recorded)?.zip(recorded.mask.as_ref());
     let counts = match mask {

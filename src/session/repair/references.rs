@@ -23,8 +23,8 @@ use wildcity_twin::store::Version;
 /// Places along the drive, from the rig's, in metres.
 const OFFSETS_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
-/// An image counts for a place if it is at most so far from it, in metres: so a place has one if they are 12 m apart or less.
-const WITHIN_M: f64 = 6.0;
+/// An image is at a place if it is at most so far from it, in metres.
+const WITHIN_M: f64 = 1.5;
 
 /// Distance between the places where a twin without recorded images is drawn, in metres.
 const STEP_M: f64 = 2.0;
@@ -453,7 +453,7 @@ mod tests {
     #[test]
     fn only_a_known_exposure_is_changed_for_a_camera() {
         let mut camera = RigCamera::new("front", reference(100, 80.0, None).camera, Pose::IDENTITY);
-        camera.appearance.exposure = Some(Exposure::of_stops(0.5));
+        camera.appearance.exposure = Exposure::new(None, Some([0.5; 3]), [0.0; 3]).ok();
         let known = reference(100, 80.0, Some(-1.0)).exposed_for(&camera);
         assert_eq!(known.appearance.exposure, camera.appearance.exposure);
         let unknown = reference(100, 80.0, None).exposed_for(&camera);

@@ -189,7 +189,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         entry;
     let time_us = entry.time_us;
     let exposure_stops = entry.exposure_stops;
-    if let Some(stops) = exposure_stops.filter(|stops| !(stops.abs() <= MOST_STOPS)) {
+    if let Some(stops) = exposure_stops.filter(|stops| !(-MOST_STOPS..=MOST_STOPS).contains(stops))
+    {
         return Err(CamerasError::Stops { name, stops });
     }
     let of_rigs = [

@@ -86,7 +86,9 @@ pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
     let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
         let Frame { time_us, exposure_stops, .. } = frame;
-        if let Some(stops) = exposure_stops.filter(|stops| !(stops.abs() <= MOST_STOPS)) {
+        if let Some(stops) =
+            exposure_stops.filter(|stops| !(-MOST_STOPS..=MOST_STOPS).contains(stops))
+        {
             let place = Place::Field(format!("frames[{index}].exposure_stops"));
             let reason = format!("{stops}; give -{MOST_STOPS} to {MOST_STOPS}");
             return Err(CaptureError::at(path, place, reason));
