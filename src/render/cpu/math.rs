@@ -3,8 +3,6 @@
 
 use fearless_simd::{f32x16, i32x16, prelude::*};
 
-use super::lanes::splats;
-
 /// The arc sine, within 2e-7 on [-1, 1].
 ///
 /// Up to 1/2 it is the polynomial of Cephes' `asinf` (Moshier); beyond, `π/2 - 2 asin √((1 - x)/2)`.
@@ -62,43 +60,25 @@ pub(super) fn log2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
     (t * series).mul_add(splat(std::f64::consts::LOG2_E), exponent)
 }
 
-/// The minimax fit of degree 5 to `2^f` on [0, 1) in relative error (8e-8), of those with value 1 at 0: from degree 5 to
-/// degree 0.
-pub(super) const EXP2_TERMS: [f32; 6] =
-    [1.867_130_2e-3, 9.017_03e-3, 5.579_991_3e-2, 2.401_644_4e-1, 6.931_513e-1, 1.0];
-
-/// `2^x`, with its coefficients in registers.
-#[derive(Clone, Copy)]
-pub(super) struct Exp2<S: Simd> {
-    terms: [f32x16<S>; 6],
-}
-
-impl<S: Simd> Exp2<S> {
-    /// From [`EXP2_TERMS`].
-    #[inline(always)]
-    pub(super) fn new(simd: S, terms: &[f32; 6]) -> Self {
-        Self { terms: splats(simd, *terms) }
-    }
-
-    /// `2^x` for x in [-126, 0], within 2e-7, and exact for whole x. Elsewhere the result is arbitrary, and the
-    /// call is safe.
-    ///
-    /// `2^x = 2^whole 2^f`: the whole part is added to the exponent's bits of a polynomial of the fraction f.
-    #[inline(always)]
-    pub(super) fn at(&self, x: f32x16<S>) -> f32x16<S> {
-        let [fifth, fourth, third, second, first, one] = self.terms;
-        let whole = x.floor();
-        let f = x - whole;
-        let power = f
-            .mul_add(fifth, fourth)
-            .mul_add(f, third)
-            .mul_add(f, second)
-            .mul_add(f, first)
-            .mul_add(f, one);
-        let whole: i32x16<S> = whole.to_int();
-        let power: i32x16<S> = power.bitcast();
-        (power + (whole << 23)).bitcast()
-    }
+/// `2^x` for x in [-126, 0], within 2e-7, and exact for whole x. Elsewhere the result is arbitrary, and the
+/// call is safe.
+///
+/// `2^x = 2^whole 2^f`: the whole part is added to the exponent's bits. The polynomial of the fraction f is
+/// the minimax fit of degree 5 to `2^f` on [0, 1) in relative error (8e-8), of those with value 1 at 0.
+#[inline(always)]
+pub(super) fn exp2<S: Simd>(simd: S, x: f32x16<S>) -> f32x16<S> {
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let whole = x.floor();
+    let f = x - whole;
+    let power = f
+        .mul_add(splat(1.867_130_2e-3), splat(9.017_03e-3))
+        .mul_add(f, splat(5.579_991_3e-2))
+        .mul_add(f, splat(2.401_644_4e-1))
+        .mul_add(f, splat(6.931_513e-1))
+        .mul_add(f, splat(1.0));
+    let whole: i32x16<S> = whole.to_int();
+    let power: i32x16<S> = power.bitcast();
+    (power + (whole << 23)).bitcast()
 }
 
 #[cfg(test)]
@@ -125,7 +105,7 @@ mod tests {
         for i in 0..=16_000 {
             let x = -8.0 * i as f32 / 16_000.0;
             let power = dispatch!(Level::new(), simd => {
-                Exp2::new(simd, &EXP2_TERMS).at(f32x16::splat(simd, x)).to_array()[0]
+                exp2(simd, f32x16::splat(simd, x)).to_array()[0]
             });
             let error = f64::from(power) / f64::from(x).exp2() - 1.0;
             assert!(error.abs() < 2e-7, "2^{x} is {power}, off by {error:e}");

@@ -8,17 +8,15 @@
 //! with vector compares. Each block then takes the splats of its 64 bits in order, with all its sums in
 //! registers. Building a list per block instead of transposing bits cost 25 % of the whole stage.
 
-use std::hint::black_box;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-use fearless_simd::{Level, dispatch, f32x16, mask32x16, prelude::*, u16x32};
+use fearless_simd::{Level, dispatch, f32x16, prelude::*, u16x32};
 use rayon::prelude::*;
 
 use super::appearance;
 use super::background::Background;
 use super::bin::{Bins, Grid};
-use super::lanes::splats;
-use super::math::{EXP2_TERMS, Exp2};
+use super::math::exp2;
 use super::project::Projected;
 use super::resolve::{self, BLOCKS, Band, HalvedBy, NOT_HALVED, TileSums};
 use crate::constants::{BLOCK_PX, TILE_PX};
@@ -28,9 +26,6 @@ use wildcity_scene::chunk::LANES;
 
 /// Splats of a batch: 64 of 308 B stay in the first-level cache beside the sums, and their bits in one u64.
 const BATCH: usize = 64;
-
-/// Index of an entry after a batch that is no splat: its alpha is 0 everywhere. It is the number of trailing zeros of 0.
-const NOTHING: usize = BATCH;
 
 /// The outputs of the stages before.
 #[derive(Clone, Copy)]
@@ -91,14 +86,11 @@ struct Matched {
 /// A batch of splats, and which of them touch each block.
 struct Batch {
     splats: [Splat; BATCH],
-    /// Of each splat, and [`NOTHING`].
-    matched: [Matched; BATCH + 1],
+    matched: [Matched; BATCH],
     /// For each splat, a bit for each block that it touches.
     blocks: [u16; BATCH],
     /// For each block, a bit for each splat that touches it.
     touching: [u64; BLOCKS],
-    /// A bit for each block that a splat touches.
-    touched: u16,
     /// The place of each splat. Only written if instances are wanted.
     places: [u32; BATCH],
 }
@@ -112,13 +104,11 @@ struct Wants {
 
 impl Default for Batch {
     fn default() -> Self {
-        let nothing = Matched { log2_opacity: f32::MIN, ..Matched::default() };
         Self {
             splats: [Splat::default(); BATCH],
-            matched: [nothing; BATCH + 1],
+            matched: [Matched::default(); BATCH],
             blocks: [0; BATCH],
             touching: [0; BLOCKS],
-            touched: 0,
             places: [0; BATCH],
         }
     }
@@ -142,7 +132,6 @@ fn rasterize_band<S: Simd>(
     band: &mut Band<'_>,
 ) -> u64 {
     let mut batch = Batch::default();
-    let numbers = BlendNumbers::new(input.cutoffs);
     let background = input.backgrounds.get(view);
     let mut scratch = background.and_then(Background::scratch);
     let wants = Wants { depth: band.wants_depth(), instances: band.wants_instances() };
@@ -153,7 +142,7 @@ fn rasterize_band<S: Simd>(
         let at_px = [column * TILE_PX, row as u32 * TILE_PX];
         let mut sums = TileSums::default();
         let mut output = TileOutput { sums: &mut sums, halved_by: &mut halved_by, wants };
-        evaluations += rasterize_tile(simd, input, &numbers, tile, at_px, &mut batch, &mut output);
+        evaluations += rasterize_tile(simd, input, tile, at_px, &mut batch, &mut output);
         if wants.instances {
             band.write_instances(&halved_by, at_px[0], input.projected);
             halved_by = NOT_HALVED;
@@ -174,7 +163,6 @@ fn rasterize_band<S: Simd>(
 fn rasterize_tile<S: Simd>(
     simd: S,
     input: Input<'_>,
-    numbers: &BlendNumbers,
     tile: &[u32],
     at_px: [u32; 2],
     batch: &mut Batch,
@@ -190,70 +178,34 @@ fn rasterize_tile<S: Simd>(
                 *to = *place;
             }
         }
-        evaluations += match output.wants {
-            Wants { depth: false, instances: false } => {
-                blend_blocks::<S, false, false>(simd, numbers, batch, &mut live, output)
+        for block in 0..BLOCKS {
+            let touching = batch.touching[block];
+            if touching == 0 || live >> block & 1 == 0 {
+                continue;
             }
-            Wants { depth: true, instances: false } => {
-                blend_blocks::<S, true, false>(simd, numbers, batch, &mut live, output)
-            }
-            Wants { depth: false, instances: true } => {
-                blend_blocks::<S, false, true>(simd, numbers, batch, &mut live, output)
-            }
-            Wants { depth: true, instances: true } => {
-                blend_blocks::<S, true, true>(simd, numbers, batch, &mut live, output)
-            }
-        };
+            let cutoffs = input.cutoffs;
+            let (stopped, count) = match output.wants {
+                Wants { depth: false, instances: false } => {
+                    blend::<S, false, false>(simd, batch, touching, block, cutoffs, output)
+                }
+                Wants { depth: true, instances: false } => {
+                    blend::<S, true, false>(simd, batch, touching, block, cutoffs, output)
+                }
+                Wants { depth: false, instances: true } => {
+                    blend::<S, false, true>(simd, batch, touching, block, cutoffs, output)
+                }
+                Wants { depth: true, instances: true } => {
+                    blend::<S, true, true>(simd, batch, touching, block, cutoffs, output)
+                }
+            };
+            live &= !(u16::from(stopped) << block);
+            evaluations += count as u64 * LANES as u64;
+        }
         if live == 0 {
             break;
         }
     }
     evaluations
-}
-
-/// Blends a batch over all blocks that it touches and that are live. Returns the number of evaluations.
-#[inline(always)]
-fn blend_blocks<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
-    simd: S,
-    numbers: &BlendNumbers,
-    batch: &Batch,
-    live: &mut u16,
-    output: &mut TileOutput<'_>,
-) -> u64 {
-    let mut touched = *live & batch.touched;
-    let mut blended = 0;
-    // In pairs, as far as that goes.
-    let mut touching = batch.touching;
-    let mut single = touched;
-    if <S::f32s as SimdBase<S>>::LEN == LANES && !INSTANCES {
-        while touched & touched.wrapping_sub(1) != 0 {
-            let a = touched.trailing_zeros() as usize % BLOCKS;
-            touched &= touched - 1;
-            let b = touched.trailing_zeros() as usize % BLOCKS;
-            touched &= touched - 1;
-            let before = touching[a].count_ones() + touching[b].count_ones();
-            let lists = [touching[a], touching[b]];
-            let pair = blend_two::<S, DEPTH>(simd, numbers, batch, lists, [a, b], output);
-            let (stopped, rest) = pair;
-            *live &= !(u16::from(stopped[0]) << a | u16::from(stopped[1]) << b);
-            blended += before - rest[0].count_ones() - rest[1].count_ones();
-            [touching[a], touching[b]] = rest;
-            let ended = |k: usize| u16::from(stopped[k] || rest[k] == 0);
-            single &= !(ended(0) << a | ended(1) << b);
-        }
-    }
-    // One by one.
-    while single != 0 {
-        let block = single.trailing_zeros() as usize % BLOCKS;
-        single &= single - 1;
-        let before = touching[block].count_ones();
-        let list = touching[block];
-        let (stopped, rest) =
-            blend::<S, DEPTH, INSTANCES>(simd, numbers, batch, list, block, output);
-        *live &= !(u16::from(stopped) << block);
-        blended += before - rest.count_ones();
-    }
-    u64::from(blended) * LANES as u64
 }
 
 /// Reads a batch of splats, and finds which of them touch each block of the tile.
@@ -316,176 +268,80 @@ fn match_batch<S: Simd>(
     let (low, high) = batch.blocks.split_at(BATCH / 2);
     let low = u16x32::from_slice(simd, low);
     let high = u16x32::from_slice(simd, high);
-    batch.touched = 0;
     for (block, touching) in batch.touching.iter_mut().enumerate() {
         let bit = u16x32::splat(simd, 1 << block);
         let low = (low & bit).simd_eq(bit).to_bitmask();
         let high = (high & bit).simd_eq(bit).to_bitmask();
         *touching = low | high << (BATCH / 2);
-        batch.touched |= u16::from(*touching != 0) << block;
     }
 }
 
-/// The thresholds of blending and the coefficients of its exponential, in registers.
+/// Blends the splats with a bit in `touching` over one block, from front to back. Returns whether all pixels
+/// of the block have stopped, and how many splats were blended.
 ///
-/// A constant would be read from memory by each instruction that needs it, and a loop that blends splats would wait for its
-/// loads and not for its multiply-adds. So the compiler must not know the numbers, and each loop has vectors of its own:
-/// vectors that live longer are kept on the stack.
-#[derive(Clone, Copy)]
-struct Blender<S: Simd> {
-    exp2: Exp2<S>,
-    cap: f32x16<S>,
-    cut: f32x16<S>,
-    stop: f32x16<S>,
-    /// Below any stop, and above the denormal numbers, which multiply slowly.
-    floor: f32x16<S>,
-}
-
-/// The numbers of a [`Blender`].
-struct BlendNumbers {
-    exp2: [f32; 6],
-    /// Largest alpha, base-2 logarithm of the smallest, transmittance at which a pixel stops, and its floor.
-    thresholds: [f32; 4],
-}
-
-impl BlendNumbers {
-    fn new(cutoffs: &Cutoffs) -> Self {
-        let Cutoffs { alpha_cap, log2_alpha_cut, stop, .. } = *cutoffs;
-        Self { exp2: EXP2_TERMS, thresholds: [alpha_cap, log2_alpha_cut, stop, 1e-20] }
-    }
-}
-
-/// The sums of one block, in registers.
+/// Each splat has `alpha = min(cap, 2^(log2(opacity) - u² - v²))`, and adds `alpha T` of its colour; then the
+/// transmittance T is multiplied by `1 - alpha` (Kerbl et al. 2023, eq. 3). A pixel stops before the splat
+/// that would bring T to the stop or below.
 ///
 /// **The transmittance that decides about stopping continues to fall after a pixel has stopped.** It never
 /// rises, so that the test `after > stop` remains false without a mask, and each iteration depends on the one
 /// before by a single multiply-add. The transmittance of the image is a separate value, which changes only
 /// where the test holds.
-struct BlockSums<S: Simd> {
-    r: f32x16<S>,
-    g: f32x16<S>,
-    b: f32x16<S>,
-    depth: f32x16<S>,
-    transmittance: f32x16<S>,
-    running: f32x16<S>,
-}
-
-impl<S: Simd> BlockSums<S> {
-    #[inline(always)]
-    fn load(simd: S, sums: &TileSums, block: usize) -> Self {
-        Self {
-            r: f32x16::load_array_ref(simd, &sums.rgb[0][block]),
-            g: f32x16::load_array_ref(simd, &sums.rgb[1][block]),
-            b: f32x16::load_array_ref(simd, &sums.rgb[2][block]),
-            depth: f32x16::load_array_ref(simd, &sums.depth_m[block]),
-            transmittance: f32x16::load_array_ref(simd, &sums.transmittance[block]),
-            running: f32x16::load_array_ref(simd, &sums.running[block]),
-        }
-    }
-
-    #[inline(always)]
-    fn store(self, sums: &mut TileSums, block: usize) {
-        self.r.store_array(&mut sums.rgb[0][block]);
-        self.g.store_array(&mut sums.rgb[1][block]);
-        self.b.store_array(&mut sums.rgb[2][block]);
-        self.depth.store_array(&mut sums.depth_m[block]);
-        self.transmittance.store_array(&mut sums.transmittance[block]);
-        self.running.store_array(&mut sums.running[block]);
-    }
-}
-
-/// What blending a splat over a block has shown.
-struct Blended<S: Simd> {
-    /// Pixels to which the splat counts: all others have stopped.
-    counts: mask32x16<S>,
-    /// The transmittance after it, had no pixel stopped.
-    after: f32x16<S>,
-    /// The transmittance before it.
-    before: f32x16<S>,
-}
-
-impl<S: Simd> Blender<S> {
-    #[inline(always)]
-    fn new(simd: S, numbers: &BlendNumbers) -> Self {
-        let BlendNumbers { exp2, thresholds } = black_box(numbers);
-        let [cap, cut, stop, floor] = splats(simd, *thresholds);
-        Self { exp2: Exp2::new(simd, exp2), cap, cut, stop, floor }
-    }
-
-    /// Blends one splat over one block, behind what the block has.
-    ///
-    /// Each splat has `alpha = min(cap, 2^(log2(opacity) - u² - v²))`, and adds `alpha T` of its colour; then the
-    /// transmittance T is multiplied by `1 - alpha` (Kerbl et al. 2023, eq. 3). A pixel stops before the splat
-    /// that would bring T to the stop or below.
-    #[inline(always)]
-    fn blend<const DEPTH: bool>(
-        &self,
-        simd: S,
-        matched: &Matched,
-        block: usize,
-        sums: &mut BlockSums<S>,
-    ) -> Blended<S> {
-        let splat = |value: f32| f32x16::splat(simd, value);
-
-        // Alpha; 0 where it is below the cut.
-        let u = f32x16::load_array_ref(simd, &matched.lane_u) + splat(matched.u[block]);
-        let v = f32x16::load_array_ref(simd, &matched.lane_v) + splat(matched.v[block]);
-        let exponent = (-v).mul_add(v, (-u).mul_add(u, splat(matched.log2_opacity)));
-        let alpha = self.exp2.at(exponent).min(self.cap);
-        let alpha = exponent.simd_ge(self.cut).select(alpha, splat(0.0));
-
-        // The weight; 0 in pixels that stop here or stopped before.
-        let after = (-alpha).mul_add(sums.running, sums.running);
-        let counts = after.simd_gt(self.stop);
-        let weight = counts.select(alpha * sums.running, splat(0.0));
-        sums.running = after.max(self.floor);
-
-        sums.r = weight.mul_add(splat(matched.rgb[0]), sums.r);
-        sums.g = weight.mul_add(splat(matched.rgb[1]), sums.g);
-        sums.b = weight.mul_add(splat(matched.rgb[2]), sums.b);
-        if DEPTH {
-            sums.depth = weight.mul_add(splat(matched.depth_m), sums.depth);
-        }
-        let before = sums.transmittance;
-        sums.transmittance = counts.select(after, before);
-        Blended { counts, after, before }
-    }
-}
-
-/// The index of the first splat with a bit; [`NOTHING`] if there is none.
-#[inline(always)]
-fn first(touching: u64) -> usize {
-    touching.trailing_zeros() as usize
-}
-
-/// Without the first bit.
-#[inline(always)]
-fn after_first(touching: u64) -> u64 {
-    touching & touching.wrapping_sub(1)
-}
-
-/// Blends the splats with a bit in `touching` over one block, from front to back. Returns whether all pixels
-/// of the block have stopped, and a bit for each splat that was not blended.
 #[inline(always)]
 fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     simd: S,
-    numbers: &BlendNumbers,
     batch: &Batch,
     mut touching: u64,
     block: usize,
+    cutoffs: &Cutoffs,
     output: &mut TileOutput<'_>,
-) -> (bool, u64) {
-    let blender = Blender::new(simd, numbers);
-    let mut sums = BlockSums::load(simd, output.sums, block);
+) -> (bool, usize) {
+    let sums = &mut *output.sums;
+    let splat = |value: f32| f32x16::splat(simd, value);
+    let load = |values: &[f32; LANES]| f32x16::load_array_ref(simd, values);
+    let cap = splat(cutoffs.alpha_cap);
+    let cut = splat(cutoffs.log2_alpha_cut);
+    let stop = splat(cutoffs.stop);
+    // Below any stop, and above the denormal numbers, which multiply slowly.
+    let floor = splat(1e-20);
+
+    // All sums in registers.
+    let mut r = load(&sums.rgb[0][block]);
+    let mut g = load(&sums.rgb[1][block]);
+    let mut b = load(&sums.rgb[2][block]);
+    let mut depth = load(&sums.depth_m[block]);
+    let mut transmittance = load(&sums.transmittance[block]);
+    let mut running = load(&sums.running[block]);
+    let mut count = 0;
     let mut stopped = false;
     while touching != 0 {
-        let index = first(touching) % BATCH;
-        touching = after_first(touching);
-        let Blended { counts, after, before } =
-            blender.blend::<DEPTH>(simd, &batch.matched[index], block, &mut sums);
+        count += 1;
+        let index = touching.trailing_zeros() as usize % BATCH;
+        let matched = &batch.matched[index];
+        touching &= touching - 1;
+
+        // Alpha; 0 where it is below the cut.
+        let u = load(&matched.lane_u) + splat(matched.u[block]);
+        let v = load(&matched.lane_v) + splat(matched.v[block]);
+        let exponent = (-v).mul_add(v, (-u).mul_add(u, splat(matched.log2_opacity)));
+        let alpha = exp2(simd, exponent).min(cap);
+        let alpha = exponent.simd_ge(cut).select(alpha, splat(0.0));
+
+        // The weight; 0 in pixels that stop here or stopped before.
+        let after = (-alpha).mul_add(running, running);
+        let counts = after.simd_gt(stop);
+        let weight = counts.select(alpha * running, splat(0.0));
+        running = after.max(floor);
+
+        r = weight.mul_add(splat(matched.rgb[0]), r);
+        g = weight.mul_add(splat(matched.rgb[1]), g);
+        b = weight.mul_add(splat(matched.rgb[2]), b);
+        if DEPTH {
+            depth = weight.mul_add(splat(matched.depth_m), depth);
+        }
         if INSTANCES {
-            let half = f32x16::splat(simd, 0.5);
-            let halves = counts & after.simd_le(half) & before.simd_gt(half);
+            let half = splat(0.5);
+            let halves = counts & after.simd_le(half) & transmittance.simd_gt(half);
             let mut lanes = halves.to_bitmask();
             while lanes != 0 {
                 let lane = lanes.trailing_zeros() as usize % LANES;
@@ -493,47 +349,17 @@ fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
                 lanes &= lanes - 1;
             }
         }
+        transmittance = counts.select(after, transmittance);
         if counts.all_false() {
             stopped = true;
             break;
         }
     }
-    sums.store(output.sums, block);
-    (stopped, touching)
-}
-
-/// The same of two blocks at once, until one of them has stopped.
-///
-/// The steps of one block wait for each other, and lists are short: seven splats on a dense capture, while each takes
-/// fifty cycles from its numbers to its sums. Two independent blocks fill the gaps. A block whose list has ended gets
-/// [`NOTHING`], which changes no sum. It takes 32 registers, so that it is for AVX-512 alone.
-#[inline(always)]
-fn blend_two<S: Simd, const DEPTH: bool>(
-    simd: S,
-    numbers: &BlendNumbers,
-    batch: &Batch,
-    [mut touching_a, mut touching_b]: [u64; 2],
-    [block_a, block_b]: [usize; 2],
-    output: &mut TileOutput<'_>,
-) -> ([bool; 2], [u64; 2]) {
-    let blender = Blender::new(simd, numbers);
-    let mut sums_a = BlockSums::load(simd, output.sums, block_a);
-    let mut sums_b = BlockSums::load(simd, output.sums, block_b);
-    let mut stopped = [false; 2];
-    while touching_a | touching_b != 0 {
-        let a = &batch.matched[first(touching_a).min(NOTHING)];
-        let b = &batch.matched[first(touching_b).min(NOTHING)];
-        touching_a = after_first(touching_a);
-        touching_b = after_first(touching_b);
-        let a = blender.blend::<DEPTH>(simd, a, block_a, &mut sums_a);
-        let b = blender.blend::<DEPTH>(simd, b, block_b, &mut sums_b);
-        // The loop ends here: a list that depended on these masks would make each turn wait for the one before.
-        stopped = [a.counts.all_false(), b.counts.all_false()];
-        if stopped[0] | stopped[1] {
-            break;
-        }
-    }
-    sums_a.store(output.sums, block_a);
-    sums_b.store(output.sums, block_b);
-    (stopped, [touching_a, touching_b])
+    r.store_array(&mut sums.rgb[0][block]);
+    g.store_array(&mut sums.rgb[1][block]);
+    b.store_array(&mut sums.rgb[2][block]);
+    depth.store_array(&mut sums.depth_m[block]);
+    transmittance.store_array(&mut sums.transmittance[block]);
+    running.store_array(&mut sums.running[block]);
+    (stopped, count)
 }
