@@ -413,7 +413,7 @@ pub(crate) fn cameras_of_long_headers() -> Vec<serde_json::Value> {
             "windshield": {
                 "reference": "backward", "horizontal": coefficients(1), "vertical": coefficients(6),
             },
-            "native_size": [1920.123_456_789_012_3, 1080.123_456_789_012_3],
+            "native_size": [1_920.123_456_789_012_3, 1_080.123_456_789_012_3],
             "camera_to_rig": { "xyz": [UGLY, UGLY, UGLY], "q": [1.0, UGLY, UGLY, UGLY] },
         })
     };

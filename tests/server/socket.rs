@@ -196,7 +196,7 @@ async fn watchers_are_told_why_they_end() {
     let mut agent = server.driver("a").await;
     let watcher = async || {
         let watcher = connect(server.address(), "/v1/sessions/a/watch", WATCH, None).await;
-        watcher.ok().expect("a watcher")
+        watcher.expect("a watcher")
     };
     let mut talker = watcher().await;
     talker.send_text("{}").await;

@@ -3,7 +3,6 @@
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
-use wildcity_scene::appearance::Appearance;
 use wildcity_session::RenderedImage;
 
 use crate::cli::profile_options::LoadedProfile;
@@ -42,7 +41,6 @@ impl Renderer {
         &self,
         view: &View,
         profile: &RenderProfile,
-        appearance: &Appearance,
     ) -> anyhow::Result<RenderedImage> {
         let views = [*view];
         let scene = self.source.scene(&views, profile)?;
@@ -61,7 +59,6 @@ impl Renderer {
             depth_m: self.maps.depth.then_some(&mut image.depth_m),
             opacity: Some(&mut image.opacity),
             normals: self.maps.normals.then_some(&mut image.normals),
-            appearance: (!appearance.is_identity()).then_some(appearance),
             ..Target::default()
         };
         let frame = Frame { scene: &scene, profile, views: &views };
