@@ -5,7 +5,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use tokio::time::Instant;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::Pose;
@@ -32,7 +32,10 @@ async fn session(bench: &Bench, name: String, width_px: u32, height_px: u32) -> 
     let [width, height] = [width_px, height_px].map(f64::from);
     let pinhole = Pinhole { fx: width, fy: width, cx: 0.5 * width, cy: 0.5 * height };
     let camera = Camera::from_pinhole(width_px, height_px, pinhole);
-    let cameras = vec![RigCamera::new("front", camera, Pose::IDENTITY)];
+    // Ahead, from the height of a windshield: OpenCV's axes (x right, y down, z ahead) in those of the vehicle.
+    let ahead =
+        Pose { position_m: 1.5 * DVec3::Z, rotation: DQuat::from_xyzw(-0.5, 0.5, -0.5, 0.5) };
+    let cameras = vec![RigCamera::new("front", camera, ahead)];
     let options = SessionOptions {
         start: Some(Start::Pose(place())),
         rig: Some(RigChoice::Full(Rig { name: "one".to_owned(), cameras })),

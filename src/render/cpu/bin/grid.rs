@@ -1,0 +1,49 @@
+//! The tiles of a view, and its macro tiles.
+
+use crate::View;
+use crate::constants::TILE_PX;
+
+/// A view's grid of tiles.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::cpu) struct Grid {
+    /// Image size, in pixels.
+    pub(super) size_px: [u32; 2],
+    /// Tiles per row.
+    pub(in crate::cpu) columns: u32,
+    /// Rows of tiles.
+    pub(in crate::cpu) rows: u32,
+    /// Base-2 logarithm of a macro tile's width and height in tiles.
+    pub(super) macro_bits: [u32; 2],
+}
+
+impl Grid {
+    /// The tiles of a view; the last tile of a row or column may reach beyond the image.
+    pub(in crate::cpu) fn new(view: &View) -> Self {
+        let size_px = [view.camera.width_px, view.camera.height_px];
+        let [columns, rows] = size_px.map(|size| size.div_ceil(TILE_PX));
+        // Smaller ones in small images, so that there are enough for all cores.
+        let macro_bits = match columns * rows {
+            512.. => [3, 2],
+            64.. => [2, 1],
+            _ => [1, 1],
+        };
+        Self { size_px, columns, rows, macro_bits }
+    }
+
+    /// Macro tiles per row.
+    pub(super) fn macro_columns(&self) -> u32 {
+        self.columns.div_ceil(1 << self.macro_bits[0])
+    }
+
+    pub(super) fn macro_tiles(&self) -> usize {
+        self.macro_columns() as usize * self.rows.div_ceil(1 << self.macro_bits[1]) as usize
+    }
+
+    /// The macro tile of a tile, and the tile's number within it.
+    pub(super) fn place(&self, column: u32, row: u32) -> (usize, usize) {
+        let [x_bits, y_bits] = self.macro_bits;
+        let number = (row >> y_bits) * self.macro_columns() + (column >> x_bits);
+        let within = |at: u32, bits: u32| at & ((1 << bits) - 1);
+        (number as usize, (within(row, y_bits) << x_bits | within(column, x_bits)) as usize)
+    }
+}
