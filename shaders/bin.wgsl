@@ -3,7 +3,8 @@
 // called a touch.
 //
 // `count` counts the touches of each splat, a prefix sum gives each splat the index of its first touch,
-// and `emit` writes the touches. Twin of `src/render/cpu/bin.rs`, where the ellipse test is documented.
+// and `emit` writes the touches. Twin of `src/render/cpu/bin`; `rows.rs` there documents
+// the ellipse test.
 
 #import constants
 #import layout

@@ -24,7 +24,6 @@ pub fn change_stops(rgb8: &mut [u8], stops: f64) {
 mod tests {
     use super::*;
 
-    /// Values of the standard's formula: 0.5 and 0.2 of stored value by hand, and the ends.
     #[test]
     fn a_stop_is_twice_the_light() {
         let mut rgb8 = [0, 10, 128, 188, 255];
@@ -35,6 +34,7 @@ mod tests {
         assert_eq!(bright, [255, 85, 255]);
     }
 
+    /// Values of the standard's formula: by hand, and the ends.
     #[test]
     fn both_directions_are_the_standard_and_each_other() {
         for (stored, linear) in

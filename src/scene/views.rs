@@ -5,6 +5,8 @@
 //!
 //! [`Manifest::views`]: crate::Manifest::views
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use super::manifest::ObjectRef;
@@ -131,17 +133,32 @@ impl RecordedView {
     }
 }
 
-/// A mask in a smaller size, `[height, width]`: a pixel counts if all of those that it is made of do.
+/// A mask of an image that Lanczos 3 shrinks, `[height, width]`: a pixel counts if all of those that it is made of do. The
+/// kernel reaches three of the smaller pixels far. Nothing changes if the sizes are equal.
 pub fn reduced_mask(counts: &[bool], from_px: [u32; 2], to_px: [u32; 2]) -> Vec<bool> {
+    if from_px == to_px {
+        return counts.to_vec();
+    }
     let [width, height] = from_px.map(|side| side as usize);
     let [to_width, to_height] = to_px.map(|side| side as usize);
     let mut reduced = vec![true; to_width * to_height];
     for (pixel, _) in counts.iter().enumerate().filter(|(_, counts)| !**counts) {
-        let row = pixel / width * to_height / height;
-        let column = pixel % width * to_width / width;
-        reduced[row * to_width + column] = false;
+        let columns = reached(pixel % width, width, to_width);
+        for row in reached(pixel / width, height, to_height) {
+            reduced[row * to_width..][columns.clone()].fill(false);
+        }
     }
     reduced
+}
+
+/// The pixels of a row of `to` that Lanczos 3 makes of pixel `at` of a row of `from`.
+fn reached(at: usize, from: usize, to: usize) -> Range<usize> {
+    const REACH_PX: f64 = 3.0;
+    let center_px = (at as f64 + 0.5) * to as f64 / from as f64;
+    // Centres are at +0.5. Negative numbers become 0.
+    let first = (center_px - REACH_PX - 0.5).ceil() as usize;
+    let last = (center_px + REACH_PX - 0.5).floor() as usize;
+    first..(last + 1).min(to)
 }
 
 impl From<RecordedView> for ViewFields {
@@ -209,11 +226,15 @@ mod tests {
 
     #[test]
     fn a_pixel_of_a_smaller_mask_counts_if_all_of_its_pixels_do() {
-        let mut counts = vec![true; 5 * 4];
-        counts[5 * 2 + 4] = false;
-        let reduced = reduced_mask(&counts, [5, 4], [2, 2]);
-        assert_eq!(reduced, [true, true, true, false]);
-        assert_eq!(reduced_mask(&counts, [5, 4], [5, 4]), counts);
+        // One pixel in the middle of 40 x 4, at 20.5: in 20 x 2 at 10.25, so that centres from 7.25 to 13.25 are reached.
+        let mut counts = vec![true; 40 * 4];
+        counts[40 * 2 + 20] = false;
+        let reduced = reduced_mask(&counts, [40, 4], [20, 2]);
+        for (column, (above, below)) in reduced[..20].iter().zip(&reduced[20..]).enumerate() {
+            let is_reached = (7..=12).contains(&column);
+            assert_eq!([*above, *below], [!is_reached; 2], "column {column}");
+        }
+        assert_eq!(reduced_mask(&counts, [40, 4], [40, 4]), counts);
     }
 
     #[test]

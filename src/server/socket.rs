@@ -21,7 +21,7 @@ pub(crate) struct Socket {
     send_timeout: Duration,
     /// Whether the client has sent its Close frame, after which it reads nothing.
     peer_closed: bool,
-    /// Whether a part of a frame was sent. If that was given up, nothing can follow it.
+    /// Whether a frame was begun and not ended. If that was given up, nothing can follow it.
     is_within_frame: bool,
 }
 

@@ -52,7 +52,8 @@ async fn pings_are_answered_whatever_runs() {
         let sent = Instant::now();
         agent.socket.send(Message::Ping("x".into())).await.unwrap();
         assert_eq!(frame(agent).await, Some(Message::Pong("x".into())));
-        assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+        // The rendering that runs has 300 ms left: the answer does not wait for it, on a busy machine either.
+        assert!(sent.elapsed() < Duration::from_millis(250), "{:?}", sent.elapsed());
     };
     pinged(&mut agent).await;
     agent.hello().await;

@@ -95,6 +95,7 @@ async fn a_small_session_keeps_driving_beside_large_ones() {
     );
     assert!(per_minute >= 60.0, "{per_minute:.0} small steps a minute");
     if let Some(alone) = alone {
-        assert!(10 * together + 10 >= 9 * alone, "{together} large frames, {alone} alone");
+        assert!(alone >= 20, "{alone} large frames are too few to compare: raise FAIRNESS_SECONDS");
+        assert!(10 * together >= 9 * alone, "{together} large frames, {alone} alone");
     }
 }

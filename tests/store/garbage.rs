@@ -1,5 +1,6 @@
 //! Garbage collection and fsck, in a directory and in an object store.
 
+use std::fs;
 use std::time::Duration;
 
 use wildcity_twin::store::{Catalog, ObjectTotals, Retention, StoreError};
@@ -176,6 +177,30 @@ fn a_version_loses_all_of_its_objects_or_none() {
         is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 8]);
         catalog.collect("street", keep, false).unwrap();
         is_sound(&catalog, &[1, 2, 3, 4, 5, 6, 7, 8, 9]);
+    });
+}
+
+#[test]
+fn a_damaged_manifest_of_an_old_version_keeps_all_objects_and_is_named() {
+    everywhere(|place| {
+        let keep = Retention { versions: 1, grace: NOW };
+        let catalog = twin(place, 3);
+        let noted = catalog.collect("street", keep, false).unwrap().noted;
+        let third = catalog.version("street", None).unwrap();
+        change(&catalog, [3, 3], 4).change(3, cells_alone()).unwrap();
+        // Version 3 is not kept any more, and not noted yet.
+        let hash = &third.hash;
+        let file = place.twins().join("street/objects").join(&hash[..2]).join(hash);
+        let manifest = fs::read(&file).unwrap();
+        fs::write(&file, &manifest[1..]).unwrap();
+        let blocked = place.catalog().collect("street", keep, false).unwrap();
+        assert_eq!(blocked.removed, ObjectTotals::default());
+        let (number, damage) = blocked.blocked_by.unwrap();
+        assert_eq!(number, 3);
+        assert!(damage.contains(hash), "{damage}");
+        // The next run removes the manifest, and with it all that was noted.
+        let free = place.catalog().collect("street", keep, false).unwrap();
+        assert_eq!((free.removed.objects, free.blocked_by), (noted.objects + OWN, None));
     });
 }
 

@@ -84,7 +84,7 @@ fn a_planted_violation_is_found() {
         ("src/session", "episode.rs", "use axum::Router;", "only src/server may name axum"),
         (
             "src/render",
-            "cpu/bin.rs",
+            "cpu/sort.rs",
             "fn f() { wgpu::init(); }",
             "only src/render/gpu may name wgpu",
         ),

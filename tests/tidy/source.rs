@@ -17,7 +17,7 @@ pub(crate) struct Package {
     pub(crate) name: String,
     /// Packages of the workspace that it depends on outside of tests, sorted.
     pub(crate) depends_on: Vec<String>,
-    /// Text of each file, by its path within the package's source folder: `cpu/bin.rs`.
+    /// Text of each file, by its path within the package's source folder: `cpu/sort.rs`.
     pub(crate) files: BTreeMap<String, String>,
     /// The source folder, from the root of the repository: `src/render`.
     pub(crate) folder: String,

@@ -61,7 +61,7 @@ pub enum Request {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 60_000_000)))]
         until_us: Option<i64>,
-        /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
+        /// What the agent notes about the step, for the record: any JSON but `null`, of at most 65,536 bytes without white space.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         notes: Option<serde_json::Value>,
         /// Whether the episode ends with this step.
@@ -214,7 +214,7 @@ pub struct SessionStep {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(range(min = 1_000, max = 60_000_000)))]
     pub until_us: Option<i64>,
-    /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
+    /// What the agent notes about the step, for the record: any JSON but `null`, of at most 65,536 bytes without white space.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub notes: Option<serde_json::Value>,
     /// Whether the episode ends with this step.

@@ -54,6 +54,12 @@ impl Gc {
             found.noted.objects,
             found.noted.bytes,
         )?;
+        if let Some((number, damage)) = found.blocked_by {
+            writeln!(
+                io::stdout(),
+                "nothing can be removed before the manifest of version {number}, which is damaged: {damage}"
+            )?;
+        }
         Ok(())
     }
 }

@@ -52,7 +52,7 @@ pub(in crate::cli) struct Views {
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 
-    /// Least distance of two images of a camera along the drive, in metres, within a tenth: 2 or 2m.
+    /// Least distance of two images of a camera along the drive, in metres: 2 or 2m. Images up to a tenth nearer are kept.
     #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
     every: f64,
 
@@ -78,8 +78,8 @@ Examples:
   wildcity twin views street --images capture --image-dir capture/images_2 --every 4m --side 480
   wildcity twin views street --remove";
 
-/// Images may be so much nearer than --every, as a share of it: in a bend a camera that is outside or inside of it makes another way
-/// than the drive, and images every 2 m would otherwise be kept every 4 m.
+/// Images may be so much nearer than --every, as a share of it: a camera outside or inside of a bend travels another distance than
+/// the drive, and images every 2 m would otherwise be kept every 4 m.
 const SLACK: f64 = 0.1;
 
 /// An image of the list with its place on the drive.

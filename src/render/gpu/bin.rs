@@ -11,7 +11,7 @@
 //! its macro tile's list, the step took longer than with one level, since 32 tiles read every mask.
 //! `BENCHMARKS.md` has the numbers.
 //!
-//! Twin of `render/cpu/bin.rs`; WGSL: `bin`, `sort`, `ranges`, and `expand` in `shaders`.
+//! Twin of `render/cpu/bin`; WGSL: `bin`, `sort`, `ranges`, and `expand` in `shaders`.
 
 use wgpu::{Buffer, ComputePass};
 

@@ -41,6 +41,9 @@ pub struct CollectionReport {
     pub removed: ObjectTotals,
     /// Objects that are garbage, and may be removed after the grace period.
     pub noted: ObjectTotals,
+    /// A version that is not kept, and the damage of its manifest, which hides what the version needs. No object is
+    /// removed until the manifest itself is.
+    pub blocked_by: Option<(u64, String)>,
 }
 
 /// A number of objects, and their total size.
@@ -220,7 +223,8 @@ impl Catalog {
                     Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {}
                     Err(error @ StoreError::Io { .. }) => return Err(error),
                     // It is unknown what a damaged manifest names, until it goes itself.
-                    Err(_) => {
+                    Err(damage) => {
+                        plan.report.blocked_by = Some((number, damage.to_string()));
                         plan.remove.clear();
                         return Ok(());
                     }

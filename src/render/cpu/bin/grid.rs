@@ -25,7 +25,8 @@ impl Grid {
         let macro_bits = match columns * rows {
             512.. => [3, 2],
             64.. => [2, 1],
-            _ => [1, 1],
+            16.. => [1, 1],
+            _ => [0, 0],
         };
         Self { size_px, columns, rows, macro_bits }
     }

@@ -6,7 +6,7 @@ use super::Scratch;
 use super::segment::{Pair, Segment};
 
 /// Most tiles of a macro tile: bits of a mask.
-const MACRO_TILES: usize = 32;
+const MACRO_TILE_TILES: usize = 32;
 
 /// Where the lists of one macro tile are.
 #[derive(Clone, Debug, Default)]
@@ -15,7 +15,7 @@ pub(super) struct MacroTile {
     pub(super) first: u32,
     pub(super) len: u32,
     /// End of each tile's list, from `first`.
-    pub(super) ends: [u32; MACRO_TILES],
+    pub(super) ends: [u32; MACRO_TILE_TILES],
 }
 impl MacroTile {
     /// Puts the splats of the macro tile `number` of a view in order of depth, and lists them by tile.
@@ -36,11 +36,11 @@ impl MacroTile {
         sort_by_depth(keys, other);
 
         // Count the splats of each tile, and turn the counts into places.
-        let mut next = [0; MACRO_TILES];
+        let mut next = [0; MACRO_TILE_TILES];
         for pair in &*pairs {
             let mut tiles = pair.tiles;
             while tiles != 0 {
-                next[tiles.trailing_zeros() as usize % MACRO_TILES] += 1;
+                next[tiles.trailing_zeros() as usize % MACRO_TILE_TILES] += 1;
                 tiles &= tiles - 1;
             }
         }
@@ -54,7 +54,7 @@ impl MacroTile {
         for &key in &*keys {
             let Pair { place, mut tiles, .. } = pairs[key as u32 as usize];
             while tiles != 0 {
-                let next = &mut next[tiles.trailing_zeros() as usize % MACRO_TILES];
+                let next = &mut next[tiles.trailing_zeros() as usize % MACRO_TILE_TILES];
                 instances[*next as usize] = place;
                 *next += 1;
                 tiles &= tiles - 1;

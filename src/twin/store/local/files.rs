@@ -9,6 +9,9 @@ use crate::store::disk::{Disk, ReadFile};
 
 /// Bytes read or written at once.
 pub(super) const BUFFER_BYTES: usize = 256 << 10;
+/// Errors of syncing a directory that is not ours, or that a file system gives which cannot sync directories.
+const CANNOT_SYNC: [ErrorKind; 3] =
+    [ErrorKind::PermissionDenied, ErrorKind::InvalidInput, ErrorKind::Unsupported];
 /// First character of the name of a file that is being written.
 pub(super) const WRITING: char = '~';
 
@@ -92,8 +95,9 @@ pub fn create_dirs(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     }
     if is_dir(disk, dir) {
         return match dir.parent().map(|parent| disk.sync_dir(parent)) {
-            // This process may not read the directory above, so that another user has created this one.
-            Some(Err(error)) if error.kind() == ErrorKind::PermissionDenied => Ok(()),
+            // This process may not read the directory above, so that another user has created this one; or its file
+            // system cannot sync directories.
+            Some(Err(error)) if CANNOT_SYNC.contains(&error.kind()) => Ok(()),
             Some(synced) => synced.map_err(StoreError::io("sync", dir)),
             None => Ok(()),
         };
