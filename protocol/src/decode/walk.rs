@@ -282,3 +282,17 @@ fn shortened(text: &str) -> String {
         Some((end, _)) => format!("{}..", &text[..end]),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::decode::decode;
+    use crate::message::Request;
+
+    #[test]
+    fn a_refusal_of_a_doubled_number_has_no_number() {
+        let text = r#"{"type": "close", "seq": 3, "seq": 4}"#;
+        let refused = decode::<Request>(text).unwrap_err();
+        assert_eq!(refused.seq, None);
+        assert_eq!(refused.mistake.field.as_deref(), Some("seq"));
+    }
+}
