@@ -95,9 +95,7 @@ impl Exposure {
         };
         Ok(Self { matrix, offset })
     }
-}
 
-impl Exposure {
     /// Changes an image, `[height, width, 3]` in 8 bits, as the renderer changes its colours.
     pub fn change_rgb8(&self, rgb8: &mut [u8]) {
         for pixel in rgb8.chunks_exact_mut(3) {

@@ -11,7 +11,7 @@
 //! culled as a unit.
 
 use std::collections::BTreeSet;
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
 use bytemuck::{Pod, Zeroable};
@@ -385,36 +385,30 @@ impl LaneBounds {
 /// [`is_drawable`] of each Gaussian of a lane group.
 fn drawable_lanes(group: &[Lanes]) -> [bool; LANES] {
     let mut drawable = [true; LANES];
-    for (index, Lanes(values)) in group.iter().enumerate() {
-        match index {
-            column::LOG2_OPACITY => and_within(&mut drawable, values, |value| value <= f32::MAX),
-            column::SH.. => {
-                let most = 2.0 * sh::MAX_COEFFICIENT;
-                and_within(&mut drawable, values, |value| value.abs() <= most);
-            }
-            _ => and_within(&mut drawable, values, |value| value.abs() <= f32::MAX),
+    for (column, Lanes(values)) in group.iter().enumerate() {
+        let accepted = accepted(column);
+        for (drawable, value) in drawable.iter_mut().zip(values) {
+            *drawable &= accepted.contains(value);
         }
     }
     drawable
 }
 
-#[inline(always)]
-fn and_within(all: &mut [bool; LANES], values: &[f32; LANES], is: impl Fn(f32) -> bool) {
-    for (all, &value) in all.iter_mut().zip(values) {
-        *all &= is(value);
-    }
-}
-
 /// Whether the renderer can draw a Gaussian with these columns, given in order.
 fn is_drawable(columns: impl Iterator<Item = f32>) -> bool {
-    columns.enumerate().all(|(column, value)| match column {
+    columns.enumerate().all(|(column, value)| accepted(column).contains(&value))
+}
+
+/// The values of a column that the renderer can draw. A NaN is in no range.
+fn accepted(column: usize) -> RangeInclusive<f32> {
+    match column {
         // Minus infinity is opacity 0: valid, never drawn.
-        column::LOG2_OPACITY => value.is_finite() || value == f32::NEG_INFINITY,
+        column::LOG2_OPACITY => f32::NEG_INFINITY..=f32::MAX,
         // Twice the bound of import, since a record format may round beyond that bound. The gpu backend
         // shares one colour scale among 256 Gaussians: a larger value would coarsen its neighbours.
-        column::SH.. => value.abs() <= 2.0 * sh::MAX_COEFFICIENT,
-        _ => value.is_finite(),
-    })
+        column::SH.. => -2.0 * sh::MAX_COEFFICIENT..=2.0 * sh::MAX_COEFFICIENT,
+        _ => f32::MIN..=f32::MAX,
+    }
 }
 
 /// `log2(1 / (1 + exp(-x)))` without overflow or cancellation, for every x that is not NaN.

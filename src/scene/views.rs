@@ -107,6 +107,11 @@ struct ViewFields {
 /// Largest exposure of an image against the twin's, in stops.
 pub const MOST_STOPS: f64 = 16.0;
 
+/// An exposure in stops that no camera has: beyond [`MOST_STOPS`], or not a number.
+pub fn refused_stops(stops: Option<f64>) -> Option<f64> {
+    stops.filter(|stops| !(-MOST_STOPS..=MOST_STOPS).contains(stops))
+}
+
 impl RecordedView {
     /// Checks names, numbers and the camera.
     ///
@@ -118,14 +123,10 @@ impl RecordedView {
                 return Err(ViewError::Name { field, name: name.clone() });
             }
         }
-        let numbers =
-            [("station_m", Some(self.station_m)), ("exposure_stops", self.exposure_stops)];
-        for (field, value) in numbers {
-            if let Some(value) = value.filter(|value| !value.is_finite()) {
-                return Err(ViewError::Number { field, value });
-            }
+        if !self.station_m.is_finite() {
+            return Err(ViewError::Number { field: "station_m", value: self.station_m });
         }
-        if let Some(value) = self.exposure_stops.filter(|stops| stops.abs() > MOST_STOPS) {
+        if let Some(value) = refused_stops(self.exposure_stops) {
             return Err(ViewError::Stops { value });
         }
         let wrong = |cause| ViewError::Camera { name: self.camera_name.clone(), cause };

@@ -1,4 +1,4 @@
-//! Means over images: gains of a repair, networks, LiDAR.
+//! Means over images: gains of a repair, networks, LiDAR; the order of images, and what JSON and CSV say of them.
 
 use wildcity_eval::{
     EvaluatedImage, Evaluation, LidarBin, LidarDepth, Pair, PairScores, Scored, Subject,
@@ -39,6 +39,43 @@ fn evaluation(images: Vec<EvaluatedImage>) -> Evaluation {
 
 fn near(found: f64, wanted: f64) {
     assert!((found - wanted).abs() < 1e-9, "{found} instead of {wanted}");
+}
+
+/// An image of one colour that is off by some steps of 255; no pixel counts if `is_hidden`.
+fn flat(name: &str, off: u8, is_hidden: bool) -> EvaluatedImage {
+    let counts = is_hidden.then(|| vec![false; 144]);
+    let pair = Pair::new([12, 12], vec![100; 432], vec![100 + off; 432], counts).unwrap();
+    EvaluatedImage::new(name.to_owned(), [12, 12], 1.0, &PairScores::of(&pair, false))
+}
+
+#[test]
+fn means_are_of_the_images_values() {
+    let made = evaluation(vec![
+        flat("front/1.png", 1, false),
+        flat("front/2.png", 10, false),
+        flat("left/1.png", 100, false),
+        flat("left/2.png", 50, true),
+    ]);
+    let db = |off: f64| 20.0 * (255.0 / off).log10();
+    assert_eq!((made.all.images, made.cameras.len()), (3, 2));
+    assert!((made.all.rendered.psnr_db - (db(1.0) + db(10.0) + db(100.0)) / 3.0).abs() < 1e-9);
+    let pooled = -10.0 * ((1.0 + 100.0 + 10_000.0) / 3.0 / 255.0_f64.powi(2)).log10();
+    assert!((made.all.rendered.pooled_psnr_db - pooled).abs() < 1e-9);
+    assert!((made.cameras[0].means.rendered.psnr_db - (db(1.0) + db(10.0)) / 2.0).abs() < 1e-9);
+    let order: Vec<&str> = made.worst_first().iter().map(|image| &*image.name).collect();
+    assert_eq!(order, ["left/1.png", "front/2.png", "front/1.png", "left/2.png"]);
+}
+
+#[test]
+fn json_and_csv_have_words_for_infinity_and_nan() {
+    let made = evaluation(vec![flat("a.png", 0, false), flat("say \"b\".png", 9, true)]);
+    let csv = made.csv();
+    let lines: Vec<&str> = csv.lines().collect();
+    let columns = lines[0].split(',').count();
+    assert_eq!(lines[1], "\"a.png\",\"\",12,12,1,1,inf,1,1,0,,,,,,,,,,,,,,");
+    assert_eq!(lines[1].split(',').count(), columns);
+    assert!(lines[2].starts_with("\"say \"\"b\"\".png\",\"\",12,12,0,1,NaN,NaN,"), "{csv}");
+    assert_eq!((made.all.images, made.all.rendered.psnr_db), (1, f64::INFINITY));
 }
 
 #[test]

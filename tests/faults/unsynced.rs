@@ -4,6 +4,7 @@
 use crate::disk::Fault;
 use crate::history::{History, Operation, Step};
 use crate::medium::Kind;
+use crate::world::World;
 
 /// More writes than one operation makes.
 const WRITES: u64 = 64;
@@ -37,8 +38,17 @@ fn run(before: &[Operation], faulty: (Operation, u64, Fault), after: &[Step], se
     }
 }
 
+/// Checks that an operation makes fewer writes than are tried: a fault after so many does not happen.
+fn check_writes(before: &[Operation], operation: Operation, writes: u64) {
+    let mut world = World::new(Kind::Disk, None).unwrap();
+    before.iter().for_each(|&one| world.run(&step(1, one, None)).unwrap());
+    world.run(&step(1, operation, Some((writes, Fault::Kill)))).unwrap();
+    assert_eq!(world.restarts(), 0, "{operation:?} makes more than {writes} writes: try more");
+}
+
 /// Lets each fault happen at each write of `faulty`.
 fn check(before: &[Operation], faulty: Operation, after: &[Operation]) {
+    check_writes(before, faulty, WRITES);
     for fault in [Fault::Full, Fault::Kill, Fault::PowerCut] {
         for writes in 0..WRITES {
             for seed in 1..=CUTS {
@@ -72,6 +82,7 @@ fn a_collected_version_stays_collected() {
 #[test]
 fn the_log_has_no_gap() {
     // A rollback has few writes, so that all pairs of them can be tried.
+    check_writes(&[PUSH, OTHER_PUSH], ROLLBACK, ROLLBACK_WRITES);
     for writes in 0..ROLLBACK_WRITES {
         for cut in 0..ROLLBACK_WRITES {
             for seed in 1..=3 * CUTS {

@@ -53,6 +53,8 @@ pub(crate) struct World {
     possible: BTreeMap<u64, Vec<Cells>>,
     /// Versions that garbage collection may have removed.
     collectable: BTreeSet<u64>,
+    /// How often the process was stopped.
+    restarts: u64,
 }
 
 type Promise = Result<(), String>;
@@ -122,7 +124,13 @@ impl World {
             acknowledged: BTreeMap::new(),
             possible: BTreeMap::new(),
             collectable: BTreeSet::new(),
+            restarts: 0,
         })
+    }
+
+    /// How often the process was stopped, and another one started.
+    pub(crate) fn restarts(&self) -> u64 {
+        self.restarts
     }
 
     /// Carries out one step. If it stops the process, starts the next one and checks the promises.
@@ -401,6 +409,7 @@ impl World {
 
     /// Starts the next process, as after a kill or a power cut.
     fn restart(&mut self, seed: u64) -> Promise {
+        self.restarts += 1;
         // The sessions and the commits of the stopped process write nothing any more.
         self.sessions.clear();
         self.prepared = None;

@@ -13,12 +13,12 @@ use wildcity_repair::reference::{
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::srgb::change_stops;
-use wildcity_session::RenderedImage;
+use wildcity_session::{OfflineView, RenderedImage};
 
+use super::compared::expose;
 use super::drive::{DrivePlace, Drives};
 use super::renderer::{Renderer, covered};
-use super::repairer::{PlacedImage, Repairer};
+use super::repairer::Repairer;
 
 /// Largest distance from the drive, in metres.
 const FARTHEST_M: f64 = 50.0;
@@ -225,21 +225,18 @@ fn draw(
     let world_from_rig = moved(&place.world_from_rig);
     let mut rendered = renderer.render(&view, image.profile)?;
     rendered.trust = drives.trust(&world_from_rig, &view, &rendered);
-    let placed = PlacedImage {
+    let of = OfflineView {
         camera: image.camera,
         rays: &image.lens.rays,
         view: &view,
         world_from_rig: &world_from_rig,
         rendered: &rendered,
-        profile: image.profile,
         kept,
     };
-    let repaired = repairer.map(|repairer| repairer.repair(renderer, &placed)).transpose()?;
-    let (mut repaired, nearest) = repaired.map(|it| (it.rgb8, it.nearest)).unzip();
-    if let Some(stops) = image.exposure_stops {
-        change_stops(&mut rendered.rgb8, stops);
-        repaired.iter_mut().for_each(|rgb8: &mut Vec<u8>| change_stops(rgb8, stops));
-    }
+    let repair = |repairer: &Repairer| repairer.repair(renderer, &of, image.profile);
+    let (mut repaired, nearest) =
+        repairer.map(repair).transpose()?.map(|it| (it.rgb8, it.nearest)).unzip();
+    expose(image.exposure_stops, &mut rendered, &mut repaired);
     Ok(Drawn { view, rendered, repaired, nearest: nearest.flatten() })
 }
 

@@ -1,11 +1,13 @@
 //! `wildcity eval`.
 
 mod beside;
+mod compared;
 mod drive;
 mod labels;
 mod networks;
 mod renderer;
 mod repairer;
+mod saved;
 mod summary;
 
 use std::io::{self, Write};
@@ -13,27 +15,23 @@ use std::path::PathBuf;
 
 use anyhow::{Context, ensure};
 
-use wildcity_eval::{EvaluatedImage, Evaluation, Pair, PairScores, Subject, Thumbnails};
-use wildcity_render::View;
+use wildcity_eval::{EvaluatedImage, Evaluation, Subject};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::geometry::camera::FieldMask;
-use wildcity_scene::rig::RigCamera;
-use wildcity_scene::srgb::change_stops;
-use wildcity_session::RenderedImage;
 
-use self::beside::{Beside, BesideImage, Lens, Offsets, OnDrive, Tools};
+use self::beside::{Beside, BesideImage, Offsets, OnDrive, Tools};
+use self::compared::Compared;
 use self::drive::Drives;
 use self::labels::{LabelOptions, Labels};
 use self::networks::{FeatureSet, NetworkOptions, Networks};
-use self::renderer::{Maps, Renderer, covered};
-use self::repairer::{PlacedImage, Repairer, RepairerOptions};
+use self::renderer::{Maps, Renderer};
+use self::repairer::{Repairer, RepairerOptions};
 use self::summary::{decibels, print_beside, print_means};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::profile_options::ProfileOptions;
-use super::real_images::{ImageList, RealImage, camera_names, own_vehicle, picture};
+use super::real_images::{ImageList, RealImage, camera_names};
 use super::scene_source::Source;
 use super::{output, placement, progress};
 
@@ -152,20 +150,6 @@ struct Features {
     beside: Vec<FeatureSet>,
 }
 
-/// An image that was compared, for what comes after it.
-struct Compared {
-    scores: EvaluatedImage,
-    view: View,
-    profile: RenderProfile,
-    truth: Vec<u8>,
-    rendered: RenderedImage,
-    repaired: Option<Vec<u8>>,
-    counts: Option<Vec<bool>>,
-    camera: RigCamera,
-    /// Of the images that are repaired or moved beside the drive.
-    lens: Option<Lens>,
-}
-
 impl Eval {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let list = ImageList::read(&self.images, self.image_dir.as_deref(), self.masks.as_deref())?;
@@ -241,96 +225,6 @@ impl Eval {
         }
     }
 
-    /// Renders one image and compares it with the real one, and the repaired image, too.
-    fn evaluate(
-        &self,
-        setup: &Setup,
-        image: &RealImage,
-        camera_name: &str,
-    ) -> anyhow::Result<Compared> {
-        let Setup { renderer, repairer, drives, labels, networks } = setup;
-        let profile = renderer.profile(image.near)?;
-        let (truth, camera) = picture::real(&image.file, &image.camera, profile.background)?;
-        let size_px = [camera.width_px, camera.height_px];
-        let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
-        let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
-        let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
-        let shown = RigCamera::new(camera_name, camera, Pose::IDENTITY);
-        let mut rendered = renderer.render(&view, &profile)?;
-        // A model repairs in the exposure of the twin; compared is in that of the real image.
-        let exposed = |mut rgb8: Vec<u8>| {
-            image.exposure_stops.iter().for_each(|stops| change_stops(&mut rgb8, *stops));
-            rgb8
-        };
-        let rendered_rgb8 = exposed(rendered.rgb8.clone());
-        let needs_lens = repairer.is_some() || self.extrapolate.is_some();
-        let lens = needs_lens.then(|| Lens::of(&camera));
-        let mask = own_vehicle::both(mask, own_vehicle::outside(rig, camera_name, size_px));
-        let mut counts = counted(&view, mask);
-        let hidden = labels.hide(image, &view, &renderer.alignment);
-        let moving = hidden.as_ref().map(|(_, share)| *share);
-        if let Some((still, _)) = hidden {
-            if self.save_images {
-                self.save_mask(&image.name, &still, size_px)?;
-            }
-            let counts = counts.get_or_insert_with(|| vec![true; still.len()]);
-            counts.iter_mut().zip(still).for_each(|(counts, still)| *counts &= still);
-        }
-        let covered = covered(&rendered);
-        let lpips = |rgb8: &[u8]| networks.lpips(size_px, rgb8, &truth, counts.as_deref());
-        let pair = Pair::new(size_px, truth.clone(), rendered_rgb8.clone(), counts.clone())?;
-        let mut compared = PairScores::of(&pair, self.align_exposure);
-        compared.scores.lpips = lpips(&rendered_rgb8)?;
-        if self.save_images {
-            self.save(&image.name, ["rendered", "errors"], &pair, &compared.error_map)?;
-        }
-        let mut scores = EvaluatedImage::new(image.name.clone(), size_px, covered, &compared);
-        scores.moving = moving;
-        scores.lidar = labels.depth(image, &view, &rendered, counts.as_deref());
-        let mut repaired_rgb8 = None;
-        let mut thumbnails =
-            Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
-        if let Some((repairer, lens)) = repairer.as_ref().zip(lens.as_ref()) {
-            let place = drives.as_ref().and_then(|drives| {
-                let place = drives.place(camera_name, &view.world_from_camera)?;
-                Some((place.world_from_rig, drives))
-            });
-            let world_from_rig = place.map_or(view.world_from_camera, |(rig, _)| rig);
-            rendered.trust =
-                place.map_or(1.0, |(rig, drives)| drives.trust(&rig, &view, &rendered));
-            let placed = PlacedImage {
-                camera: &shown,
-                rays: &lens.rays,
-                view: &view,
-                world_from_rig: &world_from_rig,
-                rendered: &rendered,
-                profile: &profile,
-                kept: None,
-            };
-            let repaired = exposed(repairer.repair(renderer, &placed)?.rgb8);
-            let pair = Pair::new(size_px, truth.clone(), repaired.clone(), counts.clone())?;
-            let mut compared = PairScores::of(&pair, self.align_exposure);
-            compared.scores.lpips = lpips(&repaired)?;
-            repaired_rgb8 = Some(repaired);
-            if self.save_images {
-                self.save(
-                    &image.name,
-                    ["repaired", "repaired_errors"],
-                    &pair,
-                    &compared.error_map,
-                )?;
-            }
-            scores.repaired = Some(compared.scored());
-            let with = thumbnails.with_repaired(&pair, &compared.error_map);
-            thumbnails = with.map_err(anyhow::Error::msg)?;
-        }
-        scores.thumbnails = Some(thumbnails);
-        let repaired = repaired_rgb8;
-        let camera = shown;
-        rendered.rgb8 = rendered_rgb8;
-        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
-    }
-
     /// Draws the views beside the drive that belong to an image.
     fn look_beside(
         &self,
@@ -382,50 +276,6 @@ impl Eval {
         if let Some(best) = best {
             best.thumbnails = None;
         }
-    }
-
-    fn save(
-        &self,
-        name: &str,
-        [pixels, errors]: [&str; 2],
-        pair: &Pair,
-        error_map: &[f32],
-    ) -> anyhow::Result<()> {
-        let [width, height] = pair.size_px();
-        let rendered = wildcity_session::png(pair.rendered(), width, height);
-        self.save_file(pixels, name, &rendered.map_err(anyhow::Error::msg)?)?;
-        let map = wildcity_eval::error_png(pair, error_map);
-        self.save_file(errors, name, &map.map_err(anyhow::Error::msg)?)
-    }
-
-    fn save_pixels(
-        &self,
-        folder: &str,
-        name: &str,
-        rgb8: &[u8],
-        view: &View,
-    ) -> anyhow::Result<()> {
-        let file = wildcity_session::png(rgb8, view.camera.width_px, view.camera.height_px);
-        self.save_file(folder, name, &file.map_err(anyhow::Error::msg)?)
-    }
-
-    /// White where nothing moves, as `--masks` takes it.
-    fn save_mask(
-        &self,
-        name: &str,
-        still: &[bool],
-        [width, height]: [u32; 2],
-    ) -> anyhow::Result<()> {
-        let rgb8: Vec<u8> =
-            still.iter().flat_map(|still| [if *still { 255 } else { 0 }; 3]).collect();
-        let file = wildcity_session::png(&rgb8, width, height);
-        self.save_file("masks", name, &file.map_err(anyhow::Error::msg)?)
-    }
-
-    fn save_file(&self, folder: &str, name: &str, png: &[u8]) -> anyhow::Result<()> {
-        let path = self.out.join(folder).join(picture::inside(name)).with_extension("png");
-        output::create_dir(path.parent().unwrap_or(&self.out))?;
-        output::write(&path, png)
     }
 
     fn subject(&self, setup: &Setup, profile: RenderProfile) -> Subject {
@@ -514,12 +364,4 @@ impl Features {
         }
         Ok(())
     }
-}
-
-/// The pixels that count: not masked, and within the lens' field.
-fn counted(view: &View, mask: Option<Vec<bool>>) -> Option<Vec<bool>> {
-    let Some(field) = FieldMask::of(&view.camera) else { return mask };
-    let mut counts = mask.unwrap_or_else(|| vec![true; view.camera.pixels()]);
-    field.clear_outside(&view.camera, 1, &mut counts);
-    Some(counts)
 }

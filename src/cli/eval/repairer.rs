@@ -6,15 +6,13 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 
 use wildcity_eval::RepairSubject;
-use wildcity_render::View;
-use wildcity_repair::reference::{Rays, ReferenceCache};
+use wildcity_repair::reference::ReferenceCache;
 use wildcity_repair::{InputRole, LoadOptions, Model};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
-use wildcity_scene::rig::RigCamera;
 use wildcity_session::{
     NeededReferences, OfflineDrawing, OfflineReferences, OfflineView, ReferenceSource,
-    RenderedImage, ViewReferences,
+    ViewReferences,
 };
 
 use super::renderer::Renderer;
@@ -50,18 +48,6 @@ pub(super) struct Repairer {
     /// Of a twin.
     references: Option<OfflineReferences>,
     cache: ReferenceCache,
-}
-
-/// An image to repair, with where it is.
-pub(super) struct PlacedImage<'a> {
-    pub(super) camera: &'a RigCamera,
-    pub(super) rays: &'a Rays,
-    pub(super) view: &'a View,
-    pub(super) world_from_rig: &'a Pose,
-    pub(super) rendered: &'a RenderedImage,
-    pub(super) profile: &'a RenderProfile,
-    /// Name of the nearest recorded image of the view before, which stays unless another is much nearer.
-    pub(super) kept: Option<&'a str>,
 }
 
 /// A repaired image.
@@ -158,17 +144,16 @@ impl Repairer {
         }
     }
 
-    /// Repairs an image.
+    /// Repairs an image that was rendered with a profile.
     pub(super) fn repair(
         &self,
         renderer: &Renderer,
-        image: &PlacedImage<'_>,
+        of: &OfflineView<'_>,
+        profile: &RenderProfile,
     ) -> anyhow::Result<Repaired> {
-        let &PlacedImage { camera, rays, view, world_from_rig, rendered, profile, kept } = image;
-        let of = OfflineView { camera, rays, view, world_from_rig, rendered, kept };
         let drawing = OfflineDrawing { profile, backend: &*renderer.backend, cache: &self.cache };
         let beside = match &self.references {
-            Some(references) => references.beside(&of, self.needed, drawing)?,
+            Some(references) => references.beside(of, self.needed, drawing)?,
             None => ViewReferences::default(),
         };
         let nearest = beside.nearest().map(str::to_owned);
@@ -176,9 +161,9 @@ impl Repairer {
             nearest.is_some() || !self.needed.nearest,
             "the model {:?} needs a recorded image of the camera {:?} within 30 m; there is none",
             self.model.manifest().name,
-            camera.name
+            of.camera.name
         );
-        let (rgb8, _) = beside.repaired(&self.model, &of)?;
+        let (rgb8, _) = beside.repaired(&self.model, of)?;
         Ok(Repaired { rgb8, nearest })
     }
 }

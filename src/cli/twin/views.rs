@@ -6,6 +6,7 @@ use anyhow::{Context, ensure};
 use image::RgbImage;
 use image::imageops::{self, FilterType};
 
+use wildcity_augment::mask_png;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::manifest::ObjectRef;
@@ -216,10 +217,8 @@ impl Views {
         let Some(counts) = counts.filter(|counts| counts.contains(&false)) else {
             return Ok((camera, stored, None));
         };
-        let white = |counts: &bool| if *counts { [255; 3] } else { [0; 3] };
-        let shown: Vec<u8> = counts.iter().flat_map(white).collect();
-        let file = wildcity_session::png(&shown, width, height).map_err(anyhow::Error::msg)?;
-        Ok((camera, stored, Some(commit.put_image(&file)?)))
+        let mask = mask_png(&counts, [width, height])?;
+        Ok((camera, stored, Some(commit.put_image(&mask)?)))
     }
 }
 

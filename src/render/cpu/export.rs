@@ -1,5 +1,7 @@
 //! The outputs of the stages in their plain form, for another backend to continue from or compare with.
 
+use rayon::prelude::*;
+
 use super::Scratch;
 use crate::layout::Cutoffs;
 use crate::stage::{SplatOwner, Stage, StageOutputs, TileLists};
@@ -7,7 +9,7 @@ use crate::stage::{SplatOwner, Stage, StageOutputs, TileLists};
 /// Copies the outputs of the stages up to and including `last`. Splats are numbered without the gaps at the
 /// ends of pages.
 pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> StageOutputs {
-    let Scratch { projected, sorted, bins } = scratch;
+    let Scratch { projected, bins } = scratch;
     let mut outputs = StageOutputs::default();
     // The number of the splat at each place.
     let mut index_of_place = vec![0; projected.places()];
@@ -25,7 +27,10 @@ pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -
     }
     let index = |place: u32| index_of_place[place as usize];
     if last >= Stage::Sort {
-        outputs.order = Some(sorted.places().map(index).collect());
+        // The cpu backend itself needs no order of whole views. The sort is stable: equal keys keep the order of global ids.
+        let mut order: Vec<u32> = (0..outputs.splats.len() as u32).collect();
+        order.par_sort_by_key(|&splat| outputs.keys[splat as usize]);
+        outputs.order = Some(order);
     }
     if last >= Stage::Bin {
         let mut lists = TileLists::default();

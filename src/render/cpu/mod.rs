@@ -91,7 +91,6 @@ pub enum CpuError {
 #[derive(Debug, Default)]
 struct Scratch {
     projected: project::Projected,
-    sorted: sort::Sorted,
     bins: bin::Bins,
 }
 
@@ -150,11 +149,6 @@ impl Cpu {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
             let mut timer = StageTimer::start();
-            if last >= Stage::Sort {
-                // Frames that this backend completes need no order of whole views.
-                scratch.sorted.sort(&scratch.projected, &cutoffs);
-                timer.finish("sort", &mut stats);
-            }
             let outputs = export::stage_outputs(scratch, last, &cutoffs);
             timer.finish("hand over", &mut stats);
             Ok((outputs, stats))
@@ -190,7 +184,7 @@ impl Scratch {
         last: Stage,
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
-        let Self { projected, bins, .. } = self;
+        let Self { projected, bins } = self;
         let mut timer = StageTimer::start();
         projected.project(level, frame, cutoffs);
         timer.finish("project", stats);
@@ -268,7 +262,7 @@ impl Cpu {
         let cutoffs = &Cutoffs::new(frame.profile);
         scratch.run(self.level, &frame, cutoffs, Stage::Bin, stats)?;
         let mut timer = StageTimer::start();
-        let Scratch { projected, bins, .. } = scratch;
+        let Scratch { projected, bins } = scratch;
         let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
         let finished = |view: usize, target: &Target<'_>| finished(first_view + view, target);
         stats.evaluations += rasterize::rasterize(self.level, input, targets, &finished);

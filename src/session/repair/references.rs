@@ -383,19 +383,25 @@ mod tests {
     use wildcity_scene::geometry::camera::Pinhole;
     use wildcity_scene::manifest::ObjectRef;
 
-    #[test]
-    fn only_an_image_of_the_same_place_and_direction_is_left_out() {
-        let pinhole = Pinhole { fx: 10.0, fy: 10.0, cx: 5.0, cy: 5.0 };
-        let view = RecordedView {
+    fn image(width_px: u32, focal_px: f64, exposure_stops: Option<f64>) -> RecordedView {
+        let middle = 0.5 * f64::from(width_px);
+        let pinhole = Pinhole { fx: focal_px, fy: focal_px, cx: middle, cy: middle };
+        RecordedView {
             trajectory: "log".into(),
-            station_m: 0.0,
+            station_m: 2.0,
             camera_name: "front".into(),
-            camera: Camera::from_pinhole(10, 10, pinhole),
-            world_from_camera: Pose { position_m: DVec3::X, ..Pose::IDENTITY },
-            exposure_stops: None,
+            camera: Camera::from_pinhole(width_px, width_px, pinhole),
+            world_from_camera: Pose::IDENTITY,
+            exposure_stops,
             image: ObjectRef { object: "0".repeat(64), bytes: 3 },
             mask: None,
-        };
+        }
+    }
+
+    #[test]
+    fn only_an_image_of_the_same_place_and_direction_is_left_out() {
+        let world_from_camera = Pose { position_m: DVec3::X, ..Pose::IDENTITY };
+        let view = RecordedView { world_from_camera, ..image(10, 10.0, None) };
         let at = |x_m: f64, turn_rad: f64| Pose {
             position_m: DVec3::X * x_m,
             rotation: DQuat::from_rotation_y(turn_rad),
@@ -414,18 +420,7 @@ mod tests {
     }
 
     fn reference(width_px: u32, focal_px: f64, exposure_stops: Option<f64>) -> ReferenceView {
-        let middle = 0.5 * f64::from(width_px);
-        let pinhole = Pinhole { fx: focal_px, fy: focal_px, cx: middle, cy: middle };
-        recorded(&Arc::new(RecordedView {
-            trajectory: "log".into(),
-            station_m: 2.0,
-            camera_name: "front".into(),
-            camera: Camera::from_pinhole(width_px, width_px, pinhole),
-            world_from_camera: Pose::IDENTITY,
-            exposure_stops,
-            image: ObjectRef { object: "0".repeat(64), bytes: 3 },
-            mask: None,
-        }))
+        recorded(&Arc::new(image(width_px, focal_px, exposure_stops)))
     }
 
     #[test]

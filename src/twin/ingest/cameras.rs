@@ -10,7 +10,7 @@ use serde::de::IgnoredAny;
 use crate::limits;
 use wildcity_scene::geometry::camera::json::{Intrinsics, LensFields, WindshieldFields};
 use wildcity_scene::geometry::{Camera, CameraError, Pose, PoseError};
-use wildcity_scene::views::MOST_STOPS;
+use wildcity_scene::views::{MOST_STOPS, refused_stops};
 
 use super::file::{self, FileError};
 use wildcity_scene::rig::MAX_NAME_BYTES;
@@ -189,8 +189,7 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         entry;
     let time_us = entry.time_us;
     let exposure_stops = entry.exposure_stops;
-    if let Some(stops) = exposure_stops.filter(|stops| !(-MOST_STOPS..=MOST_STOPS).contains(stops))
-    {
+    if let Some(stops) = refused_stops(exposure_stops) {
         return Err(CamerasError::Stops { name, stops });
     }
     let of_rigs = [

@@ -5,9 +5,11 @@
 //! candidates that are still garbage and were not written since. So a process that reads a version
 //! at the first run has that long to lease it, and a commit that needs an object again has written
 //! it again. A version goes as a whole: as long as its manifest stays, all of its objects do, though some of them may
-//! have been noted before, as those of an older version. In a directory, publishing is locked while objects are removed. In an object store there is no
-//! lock: if a commit writes an object again in the very seconds in which it is removed, the object is lost.
-//! So run garbage collection there only while no push can need an object that has been garbage for a day.
+//! have been noted before, as those of an older version.
+//!
+//! In a directory, publishing is locked while objects are removed. In an object store there is no lock: if a commit writes
+//! an object again in the very seconds in which it is removed, the object is lost. So run garbage collection there only
+//! while no push can need an object that has been garbage for a day.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;

@@ -18,8 +18,8 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ import numpy as np
 import numpy.typing as npt
 
 from .difix_config import ExportError
-from .onnx_file import Graph
 
 __all__ = ["NETS", "ExportError", "export", "main", "manifest"]
 
@@ -167,12 +166,36 @@ def collected(net: str, files: Sequence[tuple[str, Mapping[str, Any]]]) -> Array
     return found
 
 
+@dataclass
+class _Graph:
+    """A graph while it is written: nodes in the order in which they run, and arrays by their names."""
+
+    nodes: list[Any] = field(default_factory=list)
+    constants: Arrays = field(default_factory=dict)
+
+    def constant(self, name: str, values: npt.NDArray[Any]) -> str:
+        self.constants[name] = values
+        return name
+
+    def node(self, kind: str, name: str, inputs: Iterable[str], **attributes: Any) -> str:
+        """An operator with one output, which has the node's name."""
+        return self.split(kind, [name], inputs, **attributes)[0]
+
+    def split(self, kind: str, names: list[str], inputs: Iterable[str], **attributes: Any) -> list[str]:
+        """An operator with several outputs. It has the name of the first."""
+        from onnx import helper
+
+        self.nodes.append(helper.make_node(kind, list(inputs), names, names[0], **attributes))
+        return names
+
+
 def graph(net: str, arrays: Arrays) -> bytes:
     """The ONNX file: `distance` of `image` and `truth`, [1, 3, height, width] in [-1, 1]."""
-    made = Graph(f"lpips_{net}")
-    sides: list[str | int] = [1, 3, "height", "width"]
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    made = _Graph()
     # Both at once, as a batch.
-    both = made.node("Concat", "both", [made.input("image", sides), made.input("truth", sides)], axis=0)
+    both = made.node("Concat", "both", ["image", "truth"], axis=0)
     shift, scale = (np.array(values, np.float32).reshape(1, 3, 1, 1) for values in (SHIFT, SCALE))
     x = made.node("Sub", "shifted", [both, made.constant("shift", shift)])
     x = made.node("Div", "scaled", [x, made.constant("scale", scale)])
@@ -198,11 +221,19 @@ def graph(net: str, arrays: Arrays) -> bytes:
     for tap, one in enumerate(distances[1:], 1):
         name = "distance" if tap == len(distances) - 1 else f"sum{tap}"
         total = made.node("Add", name, [total, one])
-    made.output(total, [1, 1, 1, 1])
-    return made.content()
+    sides = [1, 3, "height", "width"]
+    images = [helper.make_tensor_value_info(name, TensorProto.FLOAT, sides) for name in ("image", "truth")]
+    distance = helper.make_tensor_value_info(total, TensorProto.FLOAT, [1, 1, 1, 1])
+    constants = [numpy_helper.from_array(values, name) for name, values in made.constants.items()]
+    whole = helper.make_graph(made.nodes, f"lpips_{net}", images, [distance], constants)
+    # onnxruntime reads version 8 of the format from 1.10 on.
+    model = helper.make_model(whole, ir_version=8, opset_imports=[helper.make_opsetid("", 17)], producer_name="wildcity")
+    checker.check_model(model)
+    content: bytes = model.SerializeToString()
+    return content
 
 
-def _tap(made: Graph, tap: int, x: str, arrays: Arrays) -> str:
+def _tap(made: _Graph, tap: int, x: str, arrays: Arrays) -> str:
     """The mean over the pixels of the weighted squares of differences, of features with the length 1."""
     name = f"tap{tap}"
     channels = made.constant("channels", np.array([1], np.int64))
@@ -210,7 +241,7 @@ def _tap(made: Graph, tap: int, x: str, arrays: Arrays) -> str:
     epsilon = made.constant("epsilon", np.array(EPSILON, np.float32))
     length = made.node("Add", f"{name}.length", [made.node("Sqrt", f"{name}.root", [squares]), epsilon])
     unit = made.node("Div", f"{name}.unit", [x, length])
-    image, truth = made.nodes("Split", [f"{name}.image", f"{name}.truth"], [unit], axis=0)
+    image, truth = made.split("Split", [f"{name}.image", f"{name}.truth"], [unit], axis=0)
     apart = made.node("Sub", f"{name}.apart", [image, truth])
     apart = made.node("Mul", f"{name}.apart2", [apart, apart])
     weighted = made.node("Conv", f"{name}.weighted", [apart, made.constant(f"lin{tap}", arrays[f"lin{tap}"])], kernel_shape=[1, 1])
@@ -254,8 +285,9 @@ def export(
         raise ExportError("--net", f"{net}; one of {', '.join(NETS)}")
     try:
         import blake3
+        import onnx  # noqa: F401
     except ImportError as error:
-        raise ExportError("blake3", f"{error}; pip install 'wildcity[lpips]'") from error
+        raise ExportError(error.name or "a package", f"{error}; pip install 'wildcity[lpips]'") from error
     files = [(os.fspath(path), _read(Path(path))) for path in weights] or [("lpips", _installed(net))]
     content = graph(net, collected(net, files))
     said = manifest(net, out.name, blake3.blake3(content).hexdigest(), providers)

@@ -5,7 +5,7 @@
 //! and the candidates are repaired and encoded outside of the render queue: frames of other sessions are
 //! rendered meanwhile, and a model that hangs delays its own session alone.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -215,8 +215,9 @@ impl ObservationBuilder {
         let Some(repair) = &mut self.repair else { return Vec::new() };
         let session = repair.session.clone();
         let mut wanted: Vec<ReferenceView> = Vec::new();
+        let mut known = HashSet::new();
         let mut want = |view: &ReferenceView| {
-            if wanted.iter().all(|other| other.id() != view.id()) {
+            if known.insert(view.id()) {
                 wanted.push(view.clone());
             }
         };

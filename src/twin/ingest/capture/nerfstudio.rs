@@ -12,7 +12,7 @@ use serde_json::Value;
 
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
-use wildcity_scene::views::MOST_STOPS;
+use wildcity_scene::views::{MOST_STOPS, refused_stops};
 
 use super::{CaptureError, Place, PosedImage, rotation_of};
 use crate::ingest::file::read_whole;
@@ -86,9 +86,7 @@ pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
     let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
         let Frame { time_us, exposure_stops, .. } = frame;
-        if let Some(stops) =
-            exposure_stops.filter(|stops| !(-MOST_STOPS..=MOST_STOPS).contains(stops))
-        {
+        if let Some(stops) = refused_stops(exposure_stops) {
             let place = Place::Field(format!("frames[{index}].exposure_stops"));
             let reason = format!("{stops}; give -{MOST_STOPS} to {MOST_STOPS}");
             return Err(CaptureError::at(path, place, reason));

@@ -9,7 +9,7 @@ use crate::store::disk::{Disk, ReadFile};
 
 /// Bytes read or written at once.
 pub(super) const BUFFER_BYTES: usize = 256 << 10;
-/// Errors of syncing a directory that is not ours, or that a file system gives which cannot sync directories.
+/// Errors of syncing a directory that belongs to another user, or whose file system cannot sync directories.
 const CANNOT_SYNC: [ErrorKind; 3] =
     [ErrorKind::PermissionDenied, ErrorKind::InvalidInput, ErrorKind::Unsupported];
 /// First character of the name of a file that is being written.

@@ -1,0 +1,165 @@
+//! Compares a rendered image with the real one, and the repaired image, too.
+
+use wildcity_eval::{EvaluatedImage, Pair, PairScores, Thumbnails};
+use wildcity_render::View;
+use wildcity_scene::RenderProfile;
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::geometry::camera::FieldMask;
+use wildcity_scene::rig::RigCamera;
+use wildcity_scene::srgb::change_stops;
+use wildcity_session::{OfflineView, RenderedImage};
+
+use super::beside::Lens;
+use super::networks::Networks;
+use super::renderer::covered;
+use super::{Eval, Setup};
+use crate::cli::real_images::{RealImage, own_vehicle, picture};
+
+/// An image that was compared, for what comes after it.
+pub(super) struct Compared {
+    pub(super) scores: EvaluatedImage,
+    pub(super) view: View,
+    pub(super) profile: RenderProfile,
+    pub(super) truth: Vec<u8>,
+    pub(super) rendered: RenderedImage,
+    pub(super) repaired: Option<Vec<u8>>,
+    pub(super) counts: Option<Vec<bool>>,
+    pub(super) camera: RigCamera,
+    /// Of the images that are repaired or moved beside the drive.
+    pub(super) lens: Option<Lens>,
+}
+
+/// A real image, and the pixels of it that count.
+#[derive(Clone, Copy)]
+struct Truth<'a> {
+    name: &'a str,
+    size_px: [u32; 2],
+    rgb8: &'a [u8],
+    counts: Option<&'a [bool]>,
+}
+
+impl Eval {
+    /// Renders one image and compares it with the real one, and the repaired image, too.
+    pub(super) fn evaluate(
+        &self,
+        setup: &Setup,
+        image: &RealImage,
+        camera_name: &str,
+    ) -> anyhow::Result<Compared> {
+        let Setup { renderer, repairer, labels, networks, .. } = setup;
+        // Draw what the camera saw.
+        let profile = renderer.profile(image.near)?;
+        let (truth, camera) = picture::real(&image.file, &image.camera, profile.background)?;
+        let size_px = [camera.width_px, camera.height_px];
+        let view = View::new(camera, renderer.alignment.pose(&image.world_from_camera));
+        let mut rendered = renderer.render(&view, &profile)?;
+
+        // Repair it, in the exposure of the twin.
+        let needs_lens = repairer.is_some() || self.extrapolate.is_some();
+        let lens = needs_lens.then(|| Lens::of(&camera));
+        let camera = RigCamera::new(camera_name, camera, Pose::IDENTITY);
+        let mut repaired = match &lens {
+            Some(lens) => repaired(setup, &view, &profile, &camera, lens, &mut rendered)?,
+            None => None,
+        };
+        expose(image.exposure_stops, &mut rendered, &mut repaired);
+
+        // Leave out what the twin does not have: what masks hide, the own vehicle, and what moves.
+        let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
+        let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
+        let outside = own_vehicle::outside(rig, camera_name, size_px);
+        let (still, moving) = labels.hide(image, &view, &renderer.alignment).unzip();
+        if self.save_images {
+            still.iter().try_for_each(|still| self.save_mask(&image.name, still, size_px))?;
+        }
+        let masked = own_vehicle::both(own_vehicle::both(mask, outside), still);
+        let counts = counted(&view, masked);
+
+        // Compare.
+        let of = Truth { name: &image.name, size_px, rgb8: &truth, counts: counts.as_deref() };
+        let folders = ["rendered", "errors"];
+        let (pair, compared) = self.compare(networks, of, &rendered.rgb8, folders)?;
+        let name = image.name.clone();
+        let mut scores = EvaluatedImage::new(name, size_px, covered(&rendered), &compared);
+        scores.moving = moving;
+        scores.lidar = labels.depth(image, &view, &rendered, of.counts);
+        let mut thumbnails =
+            Thumbnails::of(&pair, &compared.error_map).map_err(anyhow::Error::msg)?;
+        if let Some(rgb8) = &repaired {
+            let folders = ["repaired", "repaired_errors"];
+            let (pair, compared) = self.compare(networks, of, rgb8, folders)?;
+            scores.repaired = Some(compared.scored());
+            let with = thumbnails.with_repaired(&pair, &compared.error_map);
+            thumbnails = with.map_err(anyhow::Error::msg)?;
+        }
+        scores.thumbnails = Some(thumbnails);
+        Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
+    }
+
+    /// Compares an image with the real one. With `--save-images` it and the map of its errors go into two folders.
+    fn compare(
+        &self,
+        networks: &Networks,
+        Truth { name, size_px, rgb8: truth, counts }: Truth<'_>,
+        rgb8: &[u8],
+        folders: [&str; 2],
+    ) -> anyhow::Result<(Pair, PairScores)> {
+        let owned = counts.map(<[bool]>::to_vec);
+        let pair = Pair::new(size_px, truth.to_vec(), rgb8.to_vec(), owned)?;
+        let mut compared = PairScores::of(&pair, self.align_exposure);
+        compared.scores.lpips = networks.lpips(size_px, rgb8, truth, counts)?;
+        if self.save_images {
+            self.save(name, folders, &pair, &compared.error_map)?;
+        }
+        Ok((pair, compared))
+    }
+}
+
+/// The repaired pixels of an image, if there is a model. The image gets its trust.
+fn repaired(
+    setup: &Setup,
+    view: &View,
+    profile: &RenderProfile,
+    camera: &RigCamera,
+    lens: &Lens,
+    rendered: &mut RenderedImage,
+) -> anyhow::Result<Option<Vec<u8>>> {
+    let Some(repairer) = &setup.repairer else { return Ok(None) };
+    let placed = setup.drives.as_ref().and_then(|drives| {
+        let place = drives.place(&camera.name, &view.world_from_camera)?;
+        Some((drives, place.world_from_rig))
+    });
+    // Without a drive the camera stands for the rig, and is trusted.
+    let world_from_rig = placed.map_or(view.world_from_camera, |(_, rig)| rig);
+    rendered.trust = placed.map_or(1.0, |(drives, rig)| drives.trust(&rig, view, rendered));
+    let of = OfflineView {
+        camera,
+        rays: &lens.rays,
+        view,
+        world_from_rig: &world_from_rig,
+        rendered,
+        kept: None,
+    };
+    Ok(Some(repairer.repair(&setup.renderer, &of, profile)?.rgb8))
+}
+
+/// Brings what was rendered and repaired from the exposure of the twin to that of a real image, if it is known.
+pub(super) fn expose(
+    stops: Option<f64>,
+    rendered: &mut RenderedImage,
+    repaired: &mut Option<Vec<u8>>,
+) {
+    let Some(stops) = stops else { return };
+    change_stops(&mut rendered.rgb8, stops);
+    if let Some(rgb8) = repaired {
+        change_stops(rgb8, stops);
+    }
+}
+
+/// The pixels that count: not masked, and within the lens' field.
+fn counted(view: &View, mask: Option<Vec<bool>>) -> Option<Vec<bool>> {
+    let Some(field) = FieldMask::of(&view.camera) else { return mask };
+    let mut counts = mask.unwrap_or_else(|| vec![true; view.camera.pixels()]);
+    field.clear_outside(&view.camera, 1, &mut counts);
+    Some(counts)
+}
