@@ -22,9 +22,6 @@ impl Exposure {
     /// pixels nothing changes.
     pub(super) fn fit(pair: &Pair) -> Self {
         let count = pair.counted().count() as f64;
-        if count == 0.0 {
-            return Self { gain: [1.0; 3], offset: [0.0; 3] };
-        }
         let mut mean_from = [0.0; 3];
         let mut mean_to = [0.0; 3];
         for (from, to) in pair.counted() {

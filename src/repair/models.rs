@@ -3,7 +3,9 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
+
+use parking_lot::Mutex;
 
 use crate::error::RepairError;
 use crate::files;
@@ -75,7 +77,7 @@ impl Models {
             let known = self.entries.keys().cloned().collect();
             return Err(RepairError::Unknown { name: name.to_owned(), known });
         };
-        let mut loaded = entry.loaded.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut loaded = entry.loaded.lock();
         if let Some(model) = loaded.as_ref().filter(|model| !model.is_withdrawn()) {
             return Ok(Arc::clone(model));
         }

@@ -4,9 +4,9 @@
 //! input of the role `image` and, if it compares, one of the role `truth`.
 
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
+use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
 use crate::error::RepairError;
@@ -205,7 +205,7 @@ impl Network {
             feeds.push(self.feed(input, own));
         }
         let limit = Duration::from_millis(self.manifest.timeout_ms);
-        let mut worker = self.worker.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut worker = self.worker.lock();
         let values = worker.run(feeds, &self.manifest.output, limit)?.values;
         drop(worker);
         let of = values.len();

@@ -5,8 +5,8 @@
 //! forced: a caller waits for an answer, never for the thread.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
@@ -17,6 +17,7 @@ use ort::logging::LogLevel;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::session::{NoSelectedOutputs, RunOptions, Session, SessionInputValue};
 use ort::value::{DynValue, Outlet, Tensor, TensorElementType, ValueType};
+use parking_lot::Mutex;
 
 use crate::error::RepairError;
 use crate::files::{self, GraphFiles};
@@ -33,7 +34,7 @@ static RUNTIME: Mutex<Option<Runtime>> = Mutex::new(None);
 
 /// Whether this process has loaded a runtime library.
 pub fn is_loaded() -> bool {
-    RUNTIME.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    RUNTIME.lock().is_some()
 }
 
 /// The environment; opens the library if no model did before.
@@ -43,7 +44,7 @@ fn environment(path: &Path) -> Result<Environment, RepairError> {
         return Err(RepairError::RuntimeUnnamed);
     }
     let library = files::check_library(path).map_err(refused)?;
-    let mut runtime = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut runtime = RUNTIME.lock();
     if let Some(runtime) = &*runtime {
         if runtime.library != library {
             let loaded = runtime.library.clone();
@@ -72,7 +73,7 @@ pub(crate) fn build_info() -> &'static str {
 
 /// Name of the library's file, such as `libonnxruntime.so.1.32.0`; empty before one is loaded.
 pub(crate) fn library_name() -> String {
-    let runtime = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let runtime = RUNTIME.lock();
     let name = runtime.as_ref().and_then(|runtime| runtime.library.file_name());
     name.map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }

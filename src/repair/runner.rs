@@ -1,7 +1,8 @@
 //! Runs the graph of a model on planes, and checks the shape that comes back.
 
-use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
+
+use parking_lot::Mutex;
 
 use crate::error::RepairError;
 use crate::image::View;
@@ -25,7 +26,7 @@ impl Runner {
 
     /// Whether the model is withdrawn: no run will succeed any more.
     pub(crate) fn is_withdrawn(&self) -> bool {
-        self.worker.lock().unwrap_or_else(PoisonError::into_inner).is_withdrawn()
+        self.worker.lock().is_withdrawn()
     }
 
     /// The inputs that have pixels.
@@ -74,7 +75,7 @@ impl Runner {
         let height = planes[0].height * scale;
         let width = planes[0].width * scale;
         let limit = Duration::from_millis(self.manifest.timeout_ms);
-        let mut worker = self.worker.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut worker = self.worker.lock();
         let returned = worker.run(feeds, &output.name, limit)?;
         drop(worker);
         let wanted = signature::image_shape(layout, channels as i64, [height as i64, width as i64]);

@@ -11,6 +11,22 @@ struct Case {
     kid: f64,
 }
 
+/// Of three images, the subsets of two are equally frequent.
+#[test]
+fn subsets_are_drawn_evenly() {
+    let a = [0.0, 1.0, 3.0].map(|value| vec![value]);
+    let b = [0.5, 0.25].map(|value| vec![value]);
+    let of_pair = |[i, j]: [usize; 2]| Kid::of(&[a[i].clone(), a[j].clone()], &b).unwrap().mean;
+    let values = [[0, 1], [0, 2], [1, 2]].map(of_pair);
+    let mean = values.iter().sum::<f64>() / 3.0;
+    let deviation = (values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / 3.0).sqrt();
+    let found = Kid::of_subsets(&a, &b, 3_000, 2).unwrap();
+    // The standard error is 0.018 of the deviation.
+    assert!((found.mean - mean).abs() < 0.06 * deviation, "{found:?} {mean}");
+    let ratio = found.standard_deviation / deviation;
+    assert!((0.95..1.05).contains(&ratio), "{found:?} {deviation}");
+}
+
 #[test]
 fn the_distance_is_that_of_numpy() {
     let cases: Vec<Case> = serde_json::from_str(include_str!("kid.json")).unwrap();

@@ -1,6 +1,7 @@
 //! Points of a LiDAR in the world, and rendered depth against them: numpy and SciPy.
 
 use glam::DVec3;
+use safetensors::SafeTensors;
 use serde::Deserialize;
 
 use wildcity_eval::{DepthMap, LidarDepth, LidarError, LidarPoints};
@@ -93,6 +94,39 @@ fn depth_is_compared_as_numpy_does() {
     // A map that is 0.25 m off everywhere.
     let exact = LidarDepth::of(&[], &map);
     assert!(exact.points == 0 && exact.mean_m.is_nan() && exact.bins[0].mean_m.is_nan());
+}
+
+#[test]
+fn points_that_did_not_come_back_are_left_out() {
+    let all = LidarPoints::parse(FILE).unwrap();
+    let file = SafeTensors::deserialize(FILE).unwrap();
+    let points = file.tensor("points_m").unwrap().data();
+    let from = points.as_ptr().addr() - FILE.as_ptr().addr();
+    let mut bytes = FILE.to_vec();
+    // Bits of NaN, for one point.
+    bytes[from..from + points.len() / all.len()].fill(0xff);
+    assert_eq!(LidarPoints::parse(&bytes).unwrap().len(), all.len() - 1);
+}
+
+#[test]
+fn what_has_no_depth_does_not_count_and_the_median_lies_between_the_middle_two() {
+    let camera = Camera::from_pinhole(30, 10, Pinhole { fx: 10.0, fy: 10.0, cx: 15.0, cy: 5.0 });
+    let places = [(3, 10.5), (9, 11.0), (15, 13.0), (21, 17.0), (27, 0.0)];
+    let mut depth_m = vec![0.0; 300];
+    let mut points_m = Vec::new();
+    for (column, rendered_m) in places {
+        depth_m[5 * 30 + column] = rendered_m;
+        points_m.push(DVec3::new(column as f64 + 0.5 - 15.0, 0.5, 10.0));
+    }
+    let map = DepthMap {
+        camera: &camera,
+        world_from_camera: &Pose::IDENTITY,
+        depth_m: &depth_m,
+        opacity: &vec![1.0; 300],
+        counts: None,
+    };
+    let found = LidarDepth::of(&points_m, &map);
+    assert_eq!((found.points, found.mean_m, found.median_m), (4, 2.875, 2.0));
 }
 
 #[test]

@@ -79,6 +79,15 @@ fn json_and_csv_have_words_for_infinity_and_nan() {
 }
 
 #[test]
+fn flip_is_the_mean_of_its_map_and_an_aligned_image_keeps_its_noise() {
+    let noisy = scores(20, None);
+    let sum: f64 = noisy.error_map.iter().map(|error| f64::from(*error)).sum();
+    near(noisy.scores.flip, sum / 256.0);
+    let aligned = noisy.scores.aligned.unwrap();
+    assert!(aligned.ssim < 0.9999, "{aligned:?}");
+}
+
+#[test]
 fn a_gain_is_the_mean_after_the_repair_minus_the_mean_before() {
     let before = [scores(20, Some(0.5)), scores(8, Some(0.3))];
     let after = [scores(4, Some(0.2)), scores(2, Some(0.25))];

@@ -69,6 +69,9 @@ def run(package: str, faults: list[Fault], copies: list[Copy]) -> int:
 def chosen(faults: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
     """Those that the command line chooses: all, or those of the files that it names."""
     names = sys.argv[1:]
+    unknown = [name for name in names if all(fault[0] != name for fault in faults)]
+    if unknown:
+        sys.exit(f"no faults are listed for {', '.join(unknown)}")
     return [fault for fault in faults if not names or fault[0] in names]
 
 

@@ -2,14 +2,21 @@
 
 use rayon::prelude::*;
 
-use super::Scratch;
+use super::{Scratch, StageTimer};
+use crate::FrameStats;
 use crate::layout::Cutoffs;
 use crate::stage::{SplatOwner, Stage, StageOutputs, TileLists};
 
 /// Copies the outputs of the stages up to and including `last`. Splats are numbered without the gaps at the
 /// ends of pages.
-pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -> StageOutputs {
+pub(super) fn stage_outputs(
+    scratch: &Scratch,
+    last: Stage,
+    cutoffs: &Cutoffs,
+    stats: &mut FrameStats,
+) -> StageOutputs {
     let Scratch { projected, bins } = scratch;
+    let mut timer = StageTimer::start();
     let mut outputs = StageOutputs::default();
     // The number of the splat at each place.
     let mut index_of_place = vec![0; projected.places()];
@@ -26,11 +33,13 @@ pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -
         }
     }
     let index = |place: u32| index_of_place[place as usize];
+    timer.finish("hand over", stats);
     if last >= Stage::Sort {
         // The cpu backend itself needs no order of whole views. The sort is stable: equal keys keep the order of global ids.
         let mut order: Vec<u32> = (0..outputs.splats.len() as u32).collect();
         order.par_sort_by_key(|&splat| outputs.keys[splat as usize]);
         outputs.order = Some(order);
+        timer.finish("sort", stats);
     }
     if last >= Stage::Bin {
         let mut lists = TileLists::default();
@@ -45,6 +54,7 @@ pub(super) fn stage_outputs(scratch: &Scratch, last: Stage, cutoffs: &Cutoffs) -
             }
         }
         outputs.tiles = Some(lists);
+        timer.finish("hand over", stats);
     }
     outputs
 }

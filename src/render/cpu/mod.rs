@@ -148,9 +148,7 @@ impl Cpu {
         pool.install(|| {
             let mut stats = FrameStats::default();
             scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
-            let mut timer = StageTimer::start();
-            let outputs = export::stage_outputs(scratch, last, &cutoffs);
-            timer.finish("hand over", &mut stats);
+            let outputs = export::stage_outputs(scratch, last, &cutoffs, &mut stats);
             Ok((outputs, stats))
         })
     }

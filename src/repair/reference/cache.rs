@@ -1,7 +1,9 @@
 //! References in memory, up to a number of bytes: the least recently used go first.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
+
+use parking_lot::Mutex;
 
 use super::Reference;
 
@@ -46,7 +48,7 @@ impl ReferenceCache {
 
     /// A reference, if it is in memory.
     pub fn get(&self, key: &ReferenceKey) -> Option<Arc<Reference>> {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.state.lock();
         state.clock += 1;
         let used = state.clock;
         let entry = state.entries.get_mut(key)?;
@@ -60,7 +62,7 @@ impl ReferenceCache {
         if bytes > self.limit_bytes {
             return;
         }
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = self.state.lock();
         state.clock += 1;
         let used = state.clock;
         if let Some(before) = state.entries.insert(key, Entry { reference, used }) {
@@ -77,7 +79,7 @@ impl ReferenceCache {
 
     /// References in memory, and their bytes.
     pub fn held(&self) -> (usize, u64) {
-        let state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = self.state.lock();
         (state.entries.len(), state.bytes)
     }
 }

@@ -8,9 +8,10 @@
 //! [`STEP_M`] on its drive, with the session's cameras: nothing new in it, but the twin is right there, and wrong
 //! beside the drive.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use glam::DVec3;
+use parking_lot::Mutex;
 
 use wildcity_render::View;
 use wildcity_repair::reference::{Projection, ReferenceKey};
@@ -258,15 +259,14 @@ impl ReferenceViews {
 
     /// How a camera projects.
     pub(crate) fn projection(&self, camera: &Camera) -> Arc<Projection> {
-        let lock = || self.projections.lock().unwrap_or_else(PoisonError::into_inner);
         let find = |all: &[(Camera, Arc<Projection>)]| {
             all.iter().find(|(own, _)| own == camera).map(|(_, projection)| projection.clone())
         };
-        if let Some(known) = find(&lock()) {
+        if let Some(known) = find(&self.projections.lock()) {
             return known;
         }
         let projection = Arc::new(Projection::of(camera));
-        let mut all = lock();
+        let mut all = self.projections.lock();
         if all.len() < PROJECTIONS {
             all.push((*camera, projection.clone()));
         }
