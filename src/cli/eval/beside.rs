@@ -15,9 +15,8 @@ use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_session::{OfflineView, RenderedImage};
 
-use super::compared::expose;
 use super::drive::{DrivePlace, Drives};
-use super::renderer::{Renderer, covered};
+use super::renderer::{Renderer, covered, expose};
 use super::repairer::Repairer;
 
 /// Largest distance from the drive, in metres.

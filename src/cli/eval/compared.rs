@@ -6,12 +6,11 @@ use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::srgb::change_stops;
 use wildcity_session::{OfflineView, RenderedImage};
 
 use super::beside::Lens;
 use super::networks::Networks;
-use super::renderer::covered;
+use super::renderer::{covered, expose};
 use super::{Eval, Setup};
 use crate::cli::real_images::{RealImage, own_vehicle, picture};
 
@@ -141,19 +140,6 @@ fn repaired(
         kept: None,
     };
     Ok(Some(repairer.repair(&setup.renderer, &of, profile)?.rgb8))
-}
-
-/// Brings what was rendered and repaired from the exposure of the twin to that of a real image, if it is known.
-pub(super) fn expose(
-    stops: Option<f64>,
-    rendered: &mut RenderedImage,
-    repaired: &mut Option<Vec<u8>>,
-) {
-    let Some(stops) = stops else { return };
-    change_stops(&mut rendered.rgb8, stops);
-    if let Some(rgb8) = repaired {
-        change_stops(rgb8, stops);
-    }
 }
 
 /// The pixels that count: not masked, and within the lens' field.

@@ -3,6 +3,7 @@
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
+use wildcity_scene::srgb::change_stops;
 use wildcity_session::RenderedImage;
 
 use crate::cli::profile_options::LoadedProfile;
@@ -71,4 +72,17 @@ impl Renderer {
 pub(super) fn covered(image: &RenderedImage) -> f64 {
     let covered = image.opacity.iter().filter(|opacity| **opacity >= 0.5).count();
     covered as f64 / image.opacity.len() as f64
+}
+
+/// Brings what was rendered and repaired from the exposure of the twin to that of a real image, if it is known.
+pub(super) fn expose(
+    stops: Option<f64>,
+    rendered: &mut RenderedImage,
+    repaired: &mut Option<Vec<u8>>,
+) {
+    let Some(stops) = stops else { return };
+    change_stops(&mut rendered.rgb8, stops);
+    if let Some(rgb8) = repaired {
+        change_stops(rgb8, stops);
+    }
 }
