@@ -63,7 +63,7 @@ pub(super) struct Push {
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     settings: Vec<String>,
 
-    /// Description of this version.
+    /// Description of this version; `wildcity inspect` shows it.
     #[arg(long)]
     note: Option<String>,
 

@@ -194,7 +194,7 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
         "--rig",
         "drive/rig.json",
     ];
-    assert!(done(at, &give).contains("version 3: drives capture"));
+    assert!(done(at, &give).contains("version 3: recorded drives: capture; rig: capture"));
     let [second, third] = [2, 3].map(|number| catalog.version("street", Some(number)).unwrap());
     assert_eq!(second.manifest.chunks, third.manifest.chunks);
     assert_eq!(third.manifest.rig.unwrap().name, "capture");

@@ -49,6 +49,7 @@ from .protocol import (
     Welcome,
     decode_answer,
     encode,
+    to_json,
 )
 from .shared_memory import SharedMemory
 
@@ -263,8 +264,7 @@ class SessionProtocol:
         return result
 
     def _ask(self, kind: str, seq: int, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
-        # Raises ValueError for NaN and infinity, which JSON cannot represent.
-        request = json.dumps({"type": kind, "seq": seq, **fields}, allow_nan=False)
+        request = to_json({"type": kind, "seq": seq, **fields})
         if self.memory is not None and answer in (Observation, Many):
             self.memory.check_next_slot()
         message = yield request

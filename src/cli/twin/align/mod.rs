@@ -134,7 +134,7 @@ impl Align {
         let picture = picture.unwrap_or_else(|| format!("{}-align.png", self.twin.name).into());
         let png = picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
         output::write(&picture, &png)?;
-        writeln!(io::stdout().lock(), "picture {}", picture.display())?;
+        writeln!(io::stdout().lock(), "picture     {}", picture.display())?;
         if !self.apply {
             writeln!(io::stdout().lock(), "nothing is changed: look at it, then give --apply")?;
             return Ok(());
@@ -175,12 +175,13 @@ fn print_proposal(ground: &GroundPlane, alignment: &Alignment) -> anyhow::Result
     let mut out = io::stdout().lock();
     let DVec3 { x, y, z } = ground.up;
     let tilt_degrees = ground.up.angle_between(DVec3::Z).to_degrees();
-    let height = -ground.up.dot(ground.point);
+    let height = ground.up.dot(ground.point);
+    let below = if height < 0.0 { "below" } else { "above" };
     writeln!(
         out,
-        "ground: up is ({x:.4}, {y:.4}, {z:.4}), {tilt_degrees:.2} degrees from z; the origin is {height:.3} above it"
+        "ground      {:.3} {below} the origin; up is ({x:.4}, {y:.4}, {z:.4}), {tilt_degrees:.2} degrees from z",
+        height.abs()
     )?;
-    writeln!(out, "scale: {} m per unit", alignment.metres_per_unit)?;
-    writeln!(out, "alignment {alignment}")?;
+    writeln!(out, "scale       {} m per unit", alignment.metres_per_unit)?;
     Ok(())
 }
