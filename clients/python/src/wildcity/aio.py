@@ -18,6 +18,7 @@ from .session_protocol import (
     SessionProtocol,
     authorization_headers,
     can_reuse_connection,
+    connect_failed,
     translate_error,
 )
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
@@ -191,9 +192,7 @@ class Client:
         try:
             connection = await connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS)
         except (OSError, ValueError, WebSocketException) as error:
-            is_session = self.url.startswith(("ws://", "wss://")) and self.url.endswith("/v1/session")
-            hint = "" if is_session else "; the address of a server is ws://HOST:PORT/v1/session"
-            raise ConnectFailed(f"cannot connect to {self.url}: {error}{hint}") from error
+            raise connect_failed(self.url, error) from error
         self._connection = connection
         if connection.subprotocol != PROTOCOL:
             await self.close()
