@@ -135,7 +135,7 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     let said = done(at, &align);
     assert!(said.contains("scale       2 m") || said.contains("scale       1.999999"), "{said}");
     assert!(said.contains("nothing is changed"), "{said}");
-    assert!(said.contains("street-align.png, with a grid of 2 m\n"), "{said}");
+    assert!(said.contains("street-align.png, with a grid of 20 m\n"), "{said}");
     let picture = image::open(at.join("street-align.png")).unwrap().into_rgb8();
     let mean = |from: u32| {
         let half = picture.height() / 2;
