@@ -20,7 +20,7 @@ use super::serve::Serve;
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
 ///
 /// Prints one line for each check. A line that begins with `bad` says what to do; then the exit code is 1.
-/// `note` is no obstacle. Nothing is changed: to see whether a directory can be written, a file without a name
+/// `note` is for information only. Nothing is changed: to see whether a directory can be written, a file without a name
 /// in it is created and removed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]

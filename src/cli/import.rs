@@ -12,9 +12,10 @@ use wildcity_scene::{RecordFormat, RenderProfile};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
-use super::input_files::{read_rig, read_trajectories};
+use super::input_files::read_trajectories;
 use super::profile_options::ProfileOptions;
 use super::progress;
+use super::rig::rig_of;
 use super::sky_source::SkySource;
 
 /// Make a twin from a trained scene, or a new version of an existing twin.
@@ -43,7 +44,7 @@ pub(super) struct Import {
     ///
     /// identity: z is up already.
     /// y-down-z-forward: OpenCV, COLMAP; most captures.
-    /// y-up-z-back: OpenGL, glTF.
+    /// y-up-z-back: OpenGL, SPZ.
     /// y-up-z-forward: Unity, left-handed.
     #[arg(long, default_value = "identity", allow_hyphen_values = true, verbatim_doc_comment)]
     axes: String,
@@ -52,10 +53,11 @@ pub(super) struct Import {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     scale: f64,
 
-    /// JSON file of the vehicle's cameras (see below). They become the twin's default rig. A version that is
-    /// imported without this option has no default rig, even if the version before had one.
-    #[arg(long, value_name = "FILE")]
-    rig: Option<PathBuf>,
+    /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They become the
+    /// twin's default rig. A version that is imported without this option has no default rig, even if the
+    /// version before had one.
+    #[arg(long, value_name = "RIG")]
+    rig: Option<String>,
 
     /// JSON file of a recorded drive (see below), in the twin's axes and metres. May be given again. A version
     /// has only the drives that its own import names.
@@ -108,8 +110,8 @@ Examples:
   wildcity import street.safetensors --twin street --rig car.json --trajectory log.json
   wildcity import old.ply --twin old --axes '0 0 1 -1 0 0 0 -1 0' --scale 0.01
 
-Rig file: sizes and intrinsics are in pixels, camera_to_rig is in metres. Cameras have x right, y down, z
-forward; the rig has x forward, y left, z up. q is (w, x, y, z). This camera looks straight ahead:
+Rig file: sizes and intrinsics are in pixels, camera_to_rig is in metres. Camera axes are x right,
+y down, z forward; rig axes are x forward, y left, z up. q is (w, x, y, z). This camera looks ahead:
   {\"name\": \"car\", \"cameras\": [
     {\"name\": \"front\", \"width\": 1440, \"height\": 928,
      \"fx\": 1800, \"fy\": 1800, \"cx\": 720, \"cy\": 464,
@@ -129,7 +131,7 @@ impl Import {
         let axes = SourceAxes::parse(&self.axes, self.scale)?;
         let profile = self.profile.load()?.apply(RenderProfile::default())?;
         let sky = self.sky.read(&self.axes)?;
-        let rig = self.rig.as_deref().map(read_rig).transpose()?;
+        let rig = self.rig.as_deref().map(rig_of).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = self.twins.catalog()?;
 

@@ -244,7 +244,7 @@ impl<'a> ListBuilder<'a> {
         if !self.twin.has_non_pinhole {
             self.skip(
                 "lens_error_px",
-                "every camera is a pinhole at rest, which has no six points",
+                "every camera is a pinhole at rest, for which nothing is approximated",
             );
             return;
         }

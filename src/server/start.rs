@@ -40,7 +40,9 @@ pub enum ServerError {
         address: SocketAddr,
     },
     /// The address cannot be used.
-    #[error("cannot listen on {address}: {cause}")]
+    #[error(
+        "cannot listen on {address}: {cause}; stop the program that uses it, or give another --listen"
+    )]
     Listen {
         /// The address.
         address: SocketAddr,

@@ -72,7 +72,7 @@ impl EpisodeStart {
         let drive = drive_of(drives, "start.trajectory", name)?;
         let length_m = drive.length_m();
         if !(0.0..=length_m).contains(&station_m) {
-            let must = format!("{station_m} m; {name:?} is from 0 to {length_m} m long");
+            let must = format!("{station_m} m; trajectory {name:?} is {length_m} m long");
             return Err(SessionError::OutOfRange { field: "start.station_m", must });
         }
         if warm_up_us == 0 {

@@ -133,8 +133,9 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     let (from, to) = (point(from), point(to));
     let align = ["twin", "align", "street", "--from", &from, "--to", &to, "--distance-m", &metres];
     let said = done(at, &align);
-    assert!(said.contains("scale: 2") || said.contains("scale: 1.999999"), "{said}");
+    assert!(said.contains("scale       2 m") || said.contains("scale       1.999999"), "{said}");
     assert!(said.contains("nothing is changed"), "{said}");
+    assert!(said.contains("street-align.png, with a grid of 20 m\n"), "{said}");
     let picture = image::open(at.join("street-align.png")).unwrap().into_rgb8();
     let mean = |from: u32| {
         let half = picture.height() / 2;
@@ -194,7 +195,7 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
         "--rig",
         "drive/rig.json",
     ];
-    assert!(done(at, &give).contains("version 3: drives capture"));
+    assert!(done(at, &give).contains("version 3: recorded drives: capture; rig: capture"));
     let [second, third] = [2, 3].map(|number| catalog.version("street", Some(number)).unwrap());
     assert_eq!(second.manifest.chunks, third.manifest.chunks);
     assert_eq!(third.manifest.rig.unwrap().name, "capture");
@@ -209,6 +210,15 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     assert!(told.contains("version 4 was pushed") && told.contains("give --axes"), "{told}");
     assert!(!at.join("four").exists());
     done(at, &route("street@3"));
+
+    // 6. A preset is a rig, and the log says which versions are edits.
+    let preset = done(at, &["twin", "drive", "street", "--rig", "vehicle6"]);
+    assert!(preset.contains("version 5: recorded drives: capture; rig: vehicle6"), "{preset}");
+    let none = refused(at, &["twin", "drive", "street", "--rig", "vehicle7"]);
+    assert!(none.contains("\"vehicle7\" is neither a file nor a preset"), "{none}");
+    let log = done(at, &["twin", "log", "street"]);
+    let how: Vec<&str> = log.lines().map(|line| line[30..46].trim()).collect();
+    assert_eq!(how, ["import", "edit of 1", "edit of 2", "push of 3", "edit of 4"], "{log}");
 }
 
 #[test]

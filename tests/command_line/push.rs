@@ -26,9 +26,11 @@ async fn a_file_is_pushed_and_reported() {
     let (out, err) =
         (String::from_utf8(done.stdout).unwrap(), String::from_utf8(done.stderr).unwrap());
     assert!(done.status.success(), "{out}{err}");
-    for line in
-        ["block.ply: 40 Gaussians", "1: 32 Gaussians before, 40 after", "version 2 is ready"]
-    {
+    for line in [
+        "block.ply: 40 Gaussians",
+        "1 replaced: 32 Gaussians before, 40 after",
+        "version 2 is ready",
+    ] {
         assert!(out.contains(line), "no {line:?} in {out}");
     }
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 2);

@@ -150,6 +150,7 @@ fn devices_pipes_and_files_for_directories_are_refused_at_once() {
     fs::write(&file, b"").unwrap();
     for (arguments, code, wanted) in [
         (vec!["import", "/dev/zero", "--twin", "a"], 1, "not a regular file but a pipe, a socket"),
+        (vec!["import", "/", "--twin", "a"], 1, "a folder; give a file in it"),
         (vec!["serve", "--twins", &file], 1, "is not a directory"),
         (vec!["serve", "--listen", "localhost:0"], 2, "an address and a port, as 127.0.0.1:8080"),
     ] {

@@ -25,7 +25,7 @@ from test_end_to_end import PAIR, import_corridor
 from wildcity import Camera, Exposure, Outputs, Pose, Rig, png_data_uri
 
 SCENE = "corridor@1+log+0"
-# Exact in f32, so that both doors get the same bits.
+# Exact in f32, so that both interfaces get the same bits.
 HERE = (3.0, 0.25, 1.5)
 FORWARD = (0.5, -0.5, 0.5, -0.5)
 AT = 1_700_000_000_000_000

@@ -77,10 +77,22 @@ def test_a_refused_request_keeps_its_number(connect: Connect) -> None:
 def test_a_request_that_json_cannot_represent_is_not_sent(connect: Connect) -> None:
     with FakeServer(["welcome", "opened", OBSERVATION]) as server:
         client = connect(server.url)
-        with pytest.raises(ValueError, match="Out of range|not JSON compliant"):
+        with pytest.raises(ValueError, match="^seed is not a finite number"):
             client.open("street", seed=float("nan"))
-        client.open("street").step(HERE)
+        session = client.open("street")
+        with pytest.raises(ValueError, match=r"^action\.curvature is not a finite number"):
+            session.step(wildcity.Action(0.0, float("inf")))
+        session.step(HERE)
     assert seqs(server.requests[0]) == [0, 1, 2]
+
+
+def test_an_address_that_is_not_that_of_sessions_is_explained(connect: Connect) -> None:
+    for url in ("http://127.0.0.1:1", "127.0.0.1:1", "ws://127.0.0.1:1"):
+        with pytest.raises(wildcity.ConnectFailed, match="is ws://HOST:PORT/v1/session$"):
+            connect(url)
+    with pytest.raises(wildcity.ConnectFailed) as failed:
+        connect("ws://127.0.0.1:1/v1/session")
+    assert "HOST" not in str(failed.value)
 
 
 def test_a_server_that_does_not_read_ends_in_a_time_out(connect: Connect) -> None:

@@ -312,6 +312,12 @@ def test_frames_of_a_camera_are_in_the_order_they_were_taken() -> None:
     assert frames[:, 0, 0, 2].tolist() == [103, 53, 3]
     with pytest.raises(KeyError, match="roof"):
         observation.frames("roof")
+    with pytest.raises(KeyError, match="'roof': images are of front"):
+        _ = observation.images["roof"]
+    with pytest.raises(KeyError, match=r"Outputs\(depth=True\)"):
+        _ = observation.depth["front"]
+    with pytest.raises(KeyError, match=r"Sensors\(imu=Imu\(\)\)"):
+        _ = observation.imu
 
 
 def test_raw_tensors_are_read_in_place() -> None:

@@ -22,7 +22,7 @@ use crate::cli::directories::{TwinVersion, Twins};
 
 /// Lift what lies in a box out of a twin: makes a new version without it, and an asset of exactly these Gaussians.
 ///
-/// For parked cars that shall drive away. Everything from 5 cm above the bottom of the box on is cut; the ground stays.
+/// This lets a parked car drive away. Everything from 5 cm above the bottom of the box on is cut; the ground stays.
 /// Where the car hid the ground, the new version may have a hole, which shows in the opacity. Open sessions keep the
 /// version that they have.
 #[derive(Debug, clap::Args)]

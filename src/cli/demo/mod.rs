@@ -45,8 +45,9 @@ use super::{output, progress, view};
 ///
 /// With --scenario, there is traffic: the agent keeps its distance from other vehicles and pedestrians.
 ///
-/// With --off-trajectory, it does not drive. It draws views beside the drive from a spoiled copy of the street, which
-/// is wrong there as captures are, and compares them with the street itself; with --repair also after the repair.
+/// With --off-trajectory, it does not drive. It draws views beside the drive from a copy of the street that is
+/// damaged there, as real captures are, and compares them with the street itself: without a repair, and with --repair
+/// also after.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {

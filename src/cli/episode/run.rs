@@ -24,20 +24,20 @@ use super::{bad_input, exit};
 ///
 /// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if no
 /// episode failed by driving, 1 if one did, 2 if the command line, the suite, a scenario or the run of --against is wrong or
-/// the agent is a command that is not there, 3 if an episode was not driven for technical reasons or more than a tenth of
+/// the agent cannot be started, 3 if an episode was not driven for technical reasons or more than a tenth of
 /// them left the trained area, 4 if an episode does not repeat (--verify).
 ///
-/// With --at-least episodes may fail: 0 and 1 say whether the pass rate is as wanted. With --against they say whether the
-/// run is worse than one before, as `wildcity episode compare` does; comparison.json and comparison.html are written too.
-/// With both, both must be so. junit.xml has every failure in any case, and the exit code as a property.
+/// With --at-least and --against, episodes may fail and the exit code be 0. --at-least requires a pass rate, and
+/// --against that the run is not worse than an earlier one, as `wildcity episode compare` judges; it also writes
+/// comparison.json and comparison.html. junit.xml has every failure all the same, and the exit code as a property.
 ///
-/// An episode that was driven as another one of its scenario was is a duplicate, and is in no rate and no mean: two seeds
-/// of a scenario without jitter are the same episode.
+/// Two episodes of a scenario that were driven alike count once in rates and means: two seeds of a scenario without
+/// jitter are the same episode.
 ///
-/// An agent that is a command is started by the shell, once for each episode. It finds in its environment
-/// WILDCITY_URL, WILDCITY_OPEN (the fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and
-/// WILDCITY_STEPS (after which it closes its session). It ends with exit code 0, or 124 if it ran out of time, 69 if what
-/// it needs went away.
+/// The shell starts the command of --agent once for each episode, with these variables in its environment:
+/// WILDCITY_URL, WILDCITY_OPEN (fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and WILDCITY_STEPS
+/// (after which it closes its session). docs/suites.md has an example. The command ends with exit code 0, or 124 if
+/// it ran out of time, 69 if something that it needs went away.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Run {
@@ -66,7 +66,7 @@ pub(super) struct Run {
     #[arg(long, value_name = "S", default_value_t = wildcity_suite::limits::AGENT_TIMEOUT.as_secs())]
     agent_timeout_s: u64,
 
-    /// The least pass rate, from 0 to 1, held against the lower end of its 95 % interval [default: that of the
+    /// The least pass rate, from 0 to 1: the lower end of its 95 % interval must reach it [default: that of the
     /// suite; without one every episode must pass]
     #[arg(long, value_name = "RATE")]
     at_least: Option<f64>,

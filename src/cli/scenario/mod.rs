@@ -14,7 +14,7 @@ use wildcity_session::{ScenarioSource, Scenarios};
 use wildcity_sim::scenario::Document;
 use wildcity_twin::store::{Catalog, Version};
 
-/// Check scenarios, show what they come to, and read those of other formats.
+/// Check scenarios, show one as an episode runs it, and read those of other formats.
 ///
 /// A scenario is a JSON file: a twin, an ego, actors, a route, and when an episode ends. The tracks and maps that it
 /// names are in the same directory. docs/scenarios.md explains every field.

@@ -7,7 +7,8 @@ use wildcity_twin::store::{CommitKind, Edit};
 
 use super::change;
 use crate::cli::directories::{TwinVersion, Twins};
-use crate::cli::input_files::{read_rig, read_trajectories};
+use crate::cli::input_files::read_trajectories;
+use crate::cli::rig::rig_of;
 
 /// Give a twin recorded drives and a rig: makes a new version with the same Gaussians.
 ///
@@ -27,9 +28,9 @@ pub(in crate::cli) struct Drive {
     #[arg(long, value_name = "FILE")]
     trajectory: Vec<PathBuf>,
 
-    /// JSON file of the vehicle's cameras.
-    #[arg(long, value_name = "FILE")]
-    rig: Option<PathBuf>,
+    /// The vehicle's cameras: a preset (see `wildcity rig show`), or a JSON file as `wildcity import --help` shows it.
+    #[arg(long, value_name = "RIG")]
+    rig: Option<String>,
 
     #[command(flatten)]
     twins: Twins,
@@ -38,7 +39,7 @@ pub(in crate::cli) struct Drive {
 impl Drive {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let trajectories = read_trajectories(&self.trajectory)?;
-        let rig = self.rig.as_deref().map(read_rig).transpose()?;
+        let rig = self.rig.as_deref().map(rig_of).transpose()?;
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.twin.name, self.twin.number)?;
         let alignment = Alignment::IDENTITY;
@@ -46,6 +47,8 @@ impl Drive {
         let version = catalog.edit(&base, edit, &mut |_, _| {})?;
         let names: Vec<&str> =
             version.manifest.trajectories.iter().map(|drive| drive.name.as_str()).collect();
-        change::print(&version, &format!("drives {}", names.join(", ")))
+        let drives = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+        let rig = version.manifest.rig.as_ref().map_or("none", |rig| rig.name.as_str());
+        change::print(&version, &format!("recorded drives: {drives}; rig: {rig}"))
     }
 }

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 use crate::cli::time::utc;
-use wildcity_twin::store::LogEntry;
+use wildcity_twin::store::{CommitKind, LogEntry};
 
 /// Show all versions of a twin, oldest first: when and how each was made, and from which version.
 #[derive(Debug, clap::Args)]
@@ -37,7 +37,9 @@ impl Log {
                 writeln!(out, "{line}")?;
             } else {
                 let from = parent.map_or(String::new(), |parent| format!(" of {parent}"));
-                let how = format!("{kind}{from}");
+                // A new file has no parent: an import of a version is an edit of it, such as an alignment.
+                let edited = kind == CommitKind::Import && parent.is_some();
+                let how = if edited { format!("edit{from}") } else { format!("{kind}{from}") };
                 let when = utc(created_us);
                 writeln!(out, "{number:>6}  {when}  {how:<16}  {hash}")?;
             }

@@ -28,7 +28,7 @@ impl Rollback {
         let version = self.twins.catalog()?.rollback(&self.twin, self.number)?;
         writeln!(
             io::stdout(),
-            "twin {} version {} is version {}: {}",
+            "twin {} version {} has the content of version {}\nblake3 {}",
             self.twin,
             version.number,
             self.number,

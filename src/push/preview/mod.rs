@@ -102,7 +102,7 @@ fn reason_for_no_preview(
     }
     match &request.preview_poses {
         None if manifest.trajectories.is_empty() => {
-            "the twin has no trajectory: name golden.poses".to_owned()
+            "the twin has no recorded drive: give it one (`wildcity twin drive`), or name golden.poses".to_owned()
         }
         Some(poses) if poses.is_empty() => "golden.poses names none".to_owned(),
         _ => "a camera of the twin's rig cannot be drawn smaller: leave it out".to_owned(),

@@ -46,8 +46,8 @@ pub enum GroundError {
     },
     /// No plane has enough of the scene on it.
     #[error(
-        "no plane has {least_percent} % of the scene on it and little of it below; give the direction of up, or \
-         three points of the ground"
+        "found no ground: no plane has {least_percent} % of the scene on it and little of it below; choose three \
+         points of the ground in the viewer, or give the heights of a drive yourself (docs/scenes.md)"
     )]
     NoPlane {
         /// Least share of the scene, in percent.

@@ -23,7 +23,7 @@ struct File {
 #[serde(deny_unknown_fields)]
 struct Entry {
     name: String,
-    role: Role,
+    role: String,
     token: Option<String>,
     hash: Option<String>,
     twins: Option<BTreeSet<String>>,
@@ -76,6 +76,14 @@ impl Tokens {
                 let reason = format!("a name of {bytes} bytes; choose one of at most {most}");
                 return Err(wrong(format!("tokens[{index}].name"), &reason));
             }
+            // The message does not repeat the role: a token may stand in its place.
+            let role = Role::named(&role).ok_or_else(|| {
+                let roles = Role::ALL.map(Role::name).join(", ");
+                wrong(
+                    format!("tokens[{index}].role"),
+                    &format!("no such role; the roles are {roles}"),
+                )
+            })?;
             let secret = match (token, hash) {
                 (Some(token), None) if token.len() >= MIN_TOKEN_BYTES => {
                     Secret::OfToken(blake3::hash(token.as_bytes()))
@@ -134,8 +142,8 @@ mod tests {
         for (text, location) in [
             (r#"{"tokens": []}"#, "tokens"),
             (
-                r#"{"tokens": [{"name": "a", "role": "king", "token": "secretsecretsecret"}]}"#,
-                "line",
+                r#"{"tokens": [{"name": "a", "role": "secret", "token": "secretsecretsecret"}]}"#,
+                "tokens[0].role: no such role; the roles are metrics, drive, push, admin",
             ),
             (r#"{"tokens": ["secretsecretsecret"]}"#, "line"),
             (

@@ -8,8 +8,7 @@ use serde::Deserialize;
 use crate::fault::Fault;
 
 /// What the holder of a token may do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Read the metrics, and nothing else.
     Metrics,
@@ -121,7 +120,15 @@ impl Role {
         self == role || self == Self::Admin || (self == Self::Push && role == Self::Drive)
     }
 
-    fn name(self) -> &'static str {
+    /// Every role.
+    pub(super) const ALL: [Self; 4] = [Self::Metrics, Self::Drive, Self::Push, Self::Admin];
+
+    /// The role of this name.
+    pub(super) fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|role| role.name() == name)
+    }
+
+    pub(super) fn name(self) -> &'static str {
         match self {
             Self::Metrics => "metrics",
             Self::Drive => "drive",

@@ -31,7 +31,7 @@ const PRESETS: [(&str, &str, [[f64; 3]; 3]); 4] = [
     ),
     (
         "y-up-z-back",
-        "OpenGL, glTF: x right to east, -z forward to north, y up",
+        "OpenGL, SPZ: x right to east, -z forward to north, y up",
         [[1., 0., 0.], [0., 0., -1.], [0., 1., 0.]],
     ),
     (

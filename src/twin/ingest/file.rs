@@ -10,18 +10,23 @@ pub enum FileError {
     /// An I/O operation failed.
     #[error("cannot read: {0}")]
     Io(io::Error),
-    /// A pipe or a device has no size to check and may never end; a directory has no bytes.
-    #[error("not a regular file but {found}; copy its content into a file, and give that")]
-    NotRegular {
-        /// What it is instead.
-        found: &'static str,
-    },
+    /// A pipe or a device has no size to check and may never end.
+    #[error(
+        "not a regular file but a pipe, a socket or a device; copy its content into a file, and give that"
+    )]
+    NotRegular,
+    /// A folder has no bytes.
+    #[error(
+        "a folder; give a file in it, of a scene in a folder its meta.json, lod-meta.json or .gltf"
+    )]
+    Folder,
     /// Another file names it, and it is not within that file's folder.
     #[error("is not a plain path below the folder of the file that names it; move it there")]
     OutsideFolder,
     /// A scene of a push names it, and the push has none or several files of this name.
     #[error(
-        "is not the name of exactly one file of this push; push it together with the file that names it"
+        "is not the name of exactly one file of this push; push it together with the file that names it, or a \
+         streamed SOG as one .zip"
     )]
     NotListed,
     /// The scene names it again.
@@ -89,7 +94,7 @@ fn check_regular(metadata: &fs::Metadata) -> Result<(), FileError> {
     let kind = metadata.file_type();
     match (kind.is_file(), kind.is_dir()) {
         (true, _) => Ok(()),
-        (_, true) => Err(FileError::NotRegular { found: "a directory" }),
-        _ => Err(FileError::NotRegular { found: "a pipe, a socket or a device" }),
+        (_, true) => Err(FileError::Folder),
+        _ => Err(FileError::NotRegular),
     }
 }

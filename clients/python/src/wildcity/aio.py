@@ -18,6 +18,7 @@ from .session_protocol import (
     SessionProtocol,
     authorization_headers,
     can_reuse_connection,
+    connect_failed,
     translate_error,
 )
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
@@ -191,7 +192,7 @@ class Client:
         try:
             connection = await connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS)
         except (OSError, ValueError, WebSocketException) as error:
-            raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
+            raise connect_failed(self.url, error) from error
         self._connection = connection
         if connection.subprotocol != PROTOCOL:
             await self.close()

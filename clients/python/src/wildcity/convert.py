@@ -68,8 +68,10 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
     found = models(source)
     if model is None:
         if len(found) != 1:
-            names = ", ".join(repr(name) for name in found) or "none"
-            raise CheckpointError(f"{source}: models of Gaussians: {names}; name one of them")
+            if not found:
+                raise CheckpointError(f"{source} has no Gaussians of gsplat, drivestudio, splatfacto or INRIA")
+            names = ", ".join(repr(name) for name in found)
+            raise CheckpointError(f"{source} has several models: choose one of {names} (--model)")
         return next(iter(found.values()))
     if model not in found:
         names = ", ".join(repr(name) for name in found)

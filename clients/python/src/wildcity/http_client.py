@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from .errors import ConnectFailed, ProtocolError, Refused
+from .protocol import to_json
 
 ATTEMPTS = 6
 """How many attempts in a row may fail without transferring a byte."""
@@ -53,7 +54,7 @@ class HttpClient:
         sent = dict(headers or {})
         if self._token:
             sent["Authorization"] = f"Bearer {self._token}"
-        content = json.dumps(body, allow_nan=False).encode() if isinstance(body, dict) else body
+        content = to_json(body).encode() if isinstance(body, dict) else body
         connection = self._connection_type(self._host, self._port, timeout=self._timeout)
         try:
             connection.connect()

@@ -76,13 +76,18 @@ class Observation:
     def imu(self) -> NDArray[np.float32]:
         """float32 [n, 6]: specific force (m/s²) and angular velocity (rad/s) in the rig's axes, for each step since
         the observation before; the last is at `metadata.time_us`. Raises `KeyError` unless the session asked for it."""
-        return self.tensor("sensor.imu")
+        return self._sensor("sensor.imu", "imu=Imu()")
 
     @property
     def wheel_speed(self) -> NDArray[np.float32]:
         """float32 [n]: speed in m/s as the wheels measure it, at the times of `imu`. Raises `KeyError` unless the
         session asked for it."""
-        return self.tensor("sensor.wheel_speed")
+        return self._sensor("sensor.wheel_speed", "wheel_speed=WheelSpeed()")
+
+    def _sensor(self, name: str, option: str) -> NDArray[Any]:
+        if name not in self._tensors:
+            raise KeyError(f"there is no {name}: open the session with sensors=Sensors({option})")
+        return self.tensor(name)
 
     @property
     def images(self) -> Mapping[str, NDArray[np.uint8]]:
@@ -215,7 +220,8 @@ class View:
     def images(self) -> Mapping[str, NDArray[np.uint8]]:
         """uint8 [height, width, 3] by camera. JPEG and PNG are decoded at the first access, and kept."""
         content = self._content
-        return _LazyArrays(self._infos, lambda image: _decode_image(content, image))
+        have = ", ".join(self._infos) or "none"
+        return _LazyArrays(self._infos, lambda image: _decode_image(content, image), f"images are of {have}")
 
     @cached_property
     def depth(self) -> Mapping[str, NDArray[np.float32]]:
@@ -240,20 +246,26 @@ class View:
     def _maps(self, output: str) -> Mapping[str, NDArray[Any]]:
         content = self._content
         present = {name: i for name, i in self._infos.items() if _sibling(i, output) in content.tensors}
-        return _LazyArrays(present, lambda image: content.tensor(_sibling(image, output)))
+        have = f"{output} is of {', '.join(present)}"
+        if not present:
+            have = f"there is no {output}: open the session with outputs=Outputs({output}=True)"
+        return _LazyArrays(present, lambda image: content.tensor(_sibling(image, output)), have)
 
 
 class _LazyArrays(Mapping[str, NDArray[Any]]):
-    """Arrays by camera, made at the first access."""
+    """Arrays by camera, made at the first access. `have` says what there is, for the error of a camera without one."""
 
     def __init__(
-        self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]]
+        self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]], have: str
     ) -> None:
         self._infos = infos
         self._make = make
+        self._have = have
         self._made: dict[str, NDArray[Any]] = {}
 
     def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._infos:
+            raise KeyError(f"{name!r}: {self._have}")
         if name not in self._made:
             self._made[name] = self._make(self._infos[name])
         return self._made[name]

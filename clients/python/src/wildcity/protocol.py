@@ -857,6 +857,30 @@ def parse_json(text: str | bytes, what: str) -> Any:
         raise ProtocolError(f"{what} is not JSON: {error}") from error
 
 
+def to_json(value: Any) -> str:
+    """The JSON of a request. Raises `ValueError` with the field if a number is NaN or infinite: JSON has none."""
+    try:
+        return json.dumps(value, allow_nan=False)
+    except ValueError as error:
+        field = _not_finite(value, "")
+        if field is None:
+            raise
+        raise ValueError(f"{field} is not a finite number") from error
+
+
+def _not_finite(value: Any, field: str) -> str | None:
+    """The first field that is NaN or infinite."""
+    if isinstance(value, float):
+        return None if math.isfinite(value) else field
+    if isinstance(value, dict):
+        found = (_not_finite(item, f"{field}.{name}" if field else str(name)) for name, item in value.items())
+    elif isinstance(value, (list, tuple)):
+        found = (_not_finite(item, f"{field}[{at}]") for at, item in enumerate(value))
+    else:
+        return None
+    return next((name for name in found if name is not None), None)
+
+
 def decode_answer(text: str) -> Any:
     """Decodes a text frame from the server as one of `ANSWERS`."""
     value = parse_json(text, "an answer")

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Subprotocol
 
-from .errors import Disconnected, ProtocolError, Refused, TimedOut, WildCityError
+from .errors import ConnectFailed, Disconnected, ProtocolError, Refused, TimedOut, WildCityError
 from .observation import Many, Observation
 from .protocol import (
     OBSERVATION_BYTES,
@@ -49,6 +49,7 @@ from .protocol import (
     Welcome,
     decode_answer,
     encode,
+    to_json,
 )
 from .shared_memory import SharedMemory
 
@@ -263,8 +264,7 @@ class SessionProtocol:
         return result
 
     def _ask(self, kind: str, seq: int, answer: type[T], fields: dict[str, Any]) -> Exchange[T]:
-        # Raises ValueError for NaN and infinity, which JSON cannot represent.
-        request = json.dumps({"type": kind, "seq": seq, **fields}, allow_nan=False)
+        request = to_json({"type": kind, "seq": seq, **fields})
         if self.memory is not None and answer in (Observation, Many):
             self.memory.check_next_slot()
         message = yield request
@@ -318,6 +318,13 @@ CONNECT_OPTIONS: dict[str, Any] = {
 def authorization_headers(token: str | None) -> dict[str, str]:
     """Additional headers of the WebSocket upgrade request."""
     return {} if token is None else {"Authorization": f"Bearer {token}"}
+
+
+def connect_failed(url: str, error: Exception) -> ConnectFailed:
+    """Why there is no connection; and what an address looks like, if this one does not look so."""
+    is_session = url.startswith(("ws://", "wss://")) and url.endswith("/v1/session")
+    hint = "" if is_session else "; the address of a server is ws://HOST:PORT/v1/session"
+    return ConnectFailed(f"cannot connect to {url}: {error}{hint}")
 
 
 def can_reuse_connection(error: BaseException) -> bool:

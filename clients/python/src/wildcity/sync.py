@@ -20,6 +20,7 @@ from .session_protocol import (
     SessionProtocol,
     authorization_headers,
     can_reuse_connection,
+    connect_failed,
     translate_error,
 )
 from .errors import ConnectFailed, Disconnected, Refused, WildCityError
@@ -195,7 +196,7 @@ class Client:
             # Entered here and closed in `close`, because it outlives any block.
             connection = connect_websocket(self.url, additional_headers=self._headers, **CONNECT_OPTIONS).__enter__()
         except (OSError, ValueError, WebSocketException) as error:
-            raise ConnectFailed(f"cannot connect to {self.url}: {error}") from error
+            raise connect_failed(self.url, error) from error
         self._connection = connection
         if connection.subprotocol != PROTOCOL:
             self.close()

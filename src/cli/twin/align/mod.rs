@@ -132,9 +132,15 @@ impl Align {
 
         let picture = self.picture.clone();
         let picture = picture.unwrap_or_else(|| format!("{}-align.png", self.twin.name).into());
-        let png = picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
+        let (png, step_m) =
+            picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
         output::write(&picture, &png)?;
-        writeln!(io::stdout().lock(), "picture {}", picture.display())?;
+        let picture = picture.display();
+        writeln!(
+            io::stdout().lock(),
+            "picture     {picture}, with a grid of {} m",
+            rounded(step_m)
+        )?;
         if !self.apply {
             writeln!(io::stdout().lock(), "nothing is changed: look at it, then give --apply")?;
             return Ok(());
@@ -171,16 +177,23 @@ impl Align {
     }
 }
 
+/// Without the rounding errors of a power of ten: 0.1 for 0.10000000000000003.
+fn rounded(step_m: f64) -> f64 {
+    let digits = 10_f64.powf((-step_m.log10()).ceil().max(0.0));
+    (step_m * digits).round() / digits
+}
+
 fn print_proposal(ground: &GroundPlane, alignment: &Alignment) -> anyhow::Result<()> {
     let mut out = io::stdout().lock();
     let DVec3 { x, y, z } = ground.up;
     let tilt_degrees = ground.up.angle_between(DVec3::Z).to_degrees();
-    let height = -ground.up.dot(ground.point);
+    let height = ground.up.dot(ground.point);
+    let below = if height < 0.0 { "below" } else { "above" };
     writeln!(
         out,
-        "ground: up is ({x:.4}, {y:.4}, {z:.4}), {tilt_degrees:.2} degrees from z; the origin is {height:.3} above it"
+        "ground      {:.3} {below} the origin; up is ({x:.4}, {y:.4}, {z:.4}), {tilt_degrees:.2} degrees from z",
+        height.abs()
     )?;
-    writeln!(out, "scale: {} m per unit", alignment.metres_per_unit)?;
-    writeln!(out, "alignment {alignment}")?;
+    writeln!(out, "scale       {} m per unit", alignment.metres_per_unit)?;
     Ok(())
 }

@@ -35,12 +35,12 @@ struct Extent {
     half: DVec3,
 }
 
-/// Draws both, as a PNG.
+/// Both, as a PNG, and the distance of the grid's lines in metres.
 pub(super) fn before_and_after(
     gaussians: Gaussians,
     alignment: &Alignment,
     profile: RenderProfile,
-) -> anyhow::Result<Vec<u8>> {
+) -> anyhow::Result<(Vec<u8>, f64)> {
     let stride = gaussians.len().div_ceil(MOST).max(1);
     let before = match stride {
         1 => gaussians,
@@ -49,7 +49,8 @@ pub(super) fn before_and_after(
     let mut after = before.clone();
     alignment.apply(&mut after);
     let aligned = Extent::of(&after);
-    let grid = grid(&aligned);
+    let step_m = grid_step(&aligned);
+    let grid = grid(&aligned, step_m);
     let old = |at_m: DVec3| {
         let new_from_old = alignment.new_from_old;
         new_from_old.inverse().transform_point(at_m / alignment.metres_per_unit)
@@ -70,7 +71,7 @@ pub(super) fn before_and_after(
     }
     let mut png = Cursor::new(Vec::new());
     all.write_to(&mut png, ImageFormat::Png)?;
-    Ok(png.into_inner())
+    Ok((png.into_inner(), step_m))
 }
 
 impl Extent {
@@ -94,12 +95,16 @@ impl Extent {
     }
 }
 
-/// Lines of the ground in the new axes, at whole steps.
-fn grid(extent: &Extent) -> Vec<[DVec3; 2]> {
+/// Distance of the grid's lines: 1, 2 or 5 times a power of ten.
+fn grid_step(extent: &Extent) -> f64 {
     let size = 2.0 * extent.half.x.max(extent.half.y);
     let decade = 10.0_f64.powf((size / LINES).log10().floor());
     let step = [1.0, 2.0, 5.0, 10.0].map(|n| n * decade).into_iter().find(|s| size / s <= LINES);
-    let step = step.unwrap_or(10.0 * decade);
+    step.unwrap_or(10.0 * decade)
+}
+
+/// Lines of the ground in the new axes, at whole steps.
+fn grid(extent: &Extent, step: f64) -> Vec<[DVec3; 2]> {
     let low = extent.middle - extent.half;
     let high = extent.middle + extent.half;
     let whole = |from: f64, to: f64| {
