@@ -241,21 +241,23 @@ fn decompressed<T>(part: &[u8], capacity: usize, take: impl FnOnce(io::Result<&[
         static KEPT: RefCell<(Option<Decompressor<'static>>, Vec<u8>)> =
             const { RefCell::new((None, Vec::new())) };
     }
-    KEPT.with_borrow_mut(|(decompressor, raw)| {
-        raw.clear();
-        let mut decompress = || -> io::Result<()> {
+    KEPT.with_borrow_mut(|(decompressor, kept)| {
+        if kept.len() < capacity {
+            kept.reserve_exact(capacity - kept.len());
+            kept.resize(capacity, 0);
+        }
+        let raw = &mut kept[..capacity];
+        let mut decompress = || -> io::Result<usize> {
             let decompressor = match decompressor {
                 Some(decompressor) => decompressor,
                 None => decompressor.insert(Decompressor::new()?),
             };
-            raw.reserve_exact(capacity);
-            decompressor.decompress_to_buffer(part, raw)?;
-            Ok(())
+            decompressor.decompress_to_buffer(part, raw)
         };
-        take(match decompress() {
-            Ok(()) => Ok(raw),
-            Err(error) => Err(error),
-        })
+        match decompress() {
+            Ok(length) => take(Ok(&kept[..length])),
+            Err(error) => take(Err(error)),
+        }
     })
 }
 
