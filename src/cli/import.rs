@@ -1,7 +1,9 @@
 //! `wildcity import`.
 
+use std::fmt;
 use std::io::Write;
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 
@@ -22,6 +24,9 @@ use super::sky_source::SkySource;
 ///
 /// The format of SRC is detected from its content, not from its extension; the formats are listed below.
 /// Every Gaussian is checked before anything is written. An import that fails leaves nothing behind.
+///
+/// Prints how long each phase took: reading and checking the file, sorting Gaussians into cells, packing cells with
+/// their levels of detail, and publishing.
 ///
 /// Memory: twice the uncompressed scene (56 bytes per Gaussian without SH, 236 with SH degree 3), and in
 /// addition the contents of an archive, a glTF buffer, or a NuRec payload.
@@ -137,10 +142,12 @@ impl Import {
 
         // 2. The scene.
         let cannot = || format!("cannot import {}", self.source.display());
+        let mut phases = Phases::start();
         let bar = progress::bytes("reading");
         let read = read_scene(&self.source, &axes, &mut progress::show(&bar));
         let SourceScene { gaussians, hash, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
+        phases.end("read");
         if gaussians.is_empty() {
             let source = self.source.display();
             writeln!(
@@ -163,7 +170,15 @@ impl Import {
             provenance: provenance(&[hash], axes.options().to_vec(), levels),
             storage: StorageOptions { record: self.record, levels },
         };
-        let version = catalog.commit(new, &mut progress::show(&bar));
+        let mut show = progress::show(&bar);
+        let version = catalog.commit(new, &mut |done, total| {
+            show(done, total);
+            match done {
+                0 => phases.end("sort"),
+                done if done == total => phases.end("pack"),
+                _ => {}
+            }
+        });
         // The file passed its checks, so a Gaussian that is refused now was changed by the options.
         let version = version.map_err(|error| match error {
             StoreError::Gaussians(error) => anyhow::Error::new(error)
@@ -172,6 +187,8 @@ impl Import {
         });
         let version = version.with_context(cannot)?;
         bar.finish_and_clear();
+        phases.end("publish");
+        writeln!(std::io::stderr(), "{phases}")?;
 
         let manifest = &version.manifest;
         let stored_bytes = manifest.stored_bytes();
@@ -188,6 +205,35 @@ impl Import {
             catalog.dir().join(&self.twin).display(),
             version.hash,
         )?;
+        Ok(())
+    }
+}
+
+/// How long each phase of an import took.
+struct Phases {
+    began: Instant,
+    ended: Vec<(&'static str, Duration)>,
+}
+
+impl Phases {
+    fn start() -> Self {
+        Self { began: Instant::now(), ended: Vec::new() }
+    }
+
+    /// The phase `name` ends, and the next one begins.
+    fn end(&mut self, name: &'static str) {
+        let now = Instant::now();
+        self.ended.push((name, now - self.began));
+        self.began = now;
+    }
+}
+
+impl fmt::Display for Phases {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (index, (name, took)) in self.ended.iter().enumerate() {
+            let comma = if index == 0 { "" } else { ", " };
+            write!(f, "{comma}{name} {:.1} s", took.as_secs_f64())?;
+        }
         Ok(())
     }
 }

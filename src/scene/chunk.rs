@@ -14,12 +14,14 @@ use std::collections::BTreeSet;
 use std::ops::{Range, RangeInclusive};
 use std::sync::Arc;
 
-use bytemuck::{Pod, Zeroable};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::actor::PlacedChunk;
+use super::pages::{LanePages, Page};
 use super::{Gaussians, Sky, sh};
+
+pub use super::pages::{CLUSTER, LANES, Lanes};
 
 /// Edge of a cell, in metres.
 pub const CELL_M: f64 = 64.0;
@@ -31,16 +33,6 @@ pub const BLOCKS: usize = (CELL_M / BLOCK_M) as usize;
 /// one cluster per block, and every chunk costs each frame some work. Cells of a skyline or a sky have only
 /// a few Gaussians each.
 pub const SPARSE_CELL: usize = BLOCKS * BLOCKS * CLUSTER;
-/// Gaussians in a lane group: one AVX-512 register of f32, two of AVX2, four of SSE.
-pub const LANES: usize = 16;
-/// Gaussians in a cluster, the unit of frustum culling.
-pub const CLUSTER: usize = 256;
-
-/// One parameter of the 16 Gaussians of a lane group.
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[repr(C, align(64))]
-pub struct Lanes(pub [f32; LANES]);
-
 /// Indices of the columns of a lane group. The SH coefficients come last: coefficient-major, then red,
 /// green, blue.
 pub mod column {
@@ -141,8 +133,7 @@ pub struct Chunk {
     origin_m: DVec3,
     sh_degree: u8,
     count: usize,
-    /// `lanes[group * columns(sh_degree) + column]`.
-    lanes: Vec<Lanes>,
+    lanes: LanePages,
     clusters: Vec<Cluster>,
 }
 
@@ -150,30 +141,32 @@ impl Chunk {
     /// An empty chunk with capacity for `capacity` Gaussians, to be filled with [`Chunk::push`]. `origin_m`
     /// is in world axes.
     pub fn new(cell: [i32; 2], origin_m: DVec3, sh_degree: u8, capacity: usize) -> Self {
-        let lanes = Vec::with_capacity(capacity.div_ceil(LANES) * columns(sh_degree));
+        let mut lanes = LanePages::new(columns(sh_degree), None);
+        lanes.expect(capacity.div_ceil(LANES));
         let clusters = Vec::with_capacity(capacity.div_ceil(CLUSTER));
         Self { cell, origin_m, sh_degree, count: 0, lanes, clusters }
     }
 
-    /// A chunk from columns that are already laid out, as `lanes[group * columns(sh_degree) + column]`.
+    /// A chunk from columns that are already laid out.
     ///
     /// Lanes after `count` are emptied, and so are Gaussians that cannot be drawn, as by
     /// [`Chunk::push_activated`].
     ///
     /// # Panics
-    /// If `lanes` does not have exactly the length that `count` Gaussians of this degree need.
+    /// If `lanes` does not have exactly the lane groups that `count` Gaussians of this degree need.
     pub fn from_lanes(
         cell: [i32; 2],
         origin_m: DVec3,
         sh_degree: u8,
         count: usize,
-        mut lanes: Vec<Lanes>,
+        mut lanes: LanePages,
     ) -> Self {
         let width = columns(sh_degree);
-        assert_eq!(lanes.len(), count.div_ceil(LANES) * width, "lanes of another count");
+        assert_eq!(lanes.width(), width, "lanes of another degree");
+        assert_eq!(lanes.len(), count.div_ceil(LANES), "lanes of another count");
         let mut clusters = Vec::with_capacity(count.div_ceil(CLUSTER));
         let mut left = count;
-        for of_cluster in lanes.chunks_mut(width * CLUSTER / LANES) {
+        for of_cluster in lanes.clusters_mut() {
             let mut bounds = LaneBounds::EMPTY;
             for group in of_cluster.chunks_exact_mut(width) {
                 let mut drawable = drawable_lanes(group);
@@ -216,11 +209,11 @@ impl Chunk {
     pub fn push_activated(&mut self, record: &ActivatedGaussian<'_>) {
         let width = columns(self.sh_degree);
         assert_eq!(record.sh.len(), width - column::SH, "colour of another degree");
-        let first_column = self.count / LANES * width;
+        let group = self.count / LANES;
         let lane = self.count % LANES;
         if lane == 0 {
-            self.lanes.resize(first_column + width, Lanes([0.0; LANES]));
-            self.lanes[first_column + column::LOG2_OPACITY] = Lanes([f32::NEG_INFINITY; LANES]);
+            self.lanes.push_zeros();
+            self.lanes.group_mut(group)[column::LOG2_OPACITY] = Lanes([f32::NEG_INFINITY; LANES]);
         }
         if self.count.is_multiple_of(CLUSTER) {
             self.clusters.push(Cluster::EMPTY);
@@ -232,7 +225,7 @@ impl Chunk {
         if !is_drawable(geometry.chain([log2_opacity]).chain(*sh).copied()) {
             return;
         }
-        let group = &mut self.lanes[first_column..first_column + width];
+        let group = self.lanes.group_mut(group);
         let mut set = |first: usize, values: &[f32]| {
             for (column, &value) in group[first..].iter_mut().zip(values) {
                 column.0[lane] = value;
@@ -279,9 +272,9 @@ impl Chunk {
     }
 
     /// The columns of lane group `group`, which holds Gaussians `16 group` to `16 group + 15`.
+    #[inline]
     pub fn lane_group(&self, group: usize) -> &[Lanes] {
-        let width = columns(self.sh_degree);
-        &self.lanes[group * width..(group + 1) * width]
+        self.lanes.group(group)
     }
 
     /// Half-size of the axis-aligned box around the 3-sigma ellipsoid of one Gaussian, in metres along world
@@ -328,12 +321,13 @@ impl Chunk {
     pub fn bytes_of(sh_degree: u8, count: u64) -> u64 {
         let lanes = count.div_ceil(LANES as u64) * columns(sh_degree) as u64;
         let clusters = count.div_ceil(CLUSTER as u64);
-        lanes.saturating_mul(size_of::<Lanes>() as u64) + clusters * size_of::<Cluster>() as u64
+        let of_cluster = size_of::<Cluster>() + size_of::<Page>();
+        lanes.saturating_mul(size_of::<Lanes>() as u64) + clusters * of_cluster as u64
     }
 
     /// Memory that this chunk has allocated, in bytes.
     pub fn bytes(&self) -> usize {
-        self.lanes.capacity() * size_of::<Lanes>() + self.clusters.capacity() * size_of::<Cluster>()
+        self.lanes.bytes() + self.clusters.capacity() * size_of::<Cluster>()
     }
 }
 
@@ -684,7 +678,9 @@ mod tests {
         ] {
             let mut lanes = cell.lane_group(0).to_vec();
             lanes[column].0[0] = value;
-            let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, 2, lanes.clone());
+            let mut pages = LanePages::new(columns(0), None);
+            pages.extend_from_slice(&lanes);
+            let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, 2, pages);
             let one = |i: usize, column: usize| lanes[column].0[i];
             let mut pushed = Chunk::new([0, 0], DVec3::ZERO, 0, 2);
             for i in 0..2 {
@@ -723,7 +719,9 @@ mod tests {
         lanes[(CLUSTER + 7) / LANES * columns(0)].0[7] = f32::NAN;
         // What lies in lanes after the last Gaussian does not count.
         lanes.last_mut().unwrap().0[LANES - 1] = 1e30;
-        let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, count, lanes);
+        let mut pages = LanePages::new(columns(0), None);
+        pages.extend_from_slice(&lanes);
+        let laid = Chunk::from_lanes([0, 0], DVec3::ZERO, 0, count, pages);
         assert_eq!(laid.clusters().len(), 3);
         assert_eq!(laid.clusters(), pushed.clusters());
         for index in [0, CLUSTER + 7, count - 1] {

@@ -147,6 +147,10 @@ pub const RESIDENT_BYTES: u64 = 16 << 30;
 /// one that hangs does not stop the others.
 pub const LOADERS: usize = 8;
 
+/// Memory of evicted sections that is kept for the next ones. A load evicts just before it reads, so this is needed
+/// only for what the loader threads read at the same time: eight sections of up to 9 MB.
+pub const FREE_PAGES_BYTES: usize = 64 << 20;
+
 /// Number of attempts to load a section before the frames that wait for it get the error.
 pub const LOAD_ATTEMPTS: u32 = 3;
 

@@ -1,7 +1,7 @@
 use wildcity_render::View;
 use wildcity_scene::chunk::{CellRun, Partition, column, columns};
 use wildcity_scene::record::Clamped;
-use wildcity_scene::{Chunk, Gaussians, RecordFormat, Scene};
+use wildcity_scene::{Chunk, Gaussians, LanePages, RecordFormat, Scene};
 use wildcity_twin::store::{StorageOptions, StoreError};
 
 use crate::{commit, data, decibels, eyes, scene_files, stored, streets, tau};
@@ -75,7 +75,7 @@ fn coded(scene: &Gaussians, record: RecordFormat) -> (Chunk, Chunk, Clamped) {
     let mut clamped = Clamped::default();
     let part = record.encode(&chunk, 0..chunk.len(), &mut clamped);
     assert_eq!(part.len(), record.part_bytes(scene.sh_degree, chunk.len()));
-    let mut lanes = Vec::new();
+    let mut lanes = LanePages::new(columns(scene.sh_degree), None);
     record.decode(&part, scene.sh_degree, chunk.len(), &mut lanes).unwrap();
     let again = Chunk::from_lanes(cell.cell, cell.origin_m, scene.sh_degree, chunk.len(), lanes);
     (chunk, again, clamped)
@@ -166,7 +166,7 @@ fn a_part_of_another_size_is_refused() {
     let scene = scene_files::gaussians(100, 1, 6.0, 1);
     let (chunk, ..) = coded(&scene, RecordFormat::Q24);
     let part = RecordFormat::Q24.encode(&chunk, 0..100, &mut Clamped::default());
-    let mut lanes = Vec::new();
+    let mut lanes = LanePages::new(columns(1), None);
     for wrong in [&part[1..], &[part.as_slice(), &[0]].concat()[..], &[]] {
         let said = RecordFormat::Q24.decode(wrong, 1, 100, &mut lanes).unwrap_err();
         assert!(said.starts_with("100 Gaussians take "), "{said}");

@@ -24,6 +24,7 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::chunk::{Chunk, LANES, Lanes, column, columns};
+use super::pages::LanePages;
 use super::sh;
 
 use codec::{Code, Measure};
@@ -194,7 +195,7 @@ impl RecordFormat {
         part: &[u8],
         sh_degree: u8,
         count: usize,
-        lanes: &mut Vec<Lanes>,
+        lanes: &mut LanePages,
     ) -> Result<(), String> {
         let wanted = self.part_bytes(sh_degree, count);
         if part.len() != wanted {
@@ -214,7 +215,7 @@ impl RecordFormat {
         }
         let width = columns(sh_degree);
         let groups = count.div_ceil(LANES);
-        lanes.reserve_exact(groups * width);
+        lanes.expect(groups);
         let mut tile = vec![Lanes([0.0; LANES]); groups.min(TILE_GROUPS) * width];
         for start in (0..groups).step_by(TILE_GROUPS) {
             let end = groups.min(start + TILE_GROUPS);

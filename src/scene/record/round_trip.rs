@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use crate::chunk::columns;
 use crate::record::{Clamped, PART_GAUSSIANS};
-use crate::{Chunk, RecordFormat, Scene};
+use crate::{Chunk, LanePages, RecordFormat, Scene};
 
 /// The result of [`round_trip`].
 #[derive(Clone, Debug)]
@@ -21,7 +22,7 @@ pub fn round_trip(scene: &Scene, record: RecordFormat) -> RoundTrip {
     let empty = Scene { chunks: Vec::new(), ..scene.clone() };
     let mut all = RoundTrip { scene: empty, coded_bytes: 0, clamped: 0 };
     for chunk in &scene.chunks {
-        let mut lanes = Vec::new();
+        let mut lanes = LanePages::new(columns(chunk.sh_degree()), None);
         let mut clamped = Clamped::default();
         for start in (0..chunk.len()).step_by(PART_GAUSSIANS) {
             let end = (start + PART_GAUSSIANS).min(chunk.len());

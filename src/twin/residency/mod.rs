@@ -35,6 +35,9 @@
 //! Sections that are being loaded count as in use. The budget covers chunks; outside it are the
 //! bytes of one section per loader thread (eight), and 64 B of bookkeeping per section.
 //!
+//! **An evicted section leaves pages, not a hole**: the next section is read into them
+//! (`wildcity_scene::pages`). What the heap loses between pages is a few per cent of the budget.
+//!
 //! **Eviction is least recently used; a prefetch counts as a use.** As far as prefetching predicts the
 //! need for sections, this evicts first what is needed last. A prefetch evicts nothing that was used since
 //! its session's last prefetch, and is dropped if that leaves no room. So a prefetch can evict neither its

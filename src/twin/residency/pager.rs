@@ -121,16 +121,19 @@ impl Pager {
         requested: RequestedSections,
         urgencies: &[Urgency],
     ) -> u64 {
-        let number = {
+        let (number, has_work) = {
             let requests = &mut self.0.state.lock().requests;
             if let Some(before) = before {
                 requests.cancel_prefetch(before);
             }
             let number = requests.add_prefetch(before, requested, urgencies);
             requests.forget_unrequested_failures();
-            number
+            (number, requests.has_queued())
         };
-        self.0.work.notify_all();
+        // Usually all is in memory. To wake eight loaders for nothing took a tenth of a millisecond of each step.
+        if has_work {
+            self.0.work.notify_all();
+        }
         number
     }
 
@@ -184,13 +187,16 @@ impl WaitingFrame {
 impl Drop for WaitingFrame {
     fn drop(&mut self) {
         // Dropped without the lock, because the callback may own anything.
-        let _request = {
+        let cancelled = {
             let requests = &mut self.shared.state.lock().requests;
             let request = requests.cancel_frame(self.number);
             requests.forget_unrequested_failures();
             request
         };
-        self.shared.work.notify_all();
+        // A frame that is complete has released its loads already.
+        if cancelled.is_some() {
+            self.shared.work.notify_all();
+        }
     }
 }
 

@@ -218,6 +218,11 @@ impl<C> Requests<C> {
         entries.filter(|(key, _)| self.table.get(key.id).is_none()).count()
     }
 
+    /// Whether there may be a section to load.
+    pub(super) fn has_queued(&self) -> bool {
+        !self.queue.is_empty()
+    }
+
     /// Number of sections that a frame still waits for.
     pub(super) fn missing(&self, number: u64) -> usize {
         let frame = self.requests.get(&number).and_then(|request| request.frame.as_ref());

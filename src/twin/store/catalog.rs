@@ -8,7 +8,7 @@ use serde::Deserialize;
 use crate::limits;
 use wildcity_scene::manifest::{ChunkEntry, Section};
 use wildcity_scene::rig::is_name;
-use wildcity_scene::{Chunk, Manifest, sh};
+use wildcity_scene::{Chunk, Manifest, PagePool, sh};
 
 use super::backend::ObjectBackend;
 use super::clock::{Clock, SystemClock};
@@ -25,6 +25,8 @@ pub struct Catalog {
     pub(super) objects: Arc<dyn ObjectBackend>,
     pub(super) clock: Arc<dyn Clock>,
     remote: Option<Remote>,
+    /// Memory of sections that were evicted, for those that are read next.
+    pages: Arc<PagePool>,
 }
 
 /// Where parts of remote twins are cached on the local disk.
@@ -137,19 +139,19 @@ impl Catalog {
     /// As [`Catalog::open`].
     pub fn on(dir: &Path, disk: Arc<dyn Disk>, clock: Arc<dyn Clock>) -> Result<Self, StoreError> {
         let objects = Arc::new(Local::new(dir, disk));
-        let catalog = Self { objects, clock, remote: None };
+        let catalog = Self { objects, clock, remote: None, pages: page_pool() };
         catalog.remove_abandoned_commits(None)?;
         Ok(catalog)
     }
 
     fn local(dir: &Path) -> Self {
         let objects = Arc::new(Local::new(dir, Arc::new(RealDisk)));
-        Self { objects, clock: Arc::new(SystemClock), remote: None }
+        Self { objects, clock: Arc::new(SystemClock), remote: None, pages: page_pool() }
     }
 
     fn remote(remote: Remote) -> Self {
         let objects = Arc::new(remote.clone());
-        Self { objects, clock: Arc::new(SystemClock), remote: Some(remote) }
+        Self { objects, clock: Arc::new(SystemClock), remote: Some(remote), pages: page_pool() }
     }
 
     /// The same twins, read without the disk cache.
@@ -259,7 +261,8 @@ impl Catalog {
                 StoreError::Damaged { path, reason } => of_section(path, reason),
                 error => error,
             })?;
-        chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record)
+        let pool = Some(self.pages.clone());
+        chunk_file::unpack(&bytes, chunk, section, *sh_degree, *record, pool)
             .map_err(|reason| of_section(self.objects.object_path(twin, &chunk.object), reason))
     }
 
@@ -374,6 +377,10 @@ struct Format {
 /// Checks that a name can be a twin's, and part of a path.
 pub(super) fn check_name(name: &str) -> Result<(), StoreError> {
     if is_name(name) { Ok(()) } else { Err(StoreError::Name { name: name.to_owned() }) }
+}
+
+fn page_pool() -> Arc<PagePool> {
+    Arc::new(PagePool::new(limits::FREE_PAGES_BYTES))
 }
 
 fn open_cache(cache: Option<&DiskCacheSettings>) -> Result<Option<DiskCache>, StoreError> {

@@ -25,6 +25,7 @@
 
 use std::cell::RefCell;
 use std::io::{self, Write};
+use std::sync::Arc;
 
 use bincode::config::Config;
 use bincode::{Decode, Encode};
@@ -32,9 +33,10 @@ use glam::DVec3;
 use zstd::bulk::Decompressor;
 
 use crate::limits;
-use wildcity_scene::chunk::Chunk;
+use wildcity_scene::chunk::{Chunk, columns};
 use wildcity_scene::geometry::Bounds;
 use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_scene::pages::{LanePages, PagePool};
 use wildcity_scene::record::{Clamped, PART_GAUSSIANS, RecordFormat};
 
 const MAGIC: [u8; 8] = *b"WILDCHNK";
@@ -208,9 +210,10 @@ pub(super) fn unpack(
     section: &Section,
     sh_degree: u8,
     record: RecordFormat,
+    pool: Option<Arc<PagePool>>,
 ) -> Result<Chunk, String> {
     let count = section.count as usize;
-    let mut lanes = Vec::new();
+    let mut lanes = LanePages::new(columns(sh_degree), pool);
     let mut rest = bytes;
     for start in (0..count).step_by(PART_GAUSSIANS) {
         let here = (count - start).min(PART_GAUSSIANS);
@@ -218,10 +221,10 @@ pub(super) fn unpack(
         let length = u32::from_le_bytes(*length) as usize;
         let part = after.get(..length).ok_or("it ends within a part")?;
         rest = &after[length..];
-        let raw = decompress(part, record.part_bytes(sh_degree, here));
-        let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
-        // It grows by exactly this much, because larger steps would take memory that the budget does not count.
-        record.decode(&raw, sh_degree, here, &mut lanes)?;
+        decompressed(part, record.part_bytes(sh_degree, here), |raw| {
+            let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
+            record.decode(raw, sh_degree, here, &mut lanes)
+        })?;
     }
     if !rest.is_empty() {
         return Err(format!("{} bytes are left over", rest.len()));
@@ -229,19 +232,32 @@ pub(super) fn unpack(
     Ok(Chunk::from_lanes(chunk.cell, chunk.origin_m, sh_degree, count, lanes))
 }
 
-/// Decompresses one part of up to `capacity` bytes.
+/// Passes one part of up to `capacity` bytes on, decompressed.
 ///
-/// Each thread keeps a context of 160 kB: to make one for each section took a twentieth of the time of loading.
-fn decompress(part: &[u8], capacity: usize) -> io::Result<Vec<u8>> {
+/// Each thread keeps a context of 160 kB and the bytes of its largest part. To make a context for each section took a
+/// twentieth of the time of loading, and parts of all sizes would leave holes between the pages of sections.
+fn decompressed<T>(part: &[u8], capacity: usize, take: impl FnOnce(io::Result<&[u8]>) -> T) -> T {
     thread_local! {
-        static KEPT: RefCell<Option<Decompressor<'static>>> = const { RefCell::new(None) };
+        static KEPT: RefCell<(Option<Decompressor<'static>>, Vec<u8>)> =
+            const { RefCell::new((None, Vec::new())) };
     }
-    KEPT.with_borrow_mut(|kept| {
-        let decompressor = match kept {
-            Some(decompressor) => decompressor,
-            None => kept.insert(Decompressor::new()?),
+    KEPT.with_borrow_mut(|(decompressor, kept)| {
+        if kept.len() < capacity {
+            kept.reserve_exact(capacity - kept.len());
+            kept.resize(capacity, 0);
+        }
+        let raw = &mut kept[..capacity];
+        let mut decompress = || -> io::Result<usize> {
+            let decompressor = match decompressor {
+                Some(decompressor) => decompressor,
+                None => decompressor.insert(Decompressor::new()?),
+            };
+            decompressor.decompress_to_buffer(part, raw)
         };
-        decompressor.decompress(part, capacity)
+        match decompress() {
+            Ok(length) => take(Ok(&kept[..length])),
+            Err(error) => take(Err(error)),
+        }
     })
 }
 
@@ -446,7 +462,7 @@ mod tests {
         for section in [full, coarse] {
             let start = section.offset_bytes as usize;
             let own = &bytes[start..start + section.bytes as usize];
-            let chunk = unpack(own, &entry, section, 0, RecordFormat::Q32).unwrap();
+            let chunk = unpack(own, &entry, section, 0, RecordFormat::Q32, None).unwrap();
             assert_eq!((chunk.cell(), chunk.len()), (entry.cell, section.count as usize));
         }
     }
@@ -515,7 +531,7 @@ mod tests {
         let own = &bytes[start..start + section.bytes as usize];
         let refused = |own: &[u8], count: u32| {
             let section = Section { count, ..section };
-            unpack(own, &entry, &section, 0, RecordFormat::Q32).unwrap_err()
+            unpack(own, &entry, &section, 0, RecordFormat::Q32, None).unwrap_err()
         };
         for cut in 0..own.len() {
             refused(&own[..cut], 300);
@@ -529,7 +545,7 @@ mod tests {
             let mut own = own.to_vec();
             own[at] ^= 0x40;
             // The caller compares the hash before, so here it is enough that damaged bytes cause no panic.
-            let _ = unpack(&own, &entry, &section, 0, RecordFormat::Q32);
+            let _ = unpack(&own, &entry, &section, 0, RecordFormat::Q32, None);
         }
     }
 }

@@ -68,13 +68,14 @@ impl<'a> CellPacker<'a> {
     }
 
     /// Writes an object for each cell. Returns the chunks in order, and counts of the values that
-    /// the record could not hold. `progress` gets the number of Gaussians written and in all.
+    /// the record could not hold. `progress` gets the number of Gaussians written, from 0, and in all.
     pub(super) fn put(
         &self,
         staging: &mut dyn Staging,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<(Vec<ChunkEntry>, Clamped), StoreError> {
         let total = self.gaussians();
+        progress(0, total);
         let mut clamped = Clamped::default();
         let mut done = 0;
         let mut chunks = Vec::with_capacity(self.cells.len());

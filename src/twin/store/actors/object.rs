@@ -124,7 +124,8 @@ impl Header {
             let own = own.ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
             rest = &rest[own.len()..];
             let (entry, section) = section(level);
-            let chunk = chunk_file::unpack(own, &entry, &section, self.sh_degree, self.record);
+            let (degree, record) = (self.sh_degree, self.record);
+            let chunk = chunk_file::unpack(own, &entry, &section, degree, record, None);
             let chunk = Arc::new(chunk.map_err(of_level)?);
             levels.push(AssetLevel { error_m: level.error_m, chunk });
         }
