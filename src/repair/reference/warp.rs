@@ -10,7 +10,7 @@ use wildcity_scene::geometry::{Camera, Pose};
 
 use super::lanes::LANES;
 use super::projection::{Points, Projection};
-use super::rays::Rays;
+use super::rays::{RayPoints, Rays};
 use crate::image::Image;
 
 /// A reference fits where its depth is within this of the point's, in metres, ..
@@ -114,7 +114,7 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
         .enumerate()
         .map(|(index, reference)| Prepared { index, reference, from_target: prepare(reference) })
         .collect();
-    // Near ones first: then most pixels have their best reference soon, and the others need no look at their depth.
+    // Of equals the first counts.
     let distance_m = |one: &Prepared<'_>| {
         one.reference.world_from_camera.position_m.distance(target.world_from_camera.position_m)
     };
@@ -181,20 +181,36 @@ fn relative(reference: &Pose, target: &Pose) -> [f32; 12] {
     values
 }
 
-/// The best reference of each lane so far.
-struct Best {
-    /// Cosine of the angle between the rays, times the distance from the view's camera.
+/// A reference as the pixels of a group see it.
+#[derive(Clone)]
+struct Candidates {
+    /// Cosine of the angle between the rays, times the distance from the view's camera; -infinity where the reference
+    /// does not see the point.
     similarity: [f32; LANES],
-    reference: [usize; LANES],
-    u: [f32; LANES],
-    v: [f32; LANES],
+    /// [`Places`] of the points.
+    ///
+    /// [`Places`]: super::projection::Places
+    x: [f32; LANES],
+    y: [f32; LANES],
+    /// Depth of the points, as the reference's depth map has it.
+    depth_m: [f32; LANES],
 }
 
-const NONE: usize = usize::MAX;
+/// A pixel of a reference.
+struct Source {
+    /// In the list of prepared references.
+    place: usize,
+    /// In pixels.
+    u: f32,
+    v: f32,
+}
 
 #[inline(always)]
 fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], warped: &mut Warped) {
     let width = warped.image.width;
+    let nothing = [f32::NEG_INFINITY; LANES];
+    let none = Candidates { similarity: nothing, x: nothing, y: nothing, depth_m: nothing };
+    let mut candidates = vec![none; references.len()];
     for row in 0..warped.image.height {
         for group in 0..width.div_ceil(LANES) {
             let left = group * LANES;
@@ -210,13 +226,14 @@ fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], wa
                 Groups::Rows => row,
                 Groups::Columns => group,
             };
-            let best = best(target, references, [row, left, pose], &depth_m);
-            for lane in 0..count {
-                let Some(Prepared { index, reference, .. }) = references.get(best.reference[lane])
-                else {
+            let from = target.rays.points(width, row, left, &depth_m);
+            let best = look(&from, &depth_m, references, pose, &mut candidates);
+            for (lane, best) in best.into_iter().enumerate().take(count) {
+                let Some(source) = fitting(references, &mut candidates, lane, best) else {
                     continue;
                 };
-                let rgb = bilinear(&reference.image, best.u[lane], best.v[lane]);
+                let Prepared { index, reference, .. } = &references[source.place];
+                let rgb = bilinear(&reference.image, source.u, source.v);
                 warped.image.rgb8[3 * (first + lane)..][..3].copy_from_slice(&rgb);
                 warped.valid[first + lane] = 1.0;
                 warped.pixels[*index] += 1;
@@ -225,22 +242,19 @@ fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], wa
     }
 }
 
-/// The best reference of the pixels of a row from a column on, at depths in metres.
+/// Fills in how the references see points of the view, at depths in metres. Returns the most similar one of each lane.
 #[inline(always)]
-fn best(
-    target: &WarpTarget<'_>,
-    references: &[Prepared<'_>],
-    [row, left, pose]: [usize; 3],
+fn look(
+    from: &RayPoints,
     depth_m: &[f32; LANES],
-) -> Best {
-    let from = target.rays.points(target.camera.width_px as usize, row, left, depth_m);
-    let mut best = Best {
-        similarity: [f32::NEG_INFINITY; LANES],
-        reference: [NONE; LANES],
-        u: [0.0; LANES],
-        v: [0.0; LANES],
-    };
-    for (place, Prepared { reference, from_target, .. }) in references.iter().enumerate() {
+    references: &[Prepared<'_>],
+    pose: usize,
+    candidates: &mut [Candidates],
+) -> [u32; LANES] {
+    let mut best = [0; LANES];
+    let mut most = [f32::NEG_INFINITY; LANES];
+    for (place, (prepared, candidate)) in references.iter().zip(candidates).enumerate() {
+        let Prepared { reference, from_target, .. } = prepared;
         let m = &from_target[pose];
         let zero = [0.0; LANES];
         let mut points = Points { x: zero, y: zero, z: zero, distance: zero };
@@ -263,36 +277,65 @@ fn best(
             points.distance[lane] = distance;
             *similarity = dot / distance;
         }
-        let projection = &*reference.projection;
-        let at = projection.project(&points);
-        let size = [projection.width as f32, projection.height as f32];
-        let mut is_candidate = [false; LANES];
+        let at = reference.projection.places(&points);
+        candidate.x = at.x;
+        candidate.y = at.y;
+        candidate.depth_m = match reference.projection.depth_is_distance {
+            true => points.distance,
+            false => points.z,
+        };
         for lane in 0..LANES {
-            // Comparisons with NaN are false.
-            is_candidate[lane] = (at.u[lane] >= 0.0)
-                & (at.u[lane] < size[0])
-                & (at.v[lane] >= 0.0)
-                & (at.v[lane] < size[1])
-                & (similarity[lane] > best.similarity[lane])
-                & (depth_m[lane] > 0.0);
+            let is_seen = at.is_within[lane] & (depth_m[lane] > 0.0);
+            candidate.similarity[lane] = if is_seen { similarity[lane] } else { f32::NEG_INFINITY };
+            // Comparisons with NaN are false. Of equals the first stays.
+            let is_better = candidate.similarity[lane] > most[lane];
+            most[lane] = if is_better { candidate.similarity[lane] } else { most[lane] };
+            best[lane] = if is_better { place as u32 } else { best[lane] };
         }
-        if !is_candidate.contains(&true) {
-            continue;
+    }
+    best
+}
+
+/// The most similar reference that fits, of a lane. Most often that is the first one looked at, so the others need no
+/// look into their maps.
+#[inline(always)]
+fn fitting(
+    references: &[Prepared<'_>],
+    candidates: &mut [Candidates],
+    lane: usize,
+    best: u32,
+) -> Option<Source> {
+    let mut place = best as usize;
+    loop {
+        let candidate = candidates.get_mut(place)?;
+        let is_seen = candidate.similarity[lane] > f32::NEG_INFINITY;
+        if !is_seen {
+            return None;
         }
-        for lane in (0..LANES).filter(|lane| is_candidate[*lane]) {
-            let there = at.v[lane] as usize * projection.width + at.u[lane] as usize;
-            let there_m = reference.depth_m[there];
-            let here_m = match projection.depth_is_distance {
-                true => points.distance[lane],
-                false => points.z[lane],
-            };
+        let reference = references[place].reference;
+        let projection = &*reference.projection;
+        let at = projection.position_px(candidate.x[lane], candidate.y[lane]);
+        if let Some([u, v]) = at {
+            let there_m = reference.depth_m[v as usize * projection.width + u as usize];
+            let here_m = candidate.depth_m[lane];
             let fits = (there_m - here_m).abs() <= DEPTH_M + DEPTH_SHARE * here_m;
             if fits && there_m > 0.0 {
-                best.similarity[lane] = similarity[lane];
-                best.reference[lane] = place;
-                best.u[lane] = at.u[lane];
-                best.v[lane] = at.v[lane];
+                return Some(Source { place, u, v });
             }
+        }
+        candidate.similarity[lane] = f32::NEG_INFINITY;
+        place = most_similar(candidates, lane);
+    }
+}
+
+/// The first of the most similar candidates of a lane.
+fn most_similar(candidates: &[Candidates], lane: usize) -> usize {
+    let mut best = 0;
+    let mut most = f32::NEG_INFINITY;
+    for (place, candidate) in candidates.iter().enumerate() {
+        if candidate.similarity[lane] > most {
+            most = candidate.similarity[lane];
+            best = place;
         }
     }
     best
