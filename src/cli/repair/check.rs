@@ -152,6 +152,9 @@ impl Check {
             false => "three runs gave different bytes",
         };
         let halo = match model.halo() {
+            Some(Halo::Pixels(halo)) if manifest.size.fixed.is_some() => {
+                format!("{halo} px; the model takes no larger image that tiles could equal")
+            }
             Some(Halo::Pixels(halo)) => format!("{halo} px; tiles equal the whole"),
             Some(Halo::Whole) => "the whole image".to_owned(),
             None => "not measured: size.fit is not \"tile\"".to_owned(),
