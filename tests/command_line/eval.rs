@@ -274,7 +274,9 @@ fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
     let frames = transforms(&json!({})).replace("front/", "images/front/");
     fs::write(at.join("transforms.json"), frames).unwrap();
     mask.save(at.join("masks/front/b.png")).unwrap();
-    let (_, made) = eval(at, "scene.ply", "transforms.json", &["--masks", "masks"]);
+    let beside = ["eval", "scene.ply", "--images", "transforms.json", "--masks", "masks"];
+    done(at, &[&beside[..], &["--out", "out", "--backend", "cpu"]].concat());
+    let made: Value = serde_json::from_slice(&fs::read(at.join("out/eval.json")).unwrap()).unwrap();
     for image in made["images"].as_array().unwrap() {
         assert_eq!(image["counted"], json!(0.5), "{image}");
     }

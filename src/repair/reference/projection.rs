@@ -56,13 +56,10 @@ pub(super) struct Points {
     pub(super) distance: [f32; LANES],
 }
 
-/// Where points are, before [`Projection::position_px`] looks it up: on the image of a pinhole in pixels, or in the cells
-/// of a table.
-pub(super) struct Places {
-    pub(super) x: [f32; LANES],
-    pub(super) y: [f32; LANES],
-    /// Whether the point can be on the image. A table ends beyond the image.
-    pub(super) is_within: [bool; LANES],
+/// Positions on the image, in pixels; NaN behind a pinhole, and where a table ends.
+pub(super) struct Positions {
+    pub(super) u: [f32; LANES],
+    pub(super) v: [f32; LANES],
 }
 
 impl Projection {
@@ -83,49 +80,22 @@ impl Projection {
         }
     }
 
+    /// The positions of the points that are wanted. A table has none of the others.
     #[inline(always)]
-    pub(super) fn places(&self, points: &Points) -> Places {
-        let Points { x, y, z, distance } = points;
-        let mut at = Places { x: [0.0; LANES], y: [0.0; LANES], is_within: [false; LANES] };
-        let [width, height] = match &self.lens {
+    pub(super) fn project(&self, points: &Points, is_wanted: &[bool; LANES]) -> Positions {
+        let mut at = Positions { u: [f32::NAN; LANES], v: [f32::NAN; LANES] };
+        match &self.lens {
             Lens::Pinhole([fx, fy, cx, cy]) => {
                 for lane in 0..LANES {
-                    // A NaN is nowhere.
-                    let inverse = if z[lane] > 0.0 { z[lane].recip() } else { f32::NAN };
-                    at.x[lane] = fx * x[lane] * inverse + cx;
-                    at.y[lane] = fy * y[lane] * inverse + cy;
+                    let z = points.z[lane];
+                    let inverse = if z > 0.0 { z.recip() } else { f32::NAN };
+                    at.u[lane] = fx * points.x[lane] * inverse + cx;
+                    at.v[lane] = fy * points.y[lane] * inverse + cy;
                 }
-                [self.width as f32, self.height as f32]
             }
-            Lens::Table(table) => {
-                let middle = (CELLS / 2) as f32;
-                for lane in 0..LANES {
-                    let by = table.cells_per_unit / (distance[lane] + z[lane]);
-                    at.x[lane] = x[lane] * by + middle;
-                    at.y[lane] = y[lane] * by + middle;
-                }
-                [CELLS as f32; 2]
-            }
-        };
-        for lane in 0..LANES {
-            at.is_within[lane] = (at.x[lane] >= 0.0)
-                & (at.x[lane] < width)
-                & (at.y[lane] >= 0.0)
-                & (at.y[lane] < height);
+            Lens::Table(table) => table.project(points, is_wanted, &mut at),
         }
         at
-    }
-
-    /// The position of a place that is within, in pixels, if it is on the image.
-    #[inline(always)]
-    pub(super) fn position_px(&self, x: f32, y: f32) -> Option<[f32; 2]> {
-        let [u, v] = match &self.lens {
-            Lens::Pinhole(_) => [x, y],
-            Lens::Table(table) => table.position_px(x, y),
-        };
-        let [width, height] = [self.width as f32, self.height as f32];
-        let is_on_image = u >= 0.0 && u < width && v >= 0.0 && v < height;
-        is_on_image.then_some([u, v])
     }
 }
 
@@ -147,19 +117,32 @@ impl Table {
         Self { cells_per_unit: step.recip() as f32, at_px }
     }
 
-    /// Between the four positions around a place.
     #[inline(always)]
-    fn position_px(&self, column: f32, row: f32) -> [f32; 2] {
-        let [left, top] = [column as usize, row as usize];
-        let [x, y] = [column - left as f32, row - top as f32];
-        let first = top * (CELLS + 1) + left;
-        let upper = [self.at_px[first], self.at_px[first + 1]];
-        let lower = [self.at_px[first + CELLS + 1], self.at_px[first + CELLS + 2]];
-        [0, 1].map(|axis| {
-            let above = upper[0][axis] + x * (upper[1][axis] - upper[0][axis]);
-            let below = lower[0][axis] + x * (lower[1][axis] - lower[0][axis]);
-            above + y * (below - above)
-        })
+    fn project(&self, points: &Points, is_wanted: &[bool; LANES], at: &mut Positions) {
+        let middle = (CELLS / 2) as f32;
+        for lane in 0..LANES {
+            let by = self.cells_per_unit / (points.distance[lane] + points.z[lane]);
+            let column = points.x[lane] * by + middle;
+            let row = points.y[lane] * by + middle;
+            let last = CELLS as f32;
+            // A NaN is in no cell.
+            let is_within = column >= 0.0 && row >= 0.0 && column < last && row < last;
+            if !is_within || !is_wanted[lane] {
+                continue;
+            }
+            let [left, top] = [column as usize, row as usize];
+            let [x, y] = [column - left as f32, row - top as f32];
+            let first = top * (CELLS + 1) + left;
+            let upper = [self.at_px[first], self.at_px[first + 1]];
+            let lower = [self.at_px[first + CELLS + 1], self.at_px[first + CELLS + 2]];
+            let mix = |axis: usize| {
+                let above = upper[0][axis] + x * (upper[1][axis] - upper[0][axis]);
+                let below = lower[0][axis] + x * (lower[1][axis] - lower[0][axis]);
+                above + y * (below - above)
+            };
+            at.u[lane] = mix(0);
+            at.v[lane] = mix(1);
+        }
     }
 }
 
@@ -201,14 +184,12 @@ mod tests {
                     z: lanes(point.z),
                     distance: lanes(7.0),
                 };
-                let at = projection.places(&points);
-                let found = projection.position_px(at.x[3], at.y[3]).filter(|_| at.is_within[3]);
-                let is_on_image =
-                    exact.cmpge(DVec2::ZERO).all() && exact.cmplt(camera.size_px()).all();
-                let Some([u, v]) = found.map(|at| at.map(f64::from)) else {
-                    assert!(!is_on_image, "{off_rad} rad off the axis is within the image");
+                let at = projection.project(&points, &[true; LANES]);
+                let [u, v] = [at.u[3], at.v[3]].map(f64::from);
+                if u.is_nan() {
+                    assert!(off_rad > 0.8, "{off_rad} rad off the axis is within the image");
                     continue;
-                };
+                }
                 let error_px = (DVec2::new(u, v) - exact).length();
                 assert!(error_px < 0.01, "{error_px} px at {off_rad} rad: {camera:?}");
                 seen += 1;

@@ -10,7 +10,7 @@ use wildcity_scene::geometry::{Camera, Pose};
 
 use super::lanes::LANES;
 use super::projection::{Points, Projection};
-use super::rays::{RayPoints, Rays};
+use super::rays::Rays;
 use crate::image::Image;
 
 /// A reference fits where its depth is within this of the point's, in metres, ..
@@ -114,11 +114,13 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
         .enumerate()
         .map(|(index, reference)| Prepared { index, reference, from_target: prepare(reference) })
         .collect();
-    // Of equals the first counts.
+    // Far ones first. Most are behind the view, and the farther they are, the smaller the angle: then most pixels have
+    // their best reference soon, and the others need no look at their depth. Of equals the last one counts, the nearest.
     let distance_m = |one: &Prepared<'_>| {
         one.reference.world_from_camera.position_m.distance(target.world_from_camera.position_m)
     };
     prepared.sort_by(|a, b| distance_m(a).total_cmp(&distance_m(b)));
+    prepared.reverse();
     dispatch!(Level::new(), _ => rows(target, groups, &prepared, &mut warped));
     warped
 }
@@ -181,36 +183,20 @@ fn relative(reference: &Pose, target: &Pose) -> [f32; 12] {
     values
 }
 
-/// A reference as the pixels of a group see it.
-#[derive(Clone)]
-struct Candidates {
-    /// Cosine of the angle between the rays, times the distance from the view's camera; -infinity where the reference
-    /// does not see the point.
+/// The best reference of each lane so far.
+struct Best {
+    /// Cosine of the angle between the rays, times the distance from the view's camera.
     similarity: [f32; LANES],
-    /// [`Places`] of the points.
-    ///
-    /// [`Places`]: super::projection::Places
-    x: [f32; LANES],
-    y: [f32; LANES],
-    /// Depth of the points, as the reference's depth map has it.
-    depth_m: [f32; LANES],
+    reference: [usize; LANES],
+    u: [f32; LANES],
+    v: [f32; LANES],
 }
 
-/// A pixel of a reference.
-struct Source {
-    /// In the list of prepared references.
-    place: usize,
-    /// In pixels.
-    u: f32,
-    v: f32,
-}
+const NONE: usize = usize::MAX;
 
 #[inline(always)]
 fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], warped: &mut Warped) {
     let width = warped.image.width;
-    let nothing = [f32::NEG_INFINITY; LANES];
-    let none = Candidates { similarity: nothing, x: nothing, y: nothing, depth_m: nothing };
-    let mut candidates = vec![none; references.len()];
     for row in 0..warped.image.height {
         for group in 0..width.div_ceil(LANES) {
             let left = group * LANES;
@@ -226,14 +212,13 @@ fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], wa
                 Groups::Rows => row,
                 Groups::Columns => group,
             };
-            let from = target.rays.points(width, row, left, &depth_m);
-            let best = look(&from, &depth_m, references, pose, &mut candidates);
-            for (lane, best) in best.into_iter().enumerate().take(count) {
-                let Some(source) = fitting(references, &mut candidates, lane, best) else {
+            let best = best(target, references, [row, left, pose], &depth_m);
+            for lane in 0..count {
+                let Some(Prepared { index, reference, .. }) = references.get(best.reference[lane])
+                else {
                     continue;
                 };
-                let Prepared { index, reference, .. } = &references[source.place];
-                let rgb = bilinear(&reference.image, source.u, source.v);
+                let rgb = bilinear(&reference.image, best.u[lane], best.v[lane]);
                 warped.image.rgb8[3 * (first + lane)..][..3].copy_from_slice(&rgb);
                 warped.valid[first + lane] = 1.0;
                 warped.pixels[*index] += 1;
@@ -242,19 +227,22 @@ fn rows(target: &WarpTarget<'_>, groups: Groups, references: &[Prepared<'_>], wa
     }
 }
 
-/// Fills in how the references see points of the view, at depths in metres. Returns the most similar one of each lane.
+/// The best reference of the pixels of a row from a column on, at depths in metres.
 #[inline(always)]
-fn look(
-    from: &RayPoints,
-    depth_m: &[f32; LANES],
+fn best(
+    target: &WarpTarget<'_>,
     references: &[Prepared<'_>],
-    pose: usize,
-    candidates: &mut [Candidates],
-) -> [u32; LANES] {
-    let mut best = [0; LANES];
-    let mut most = [f32::NEG_INFINITY; LANES];
-    for (place, (prepared, candidate)) in references.iter().zip(candidates).enumerate() {
-        let Prepared { reference, from_target, .. } = prepared;
+    [row, left, pose]: [usize; 3],
+    depth_m: &[f32; LANES],
+) -> Best {
+    let from = target.rays.points(target.camera.width_px as usize, row, left, depth_m);
+    let mut best = Best {
+        similarity: [f32::NEG_INFINITY; LANES],
+        reference: [NONE; LANES],
+        u: [0.0; LANES],
+        v: [0.0; LANES],
+    };
+    for (place, Prepared { reference, from_target, .. }) in references.iter().enumerate() {
         let m = &from_target[pose];
         let zero = [0.0; LANES];
         let mut points = Points { x: zero, y: zero, z: zero, distance: zero };
@@ -277,65 +265,41 @@ fn look(
             points.distance[lane] = distance;
             *similarity = dot / distance;
         }
-        let at = reference.projection.places(&points);
-        candidate.x = at.x;
-        candidate.y = at.y;
-        candidate.depth_m = match reference.projection.depth_is_distance {
-            true => points.distance,
-            false => points.z,
-        };
+        let mut is_candidate = [false; LANES];
         for lane in 0..LANES {
-            let is_seen = at.is_within[lane] & (depth_m[lane] > 0.0);
-            candidate.similarity[lane] = if is_seen { similarity[lane] } else { f32::NEG_INFINITY };
-            // Comparisons with NaN are false. Of equals the first stays.
-            let is_better = candidate.similarity[lane] > most[lane];
-            most[lane] = if is_better { candidate.similarity[lane] } else { most[lane] };
-            best[lane] = if is_better { place as u32 } else { best[lane] };
+            // Comparisons with NaN are false.
+            is_candidate[lane] =
+                (similarity[lane] >= best.similarity[lane]) & (depth_m[lane] > 0.0);
         }
-    }
-    best
-}
-
-/// The most similar reference that fits, of a lane. Most often that is the first one looked at, so the others need no
-/// look into their maps.
-#[inline(always)]
-fn fitting(
-    references: &[Prepared<'_>],
-    candidates: &mut [Candidates],
-    lane: usize,
-    best: u32,
-) -> Option<Source> {
-    let mut place = best as usize;
-    loop {
-        let candidate = candidates.get_mut(place)?;
-        let is_seen = candidate.similarity[lane] > f32::NEG_INFINITY;
-        if !is_seen {
-            return None;
+        if !is_candidate.contains(&true) {
+            continue;
         }
-        let reference = references[place].reference;
         let projection = &*reference.projection;
-        let at = projection.position_px(candidate.x[lane], candidate.y[lane]);
-        if let Some([u, v]) = at {
-            let there_m = reference.depth_m[v as usize * projection.width + u as usize];
-            let here_m = candidate.depth_m[lane];
+        let at = projection.project(&points, &is_candidate);
+        let size = [projection.width as f32, projection.height as f32];
+        for lane in 0..LANES {
+            is_candidate[lane] &= (at.u[lane] >= 0.0)
+                & (at.u[lane] < size[0])
+                & (at.v[lane] >= 0.0)
+                & (at.v[lane] < size[1]);
+        }
+        if !is_candidate.contains(&true) {
+            continue;
+        }
+        for lane in (0..LANES).filter(|lane| is_candidate[*lane]) {
+            let there = at.v[lane] as usize * projection.width + at.u[lane] as usize;
+            let there_m = reference.depth_m[there];
+            let here_m = match projection.depth_is_distance {
+                true => points.distance[lane],
+                false => points.z[lane],
+            };
             let fits = (there_m - here_m).abs() <= DEPTH_M + DEPTH_SHARE * here_m;
             if fits && there_m > 0.0 {
-                return Some(Source { place, u, v });
+                best.similarity[lane] = similarity[lane];
+                best.reference[lane] = place;
+                best.u[lane] = at.u[lane];
+                best.v[lane] = at.v[lane];
             }
-        }
-        candidate.similarity[lane] = f32::NEG_INFINITY;
-        place = most_similar(candidates, lane);
-    }
-}
-
-/// The first of the most similar candidates of a lane.
-fn most_similar(candidates: &[Candidates], lane: usize) -> usize {
-    let mut best = 0;
-    let mut most = f32::NEG_INFINITY;
-    for (place, candidate) in candidates.iter().enumerate() {
-        if candidate.similarity[lane] > most {
-            most = candidate.similarity[lane];
-            best = place;
         }
     }
     best
