@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, thiserror::Error)]
 pub enum AugmentError {
     /// A number of the plan is out of range.
-    #[error("{field} is {value:?}; give {expected}")]
+    #[error("{field} is {value}; give {expected}")]
     Number {
         /// The option.
         field: &'static str,

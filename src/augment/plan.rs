@@ -188,11 +188,11 @@ mod tests {
         let said = |round, offsets: &[f64], every| {
             Plan::new(round, offsets, every).unwrap_err().to_string()
         };
-        assert!(said(0, &[1.0], 2.0).contains("--round is 0.0"), "{}", said(0, &[1.0], 2.0));
-        assert!(said(1, &[1.0, -3.0], 2.0).contains("--offsets is -3.0"));
+        assert!(said(0, &[1.0], 2.0).contains("--round is 0;"), "{}", said(0, &[1.0], 2.0));
+        assert!(said(1, &[1.0, -3.0], 2.0).contains("--offsets is -3;"));
         assert!(said(1, &[f64::NAN], 2.0).contains("--offsets is NaN"));
         assert!(said(1, &[], 2.0).contains("--offsets"));
-        assert!(said(1, &[1.0], 0.0).contains("--every is 0.0; give metres from 0.1 to 1000"));
+        assert!(said(1, &[1.0], 0.0).contains("--every is 0; give metres from 0.1 to 1000"));
         let plan = Plan::new(1, &[1.0], 2.0).unwrap();
         assert!(plan.places(&[]).unwrap_err().to_string().contains("wildcity twin drive"));
     }

@@ -98,12 +98,32 @@ pub struct Subject {
     /// [`Scores::lpips`]: super::Scores::lpips
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_network: Option<String>,
-    /// Where boxes were read, and their number of tracks.
+    /// The boxes of what moves, if some were given.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub boxes: Option<(String, usize)>,
-    /// Where LiDAR points were read, and how many were left out, since no two poses at most 0.2 s apart are around them.
+    pub boxes: Option<BoxesSubject>,
+    /// The points of a LiDAR, if some were given.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub lidar: Option<(String, usize)>,
+    pub lidar: Option<LidarSubject>,
+}
+
+/// The boxes of what moves.
+#[derive(Clone, Debug, Serialize)]
+pub struct BoxesSubject {
+    /// Where they were read.
+    pub file: String,
+    /// Number of tracks.
+    pub tracks: usize,
+}
+
+/// The points of a LiDAR.
+#[derive(Clone, Debug, Serialize)]
+pub struct LidarSubject {
+    /// Where they were read.
+    pub file: String,
+    /// Points that were brought into the world.
+    pub points: usize,
+    /// Points that were left out, since no two poses at most 0.2 s apart are around their time.
+    pub left_out: usize,
 }
 
 /// The model that repaired the images.

@@ -41,13 +41,14 @@ mod thumbnails;
 
 pub use boxes::{Boxes, BoxesError, GROWN_PX, MOVES_M_PER_S, MovingBox, hide};
 pub use evaluated_image::EvaluatedImage;
-pub use evaluation::{Evaluation, RepairSubject, Subject};
+pub use evaluation::{BoxesSubject, Evaluation, LidarSubject, RepairSubject, Subject};
 pub use exposure::Exposure;
 pub use extrapolation::{ExtrapolatedView, Extrapolation, ViewMeans, ViewScores};
 pub use flicker::flicker;
 pub use kid::{Kid, KidError, KidScores};
 pub use lidar::{
-    BINS_M, DepthMap, LidarBin, LidarDepth, LidarError, LidarMeans, LidarPoints, WorldPoints,
+    BINS_M, DepthMap, LidarBin, LidarDepth, LidarError, LidarMeans, LidarPoints, NO_LIDAR_POINT,
+    WorldPoints,
 };
 pub use means::{AlignedMeans, CameraMeans, Gain, Means, ScoreMeans};
 pub use page::render as page;

@@ -27,6 +27,10 @@ pub(crate) const LEAST_OPACITY: f32 = 0.5;
 /// Limits of the bins of depth, in metres. Points beyond the last do not count.
 pub const BINS_M: [f64; 4] = [0.0, 10.0, 30.0, 80.0];
 
+/// Why no depth was compared, where none was.
+pub const NO_LIDAR_POINT: &str = "no LiDAR point was compared: none is within an image, less than 80 m away, at a time near the \
+                                  image's (--lidar-window), where the scene is opaque and pixels count";
+
 /// Points of a LiDAR with their times.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LidarPoints {

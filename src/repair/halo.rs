@@ -10,6 +10,9 @@ use crate::error::RepairError;
 use crate::limits::MAX_HALO_PROBE_PX;
 use crate::planes::Planes;
 
+/// Pixels in a row and in a column that are tried in a model of a fixed size: enough for strides up to 8.
+const FIXED_PHASES: usize = 8;
+
 /// How far the output depends on the input.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Halo {
@@ -51,7 +54,9 @@ impl Probe {
 
     fn halo_at(&self, [height, width]: [usize; 2], run: &mut Run<'_>) -> Result<Halo, RepairError> {
         let mut halo = 0;
-        for phase in 0..self.multiple_of {
+        // The strides of a model of a fixed size are not known: windows of it begin anywhere.
+        let phases = if self.fixed.is_some() { FIXED_PHASES } else { self.multiple_of };
+        for phase in 0..phases {
             let middle = |side: usize| {
                 (side / 2 / self.multiple_of * self.multiple_of + phase).min(side - 1)
             };
@@ -111,4 +116,39 @@ fn reach(output: &Planes, [y, x]: [usize; 2], scale: usize) -> Option<usize> {
         }
     }
     reach
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A model that takes the mean of 4 x 4 pixels for each of them: from 0 to 3 pixels far, by the phase.
+    fn means_of_four(inputs: &[Planes]) -> Result<Planes, RepairError> {
+        let input = &inputs[0];
+        let mut output = Planes::zeros(1, input.height, input.width);
+        for y in 0..input.height {
+            for x in 0..input.width {
+                let mut sum = 0.0;
+                for row in y / 4 * 4..(y / 4 * 4 + 4).min(input.height) {
+                    sum += input.row(0, row)[x / 4 * 4..(x / 4 * 4 + 4).min(input.width)]
+                        .iter()
+                        .sum::<f32>();
+                }
+                output.row_mut(0, y)[x] = sum / 16.0;
+            }
+        }
+        Ok(output)
+    }
+
+    #[test]
+    fn the_halo_is_the_largest_of_all_phases_also_of_a_fixed_size() {
+        let probe = |multiple_of, fixed| Probe {
+            inputs: vec![(1, [0.0, 1.0])],
+            multiple_of,
+            fixed,
+            scale: 1,
+        };
+        assert_eq!(probe(4, None).halo(&mut means_of_four).unwrap(), Halo::Pixels(3));
+        assert_eq!(probe(1, Some([40, 24])).halo(&mut means_of_four).unwrap(), Halo::Pixels(3));
+    }
 }

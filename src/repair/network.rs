@@ -105,25 +105,11 @@ impl NetworkManifest {
     /// # Errors
     /// [`RepairError::Manifest`] with the field that is wrong.
     pub fn parse(bytes: &[u8], file: &Path) -> Result<Self, RepairError> {
-        let wrong = |field: String, message: String| RepairError::Manifest {
-            file: file.to_owned(),
-            field,
-            message,
-        };
-        let mut reader = serde_json::Deserializer::from_slice(bytes);
-        let manifest: Self = serde_path_to_error::deserialize(&mut reader)
-            .map_err(|error| wrong(error.path().to_string(), error.into_inner().to_string()))?;
-        reader.end().map_err(|error| wrong("end".to_owned(), error.to_string()))?;
-        manifest.check().map_err(|(field, message)| wrong(field, message))?;
-        Ok(manifest)
+        validate::read(bytes, file, Self::FORMAT, Self::check)
     }
 
     fn check(&self) -> Checked {
         let wrong = |field: &str, message: String| Err((field.to_owned(), message));
-        if self.format != Self::FORMAT {
-            let message = format!("{:?}; this program reads {:?}", self.format, Self::FORMAT);
-            return wrong("format", message);
-        }
         validate::check_name(&self.name)?;
         validate::check_run(&self.providers, self.timeout_ms, self.memory_mib)?;
         validate::check_files(&self.files)?;

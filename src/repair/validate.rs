@@ -2,6 +2,9 @@
 
 use std::path::Path;
 
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
 use crate::error::RepairError;
 use crate::limits::{
     MAX_CONSTANT_VALUES, MAX_FILES, MAX_INPUTS, MAX_MULTIPLE_PX, MAX_SCALE, MAX_SIDE_PX,
@@ -18,27 +21,44 @@ impl Manifest {
     /// # Errors
     /// [`RepairError::Manifest`] with the field that is wrong.
     pub fn parse(bytes: &[u8], file: &Path) -> Result<Manifest, RepairError> {
-        let wrong = |field: String, message: String| RepairError::Manifest {
-            file: file.to_owned(),
-            field,
-            message,
-        };
-        let mut reader = serde_json::Deserializer::from_slice(bytes);
-        let manifest: Manifest = serde_path_to_error::deserialize(&mut reader)
-            .map_err(|error| wrong(error.path().to_string(), error.into_inner().to_string()))?;
-        reader.end().map_err(|error| wrong("end".to_owned(), error.to_string()))?;
-        check(&manifest).map_err(|(field, message)| wrong(field, message))?;
-        Ok(manifest)
+        read(bytes, file, Self::FORMAT, check)
     }
+}
+
+/// Reads a manifest of a format, and checks it. A file of another format is refused as that, and not for one of its fields.
+pub(crate) fn read<T: DeserializeOwned>(
+    bytes: &[u8],
+    file: &Path,
+    format: &str,
+    check: fn(&T) -> Checked,
+) -> Result<T, RepairError> {
+    let wrong = |field: &str, message: String| RepairError::Manifest {
+        file: file.to_owned(),
+        field: field.to_owned(),
+        message,
+    };
+    let value: Value = serde_json::from_slice(bytes).map_err(|error| {
+        let must = "give the manifest, a JSON file beside the .onnx file (docs/repair.md)";
+        wrong("manifest", format!("{error}; {must}"))
+    })?;
+    let found = value.get("format");
+    if found.and_then(Value::as_str) != Some(format) {
+        let found = found.map_or("missing".to_owned(), Value::to_string);
+        return Err(wrong("format", format!("{found}; {format:?} is needed here")));
+    }
+    let mut reader = serde_json::Deserializer::from_slice(bytes);
+    let manifest: T = serde_path_to_error::deserialize(&mut reader).map_err(|error| {
+        let path = error.path().to_string();
+        // The path of the whole file.
+        let field = if path == "." { "manifest" } else { &path };
+        wrong(field, error.inner().to_string())
+    })?;
+    check(&manifest).map_err(|(field, message)| wrong(&field, message))?;
+    Ok(manifest)
 }
 
 /// What the types do not say. The field and what is accepted.
 fn check(manifest: &Manifest) -> Checked {
-    let wrong = |field: &str, message: String| Err((field.to_owned(), message));
-    if manifest.format != Manifest::FORMAT {
-        let message = format!("{:?}; this program reads {:?}", manifest.format, Manifest::FORMAT);
-        return wrong("format", message);
-    }
     check_name(&manifest.name)?;
     check_run(&manifest.providers, manifest.timeout_ms, manifest.memory_mib)?;
     check_files(&manifest.files)?;

@@ -270,6 +270,16 @@ fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
         let numbers = [&image["psnr_db"], &image["ssim"], &image["flip"], &image["counted"]];
         assert_eq!(numbers, [&json!("inf"), &json!(1.0), &json!(0.0), &json!(0.5)]);
     }
+    // Names of transforms.json begin with the folder of the images; masks need not be in a folder of that name.
+    let frames = transforms(&json!({})).replace("front/", "images/front/");
+    fs::write(at.join("transforms.json"), frames).unwrap();
+    mask.save(at.join("masks/front/b.png")).unwrap();
+    let beside = ["eval", "scene.ply", "--images", "transforms.json", "--masks", "masks"];
+    done(at, &[&beside[..], &["--out", "out", "--backend", "cpu"]].concat());
+    let made: Value = serde_json::from_slice(&fs::read(at.join("out/eval.json")).unwrap()).unwrap();
+    for image in made["images"].as_array().unwrap() {
+        assert_eq!(image["counted"], json!(0.5), "{image}");
+    }
     // transforms.json names masks beside itself.
     mask.save(at.join("images/mask.png")).unwrap();
     fs::write(at.join("images/transforms.json"), transforms(&json!({"mask_path": "mask.png"})))
@@ -336,7 +346,10 @@ fn what_is_missing_or_of_another_size_is_named() {
     );
     let images = [&images[..], &["--image-dir", "images"]].concat();
     let said = refused(at, &[&images[..], &["--masks", "masks"]].concat());
-    assert!(said.contains("there is no mask masks/front/a.png.png"), "{said}");
+    assert!(
+        said.contains("there is no mask masks/front/a.png, nor masks/front/a.png.png"),
+        "{said}"
+    );
     fs::create_dir_all(at.join("masks/front")).unwrap();
     for name in ["a", "b", "c"] {
         GrayImage::new(5, 5).save(at.join(format!("masks/front/{name}.png"))).unwrap();

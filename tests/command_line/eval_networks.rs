@@ -183,7 +183,10 @@ fn boxes_hide_what_moves_and_lidar_measures_depth() {
     ];
     fs::write(at.join("lidar.safetensors"), serialize(tensors, None).unwrap()).unwrap();
     let (said, made) = eval(at, "scene.ply", "views.jsonl", &["--lidar", "lidar.safetensors"]);
-    assert_eq!(made["subject"]["lidar"], json!(["lidar.safetensors", 1]));
+    assert_eq!(
+        made["subject"]["lidar"],
+        json!({"file": "lidar.safetensors", "points": 3, "left_out": 1})
+    );
     assert!(said.contains("1 LiDAR points were left out"), "{said}");
     let lidar = |image: &Value| image["lidar"].clone();
     let found: Vec<Value> = made["images"].as_array().unwrap().iter().map(lidar).collect();
@@ -191,6 +194,21 @@ fn boxes_hide_what_moves_and_lidar_measures_depth() {
     // Where the scene is opaque. It is a ball of about 1.5 m around the point.
     assert!(found.len() == 3 && !seen.is_empty(), "{found:?}");
     assert!(seen.iter().all(|lidar| number(&lidar["mean_m"]) < 3.0), "{found:?}");
+
+    // Points that no image sees are told, and not a mean of nothing.
+    let points = bytes(&[500.0; 12]);
+    let tensors = [
+        ("points_m", TensorView::new(Dtype::F32, vec![4, 3], &points).unwrap()),
+        ("time_us", TensorView::new(Dtype::I64, vec![4], &point_times).unwrap()),
+        ("pose_time_us", TensorView::new(Dtype::I64, vec![3], &pose_times).unwrap()),
+        ("world_from_rig", TensorView::new(Dtype::F64, vec![3, 4, 4], &poses).unwrap()),
+    ];
+    fs::write(at.join("lidar.safetensors"), serialize(tensors, None).unwrap()).unwrap();
+    let (said, made) = eval(at, "scene.ply", "views.jsonl", &["--lidar", "lidar.safetensors"]);
+    assert!(said.contains("no LiDAR point was compared") && !said.contains("NaN"), "{said}");
+    let page = fs::read_to_string(at.join("out/report.html")).unwrap();
+    assert!(page.contains("no LiDAR point was compared"));
+    assert_eq!(made["all"]["lidar"]["points"], 0);
 }
 
 #[test]

@@ -54,6 +54,9 @@ fn images_are_stored_scaled_along_the_drive_and_removed() {
     };
     let said = done(at, &[&views("street")[..], &["--side", "100"]].concat());
     assert!(said.starts_with("twin street version 2: 6 recorded images of 0.0 MB"), "{said}");
+    let far = [&views("street")[..], &["--axes", "identity", "--scale", "1000"]].concat();
+    let said = refused(at, &far);
+    assert!(said.contains("m or more from the drives") && said.contains("--scale"), "{said}");
 
     let version = catalog.version("street", None).unwrap();
     let stored = catalog.views(&version).unwrap();

@@ -1,10 +1,13 @@
 //! Every mistake has its own error, which names the field and what to do; a model goes on after it.
 
 use std::fs;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
-use wildcity_repair::{Image, LoadOptions, Model, Provider, RepairError, View};
+use wildcity_repair::{
+    Image, LoadOptions, Manifest, Model, NetworkManifest, Provider, RepairError, View,
+};
 
 use crate::onnx_doubles as doubles;
 use crate::onnx_models::{Folder, library};
@@ -98,6 +101,30 @@ fn a_manifest_is_refused_with_the_field_that_is_wrong() {
         let RepairError::Manifest { field: at, .. } = &error else { panic!("{changes}: {error}") };
         assert_eq!(at, field, "{error}");
     }
+}
+
+#[test]
+fn a_file_that_is_no_manifest_is_refused_as_that() {
+    let file = Path::new("m.json");
+    for (text, said) in [
+        ("\x08\x07", "m.json: manifest: expected value at line 1 column 1; give the manifest"),
+        ("{\"name\": \"a\"}", "m.json: format: missing; \"wildcity.repair/1\" is needed here"),
+        ("{\"format\": \"wildcity.repair/1\"}", "m.json: manifest: missing field `name`"),
+        // The fields of a network have other types; its format is what is wrong.
+        (
+            "{\"format\": \"wildcity.network/1\", \"size\": [1, 2]}",
+            "m.json: format: \"wildcity.network/1\"; \"wildcity.repair/1\" is needed here",
+        ),
+    ] {
+        let error = Manifest::parse(text.as_bytes(), file).unwrap_err().to_string();
+        assert!(error.starts_with(said), "{error}");
+    }
+    let text = "{\"format\": \"wildcity.repair/1\", \"size\": {\"fixed\": [1, 2]}}";
+    let error = NetworkManifest::parse(text.as_bytes(), file).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "m.json: format: \"wildcity.repair/1\"; \"wildcity.network/1\" is needed here"
+    );
 }
 
 #[test]

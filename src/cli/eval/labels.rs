@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, ensure};
 
 use wildcity_eval::{
-    Boxes, DepthMap, GROWN_PX, LidarDepth, LidarPoints, MovingBox, WorldPoints, hide,
+    Boxes, BoxesSubject, DepthMap, GROWN_PX, LidarDepth, LidarPoints, LidarSubject, MovingBox,
+    WorldPoints, hide,
 };
 use wildcity_render::View;
 use wildcity_scene::align::Alignment;
@@ -45,8 +46,8 @@ pub(super) struct Labels {
     boxes: Option<Boxes>,
     lidar: Option<WorldPoints>,
     window_us: i64,
-    pub(super) boxes_subject: Option<(String, usize)>,
-    pub(super) lidar_subject: Option<(String, usize)>,
+    pub(super) boxes_subject: Option<BoxesSubject>,
+    pub(super) lidar_subject: Option<LidarSubject>,
 }
 
 impl LabelOptions {
@@ -80,13 +81,18 @@ impl LabelOptions {
         };
         if let Some(path) = &self.boxes {
             let boxes = read_boxes(path).with_context(|| format!("--boxes {}", path.display()))?;
-            labels.boxes_subject = Some((path.display().to_string(), boxes.tracks()));
+            let file = path.display().to_string();
+            labels.boxes_subject = Some(BoxesSubject { file, tracks: boxes.tracks() });
             labels.boxes = Some(boxes.aligned(alignment));
         }
         if let Some(path) = &self.lidar {
             let about = || format!("--lidar {}", path.display());
             let points = read_lidar(path, source, alignment).with_context(about)?;
-            labels.lidar_subject = Some((path.display().to_string(), points.skipped));
+            labels.lidar_subject = Some(LidarSubject {
+                file: path.display().to_string(),
+                points: points.points_m.len(),
+                left_out: points.skipped,
+            });
             labels.lidar = Some(points);
         }
         Ok(labels)

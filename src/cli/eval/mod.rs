@@ -314,12 +314,11 @@ impl Eval {
                 kid.repaired.map_or(String::new(), |kid| format!(", repaired {:.5}", kid.mean));
             writeln!(out, "KID by {}: {:.5}{after}", kid.network, kid.rendered.mean)?;
         }
-        if let Some((_, skipped)) =
-            evaluation.subject.lidar.as_ref().filter(|(_, skipped)| *skipped > 0)
-        {
+        if let Some(lidar) = evaluation.subject.lidar.as_ref().filter(|lidar| lidar.left_out > 0) {
             writeln!(
                 out,
-                "{skipped} LiDAR points were left out: no two poses at most 0.2 s apart are around their time"
+                "{} LiDAR points were left out: no two poses at most 0.2 s apart are around their time",
+                lidar.left_out
             )?;
         }
         for one in &evaluation.extrapolation {

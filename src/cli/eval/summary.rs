@@ -12,10 +12,13 @@ pub(super) fn print_means(out: &mut impl Write, means: &Means) -> io::Result<()>
     }
     if let Some(lidar) = &means.lidar {
         let LidarMeans { points, mean_m, median_m, .. } = lidar;
-        writeln!(
-            out,
-            "depth against {points} LiDAR points: mean {mean_m:.3} m, median {median_m:.3} m"
-        )?;
+        match points {
+            0 => writeln!(out, "depth: {}", wildcity_eval::NO_LIDAR_POINT)?,
+            _ => writeln!(
+                out,
+                "depth against {points} LiDAR points: mean {mean_m:.3} m, median {median_m:.3} m"
+            )?,
+        }
     }
     if let Some(gain) = &means.gain {
         let Gain { psnr_db, ssim, flip, .. } = gain;

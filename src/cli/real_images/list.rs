@@ -2,12 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use wildcity_scene::align::PosedImage;
 use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_twin::ingest::capture::CaptureError;
 use wildcity_twin::ingest::{self, cameras, capture};
 
 /// A real image and its camera.
@@ -99,7 +100,10 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
     let beside = source.parent().unwrap_or(Path::new("")).to_owned();
     let is_dir = source.is_dir();
     if is_dir && !source.join("transforms.json").is_file() {
-        let images = capture::read_colmap(source)?;
+        let images = capture::read_colmap(source).map_err(|error| match error {
+            CaptureError::NoModel { .. } => anyhow!("{error}; there is no transforms.json either"),
+            error => error.into(),
+        })?;
         let listed = |posed| ListedImage {
             posed,
             mask: None,
@@ -170,15 +174,20 @@ fn image_file(folder: &Path, name: &str) -> anyhow::Result<PathBuf> {
     })
 }
 
-/// The mask of an image: with its name, with .png in place of its extension, or behind it, as COLMAP names masks.
+/// The mask of an image: with its name, with .png in place of its extension, or behind it, as COLMAP names masks. Names of
+/// transforms.json begin with the folder of the images, such as `images` or `images_4`, and those of masks need not.
 fn mask_file(masks: &Path, name: &str) -> anyhow::Result<PathBuf> {
-    let named = masks.join(name);
-    let appended = PathBuf::from(format!("{}.png", named.display()));
-    let candidates = [appended.clone(), named.with_extension("png"), named];
+    let within = name.split_once('/').filter(|(folder, _)| folder.starts_with("images"));
+    let names = [Some(name), within.map(|(_, within)| within)].into_iter().flatten();
+    let candidates = names.flat_map(|name| {
+        let named = masks.join(name);
+        let appended = PathBuf::from(format!("{}.png", named.display()));
+        [appended, named.with_extension("png"), named]
+    });
     candidates.into_iter().find(|file| file.is_file()).with_context(|| {
         format!(
-            "there is no mask {}: a mask for each image, white where it counts",
-            appended.display()
+            "there is no mask {0}, nor {0}.png: --masks needs one for each image, white where it counts",
+            masks.join(name).display()
         )
     })
 }

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use image::{ImageFormat, RgbImage};
 use wildcity_repair::{Halo, Image, InputRole, LoadOptions, Model, Provider};
 
@@ -73,10 +73,14 @@ impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let sizes = self.sizes()?;
         let image = self.image.as_deref().map(read_image).transpose()?;
+        if let Some(dir) = &self.out {
+            output::create_dir(dir)?;
+        }
         let model = Model::load(&self.manifest, &self.options())?;
         let mut out = io::stdout().lock();
         self.print_model(&mut out, &model)?;
         writeln!(out, "\n{:<12} {:>10} {:>12}", "size", "time", "memory")?;
+        let mut measured = 0;
         for [width, height] in sizes {
             let size = format!("{width}x{height}");
             let sample = Sample::new(pattern(width, height));
@@ -84,6 +88,7 @@ impl Check {
             let start = Instant::now();
             match model.repair_timed(&sample.view()) {
                 Ok((_, times)) => {
+                    measured += 1;
                     let seconds = start.elapsed().as_secs_f64();
                     writeln!(out, "{size:<12} {seconds:>8.3} s {:>12}", peak.text())?;
                     let [fit, run, merge] =
@@ -100,10 +105,10 @@ impl Check {
                 writeln!(out, "{:<12} {straight:>8.3} s {beside} {bent:.3} s", "")?;
             }
         }
+        ensure!(measured > 0, "the model repaired an image of none of these sizes");
         let Some(dir) = &self.out else { return Ok(()) };
         let sample = Sample::new(image.unwrap_or_else(|| pattern(SIZES[0][0], SIZES[0][1])));
         let repaired = model.repair(&sample.view())?;
-        output::create_dir(dir)?;
         output::write(&dir.join("before.png"), &png(sample.rendered())?)?;
         output::write(&dir.join("after.png"), &png(&repaired.image)?)?;
         writeln!(out, "\nrendered     {}", repaired.rendered_hash)?;
@@ -147,6 +152,9 @@ impl Check {
             false => "three runs gave different bytes",
         };
         let halo = match model.halo() {
+            Some(Halo::Pixels(halo)) if manifest.size.fixed.is_some() => {
+                format!("{halo} px; the model takes no larger image that tiles could equal")
+            }
             Some(Halo::Pixels(halo)) => format!("{halo} px; tiles equal the whole"),
             Some(Halo::Whole) => "the whole image".to_owned(),
             None => "not measured: size.fit is not \"tile\"".to_owned(),
@@ -198,6 +206,7 @@ fn read_image(path: &Path) -> anyhow::Result<Image> {
         .with_context(cannot)?
         .with_guessed_format()
         .with_context(cannot)?;
+    ensure!(reader.format().is_some(), "--image {}: neither PNG nor JPEG", path.display());
     let largest = wildcity_repair::limits::MAX_SIDE_PX as u32;
     let mut limits = image::Limits::default();
     limits.max_image_width = Some(largest);

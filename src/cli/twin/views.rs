@@ -83,6 +83,10 @@ Examples:
 /// the drive, and images every 2 m would otherwise be kept every 4 m.
 const SLACK: f64 = 0.1;
 
+/// Half of the images are at most so far from the drives, in metres, or their poses have other axes or another unit. Cameras of a
+/// vehicle are within some metres; another lane is within 20 m.
+const MOST_MEDIAN_M: f64 = 20.0;
+
 /// An image of the list with its place on the drive.
 struct Placed<'a> {
     image: &'a RealImage,
@@ -99,6 +103,7 @@ impl Views {
         let manifest = &base.manifest;
         let storage = StorageOptions { record: manifest.record, ..StorageOptions::default() };
         let mut commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
+        let mut listed = 0;
         match &self.images {
             None => commit.set_views(None),
             Some(images) => {
@@ -113,6 +118,7 @@ impl Views {
                     None if list.is_in_scene_axes => Alignment::IDENTITY,
                     None => placement::of_version(&catalog, &base)?,
                 };
+                listed = list.every(1).len();
                 let views = self.put(&mut commit, manifest, &list, &alignment)?;
                 let views = commit.put_views(&views)?;
                 commit.set_views(Some(views));
@@ -123,7 +129,11 @@ impl Views {
         let what =
             version.manifest.views.as_ref().map_or("no recorded images".to_owned(), |views| {
                 let mb = views.image_bytes as f64 * 1e-6;
-                format!("{} recorded images of {mb:.1} MB", views.images)
+                let of = match listed {
+                    listed if listed as u64 == u64::from(views.images) => String::new(),
+                    listed => format!("; the list has {listed}, others are nearer than --every"),
+                };
+                format!("{} recorded images of {mb:.1} MB{of}", views.images)
             });
         change::print(&version, &what)
     }
@@ -146,6 +156,14 @@ impl Views {
             let (trajectory, place) = nearest.context("the twin has no recorded drive")?;
             placed.push(Placed { image, camera_name, trajectory, place, alignment });
         }
+        let mut distances_m: Vec<f64> = placed.iter().map(|one| one.place.distance_m).collect();
+        distances_m.sort_by(f64::total_cmp);
+        let median_m = distances_m.get(distances_m.len() / 2).copied().unwrap_or(0.0);
+        ensure!(
+            median_m <= MOST_MEDIAN_M,
+            "half of the images are {median_m:.0} m or more from the drives of the twin, and at most {MOST_MEDIAN_M} m are possible: \
+             the poses have other axes or another unit; see --axes and --scale"
+        );
         let order = |one: &Placed<'_>| (one.trajectory.name.clone(), one.camera_name.clone());
         placed.sort_by(|a, b| {
             order(a).cmp(&order(b)).then(a.place.station_m.total_cmp(&b.place.station_m))

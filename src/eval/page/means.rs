@@ -3,9 +3,9 @@
 use maud::{Markup, html};
 
 use super::numbers::{decibels, metres, share, signed};
-use crate::evaluation::Evaluation;
+use crate::evaluation::{Evaluation, LidarSubject};
 use crate::kid::Kid;
-use crate::lidar::LidarMeans;
+use crate::lidar::{LidarMeans, NO_LIDAR_POINT};
 use crate::means::{Gain, Means, ScoreMeans};
 
 /// Which columns there are.
@@ -112,12 +112,11 @@ pub(super) fn lidar(evaluation: &Evaluation) -> Markup {
         h2 { "Depth against LiDAR" }
         p {
             "Absolute difference of the rendered depth and the point's, in metres, by the point's depth."
-            @if let Some((_, skipped)) = &evaluation.subject.lidar {
-                @if *skipped > 0 {
-                    " " (skipped) " points were left out: no two poses at most 0.2 s apart are around their time."
-                }
+            @if let Some(LidarSubject { left_out, .. }) = &evaluation.subject.lidar && *left_out > 0 {
+                " " (left_out) " points were left out: no two poses at most 0.2 s apart are around their time."
             }
         }
+        @if all.points == 0 { p.miss { (NO_LIDAR_POINT) "." } }
         div.wide {
             table {
                 tr {

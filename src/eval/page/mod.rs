@@ -87,8 +87,8 @@ fn introduction(evaluation: &Evaluation) -> Markup {
         }
         @if past > 0 {
             p.miss {
-                "In " (past) " images the scene covers less than " (100.0 * BARELY_COVERED) " % of the pixels. If it \
-                 should be there, the poses have other axes or another unit than the scene: see --axes and --scale."
+                "The scene covers less than " (100.0 * BARELY_COVERED) " % of the pixels of " (past) " of the images. If \
+                 it should be there, the poses have other axes or another unit than the scene: see --axes and --scale."
             }
         }
     }

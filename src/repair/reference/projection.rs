@@ -80,8 +80,9 @@ impl Projection {
         }
     }
 
+    /// The positions of the points that are wanted. A table has none of the others.
     #[inline(always)]
-    pub(super) fn project(&self, points: &Points) -> Positions {
+    pub(super) fn project(&self, points: &Points, is_wanted: &[bool; LANES]) -> Positions {
         let mut at = Positions { u: [f32::NAN; LANES], v: [f32::NAN; LANES] };
         match &self.lens {
             Lens::Pinhole([fx, fy, cx, cy]) => {
@@ -92,7 +93,7 @@ impl Projection {
                     at.v[lane] = fy * points.y[lane] * inverse + cy;
                 }
             }
-            Lens::Table(table) => table.project(points, &mut at),
+            Lens::Table(table) => table.project(points, is_wanted, &mut at),
         }
         at
     }
@@ -117,7 +118,7 @@ impl Table {
     }
 
     #[inline(always)]
-    fn project(&self, points: &Points, at: &mut Positions) {
+    fn project(&self, points: &Points, is_wanted: &[bool; LANES], at: &mut Positions) {
         let middle = (CELLS / 2) as f32;
         for lane in 0..LANES {
             let by = self.cells_per_unit / (points.distance[lane] + points.z[lane]);
@@ -126,7 +127,7 @@ impl Table {
             let last = CELLS as f32;
             // A NaN is in no cell.
             let is_within = column >= 0.0 && row >= 0.0 && column < last && row < last;
-            if !is_within {
+            if !is_within || !is_wanted[lane] {
                 continue;
             }
             let [left, top] = [column as usize, row as usize];
@@ -183,7 +184,7 @@ mod tests {
                     z: lanes(point.z),
                     distance: lanes(7.0),
                 };
-                let at = projection.project(&points);
+                let at = projection.project(&points, &[true; LANES]);
                 let [u, v] = [at.u[3], at.v[3]].map(f64::from);
                 if u.is_nan() {
                     assert!(off_rad > 0.8, "{off_rad} rad off the axis is within the image");

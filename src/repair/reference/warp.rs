@@ -114,11 +114,13 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
         .enumerate()
         .map(|(index, reference)| Prepared { index, reference, from_target: prepare(reference) })
         .collect();
-    // Near ones first: then most pixels have their best reference soon, and the others need no look at their depth.
+    // Far ones first. Most are behind the view, and the farther they are, the smaller the angle: then most pixels have
+    // their best reference soon, and the others need no look at their depth. Of equals the last one counts, the nearest.
     let distance_m = |one: &Prepared<'_>| {
         one.reference.world_from_camera.position_m.distance(target.world_from_camera.position_m)
     };
     prepared.sort_by(|a, b| distance_m(a).total_cmp(&distance_m(b)));
+    prepared.reverse();
     dispatch!(Level::new(), _ => rows(target, groups, &prepared, &mut warped));
     warped
 }
@@ -263,18 +265,23 @@ fn best(
             points.distance[lane] = distance;
             *similarity = dot / distance;
         }
-        let projection = &*reference.projection;
-        let at = projection.project(&points);
-        let size = [projection.width as f32, projection.height as f32];
         let mut is_candidate = [false; LANES];
         for lane in 0..LANES {
             // Comparisons with NaN are false.
-            is_candidate[lane] = (at.u[lane] >= 0.0)
+            is_candidate[lane] =
+                (similarity[lane] >= best.similarity[lane]) & (depth_m[lane] > 0.0);
+        }
+        if !is_candidate.contains(&true) {
+            continue;
+        }
+        let projection = &*reference.projection;
+        let at = projection.project(&points, &is_candidate);
+        let size = [projection.width as f32, projection.height as f32];
+        for lane in 0..LANES {
+            is_candidate[lane] &= (at.u[lane] >= 0.0)
                 & (at.u[lane] < size[0])
                 & (at.v[lane] >= 0.0)
-                & (at.v[lane] < size[1])
-                & (similarity[lane] > best.similarity[lane])
-                & (depth_m[lane] > 0.0);
+                & (at.v[lane] < size[1]);
         }
         if !is_candidate.contains(&true) {
             continue;

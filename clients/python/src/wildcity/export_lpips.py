@@ -319,6 +319,9 @@ def _read(path: Path) -> Mapping[str, Any]:
 
             # Arrays only: a file of this kind may contain a program.
             return _arrays(torch.load(path, map_location="cpu", weights_only=True))
+    except ModuleNotFoundError as error:
+        message = f"{error}; install it, or convert the file to .npz or .safetensors"
+        raise ExportError(f"--weights {path}", message) from error
     except Exception as error:  # Errors of the readers have no common class.
         raise ExportError(f"--weights {path}", str(error)) from error
     raise ExportError(f"--weights {path}", "a name that ends with .safetensors, .npz or .pth")
