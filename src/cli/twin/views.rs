@@ -130,7 +130,7 @@ impl Views {
             version.manifest.views.as_ref().map_or("no recorded images".to_owned(), |views| {
                 let mb = views.image_bytes as f64 * 1e-6;
                 let of = match listed {
-                    listed if listed as u64 == u64::from(views.images) => String::new(),
+                    listed if listed as u64 == views.images => String::new(),
                     listed => format!("; the list has {listed}, others are nearer than --every"),
                 };
                 format!("{} recorded images of {mb:.1} MB{of}", views.images)

@@ -120,14 +120,14 @@ impl Table {
     #[inline(always)]
     fn project(&self, points: &Points, is_wanted: &[bool; LANES], at: &mut Positions) {
         let middle = (CELLS / 2) as f32;
-        for lane in 0..LANES {
+        for (lane, is_wanted) in is_wanted.iter().enumerate() {
             let by = self.cells_per_unit / (points.distance[lane] + points.z[lane]);
             let column = points.x[lane] * by + middle;
             let row = points.y[lane] * by + middle;
             let last = CELLS as f32;
             // A NaN is in no cell.
             let is_within = column >= 0.0 && row >= 0.0 && column < last && row < last;
-            if !is_within || !is_wanted[lane] {
+            if !is_within || !is_wanted {
                 continue;
             }
             let [left, top] = [column as usize, row as usize];

@@ -266,10 +266,9 @@ fn best(
             *similarity = dot / distance;
         }
         let mut is_candidate = [false; LANES];
-        for lane in 0..LANES {
+        for (lane, is_candidate) in is_candidate.iter_mut().enumerate() {
             // Comparisons with NaN are false.
-            is_candidate[lane] =
-                (similarity[lane] >= best.similarity[lane]) & (depth_m[lane] > 0.0);
+            *is_candidate = (similarity[lane] >= best.similarity[lane]) & (depth_m[lane] > 0.0);
         }
         if !is_candidate.contains(&true) {
             continue;
@@ -277,8 +276,8 @@ fn best(
         let projection = &*reference.projection;
         let at = projection.project(&points, &is_candidate);
         let size = [projection.width as f32, projection.height as f32];
-        for lane in 0..LANES {
-            is_candidate[lane] &= (at.u[lane] >= 0.0)
+        for (lane, is_candidate) in is_candidate.iter_mut().enumerate() {
+            *is_candidate &= (at.u[lane] >= 0.0)
                 & (at.u[lane] < size[0])
                 & (at.v[lane] >= 0.0)
                 & (at.v[lane] < size[1]);
