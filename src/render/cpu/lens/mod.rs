@@ -5,7 +5,7 @@
 //! image radius r(θ) divided by t is a smooth function of t, whichever way a calibration's polynomial leads.
 //! 8 to 14 terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel
 //! to its ray ([`LensRays`]); the number of terms is chosen when a lens is prepared. The results are within
-//! 8e-4 px of f64, also with a rolling shutter. With Newton's method instead, a step of a real six-camera rig
+//! 8e-4 px of f64, also with a rolling shutter ([`search`]). With Newton's method instead, a step of a real six-camera rig
 //! spent four fifths of its time in it.
 //!
 //! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three kinds
@@ -33,7 +33,7 @@ pub(super) use rays::LensRays;
 pub(super) use search::ExposedPixels;
 use shutter::SimdShutter;
 use tangent::Tangent;
-use windshield::{Refracted, SimdWindshield};
+use windshield::SimdWindshield;
 
 /// Largest error of a series, in pixels: a tenth of the resolution of f32 away from the middle of an image.
 const MAX_SERIES_ERROR_PX: f64 = 1e-5;
@@ -176,9 +176,7 @@ impl LensProjection {
     #[inline(always)]
     fn project_static<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> LensPixels<S> {
         let Some(windshield) = &self.windshield else { return self.project_lens(simd, point_m) };
-        let Refracted { direction, margin } = windshield.inside(simd, point_m);
-        let pixels = self.project_lens(simd, direction);
-        LensPixels { margin: pixels.margin.min(margin), ..pixels }
+        self.project_lens(simd, windshield.inside(simd, point_m))
     }
 
     /// Projects points, or directions behind the windshield, by the lens alone.
@@ -437,6 +435,7 @@ mod tests {
                 let mut inside = 0;
                 let mut beyond = 0;
                 let mut max_error_px: f64 = 0.0;
+                let mut max_faded_px: f64 = 0.0;
                 for step in 0..5_000 {
                     let angle_rad = camera.limit_rad() * f64::from(step) / 4_000.0;
                     let (sin, cos) = angle_rad.sin_cos();
@@ -466,8 +465,11 @@ mod tests {
                         for ([x_px, y_px, margin], point_m) in [(found, point_m), (near, aside_m)] {
                             let at_px = view.project_extrapolated(point_m, 1.0).at_px;
                             let off = at_px - DVec2::new(x_px, y_px);
+                            // Where the refraction of a windshield fades out: 81° off the axis, less the points beside and the motion.
+                            let fades = camera.windshield.is_some() && angle_rad > 1.35;
+                            let most = if fades { &mut max_faded_px } else { &mut max_error_px };
                             if margin >= 0.0 {
-                                max_error_px = max_error_px.max(off.length());
+                                *most = most.max(off.length());
                             }
                         }
                         inside += usize::from(view.project_world(point_m).is_some());
@@ -484,6 +486,8 @@ mod tests {
                 // Behind a windshield and far beyond the image 2.0e-3 px were measured.
                 let bound_px = if is_bare { 1.5e-3 } else { 2.5e-3 };
                 assert!(max_error_px < bound_px, "{name}: {max_error_px:e} px");
+                // Beside the image of a pinhole behind one, 7.9e-3 px were measured.
+                assert!(max_faded_px < 1e-2, "{name}: {max_faded_px:e} px");
             }
         }
     }

@@ -127,8 +127,8 @@ impl LensProjection {
 
             // The slope of the secant. A point at rest on the image has -1.
             let secant = (next_off - off) / step;
-            let slow = secant.simd_ge(splat(-1.5))
-                & secant.simd_le(splat(-0.5))
+            let slow = secant.simd_ge(splat(-2.0))
+                & secant.simd_le(splat(-0.3))
                 & step.abs().simd_gt(splat(LEAST_STEP));
             let slope = slow.select(secant, from.slope);
 

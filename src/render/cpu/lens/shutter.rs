@@ -102,7 +102,7 @@ impl SimdShutter {
         let [x, y, z] = self.translation_m;
         let moved_m = splat((x * x + y * y + z * z).sqrt());
         let turn = moved_m / (distance_m - moved_m);
-        let far = distance_m.simd_gt(splat(3.0) * moved_m);
+        let far = distance_m.simd_gt(splat(1.5) * moved_m);
         far.select(turn, splat(f32::INFINITY)) + splat(self.rotation_rad)
     }
 

@@ -9,8 +9,8 @@ use crate::cpu::math::{angle_of, sin};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
-/// A windshield with polynomials from outside angles to inside angles. It is valid at angles where the
-/// refraction is complete: at large angles [`Windshield`] fades the refraction out, and this type does not.
+/// A windshield with polynomials from outside angles to inside angles. Directions inside are those of [`Windshield`], which
+/// fades the refraction out at large angles. Directions outside, and derivatives, are valid where the refraction is complete.
 ///
 /// The polynomials here are by how much the angles change. A windshield changes a ray by 0.01, so what f32 rounds of that
 /// is a hundredth of what it rounds of a ray. Beside the camera this decides: from `z² = 1 - x² - y²` alone, z = 0.15 would
@@ -31,15 +31,6 @@ struct ValueAndSlopes<S: Simd> {
     value: f32x16<S>,
     by_phi: f32x16<S>,
     by_theta: f32x16<S>,
-}
-
-/// Directions behind a windshield.
-#[derive(Clone, Copy)]
-pub(super) struct Refracted<S: Simd> {
-    /// Unit directions inside.
-    pub(super) direction: Vec3x16<S>,
-    /// Not below 0 where the refraction is complete.
-    pub(super) margin: f32x16<S>,
 }
 
 /// The refraction around a direction.
@@ -71,21 +62,23 @@ impl SimdWindshield {
         described.then_some(Self { horizontal, vertical })
     }
 
-    /// Directions inside, of directions of any length outside.
+    /// Unit directions inside, of directions of any length outside.
     #[inline(always)]
-    pub(super) fn inside<S: Simd>(&self, simd: S, outside: Vec3x16<S>) -> Refracted<S> {
+    pub(super) fn inside<S: Simd>(&self, simd: S, outside: Vec3x16<S>) -> Vec3x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let unit = outside.scale(splat(1.0) / outside.dot(outside).sqrt());
         let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
         let phi = angle_of(simd, unit.x, cosines[0]);
         let theta = angle_of(simd, unit.y, cosines[1]);
-        let by_rad = [self.horizontal.at(simd, phi, theta), self.vertical.at(simd, phi, theta)];
-        let direction = turned(simd, unit, cosines, by_rad);
-        let [_, full_z] = Windshield::FADES_Z;
-        let full_z = splat(full_z as f32);
-        // A NaN is not above the limit.
-        let margin = unit.z.simd_ge(full_z).select(unit.z - full_z, splat(-1.0));
-        Refracted { direction, margin }
+        let [none_z, full_z] = Windshield::FADES_Z;
+        let per_z = splat((1.0 / (full_z - none_z)) as f32);
+        let share = ((unit.z - splat(none_z as f32)) * per_z).max(splat(0.0)).min(splat(1.0));
+        let by_phi = self.horizontal.at(simd, phi, theta) * share;
+        let by_theta = self.vertical.at(simd, phi, theta) * share;
+        let direction = turned(simd, unit, cosines, [by_phi, by_theta]);
+        // z follows from the unit length with its sign lost.
+        let refracted = share.simd_gt(splat(0.0));
+        Vec3x16 { z: refracted.select(direction.z, unit.z), ..direction }
     }
 
     /// The refraction around unit directions outside.
