@@ -14,11 +14,11 @@ pub(super) fn angle_of<S: Simd>(simd: S, sine: f32x16<S>, cosine: f32x16<S>) -> 
     let steep = size.simd_gt(cosine);
     let x = size.min(cosine);
     let z = x * x;
-    let series = splat(9.700_310e-2)
+    let series = splat(9.700_31e-2)
         .mul_add(z, splat(-8.368_472e-2))
         .mul_add(z, splat(6.646_933e-2))
         .mul_add(z, splat(9.544_048e-3))
-        .mul_add(z, splat(3.214_237_8e-2))
+        .mul_add(z, splat(3.214_238e-2))
         .mul_add(z, splat(4.452_649_5e-2))
         .mul_add(z, splat(7.500_289_4e-2))
         .mul_add(z, splat(1.666_666_6e-1));

@@ -1,16 +1,15 @@
 //! Lenses and rolling shutters, 16 points at a time in f32, within the lens' field.
 //!
-//! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With
-//! `t = tan(θ/2) = |(x, y)|/(|p| + z)` the angle θ needs a square root instead of an arc tangent, and the
-//! image radius r(θ) divided by t is a smooth function of t, whichever way a calibration's polynomial leads.
-//! 8 to 14 terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel
-//! to its ray ([`LensRays`]); the number of terms is chosen when a lens is prepared. The results are within
-//! 8e-4 px of f64, also with a rolling shutter ([`search`]). With Newton's method instead, a step of a real six-camera rig
-//! spent four fifths of its time in it.
+//! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With `t = tan(θ/2) = |(x, y)|/(|p| +
+//! z)` the angle θ needs a square root instead of an arc tangent, and the image radius r(θ) divided by t is a smooth
+//! function of t, whichever way a calibration's polynomial leads. 8 to 14 terms approximate it within
+//! [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel to its ray ([`LensRays`]); the number of terms is
+//! chosen when a lens is prepared. The results are within 8e-4 px of f64, also with a rolling shutter ([`search`]).
+//! With Newton's method instead, a step of a real six-camera rig spent four fifths of its time in it.
 //!
-//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three kinds
-//! of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field of other lenses, those for
-//! which the search finds no row, and those of cameras that this module does not describe.
+//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three
+//! kinds of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field of other
+//! lenses, those for which the search finds no row, and those of cameras that this module does not describe.
 
 mod chebyshev;
 mod expansion;
@@ -33,7 +32,7 @@ pub(super) use rays::LensRays;
 pub(super) use search::ExposedPixels;
 use shutter::SimdShutter;
 use tangent::Tangent;
-use windshield::SimdWindshield;
+use windshield::{Refracted, SimdWindshield};
 
 /// Largest error of a series, in pixels: a tenth of the resolution of f32 away from the middle of an image.
 const MAX_SERIES_ERROR_PX: f64 = 1e-5;
@@ -176,7 +175,15 @@ impl LensProjection {
     #[inline(always)]
     fn project_static<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> LensPixels<S> {
         let Some(windshield) = &self.windshield else { return self.project_lens(simd, point_m) };
-        self.project_lens(simd, windshield.inside(simd, point_m))
+        let Refracted { direction, margin } = windshield.inside(simd, point_m);
+        let pixels = self.project_lens(simd, direction);
+        match self.model {
+            Model::Round { .. } => pixels,
+            // Slopes rise too fast where the refraction fades out: 0.05 px were measured there.
+            Model::Pinhole { .. } | Model::Slopes { .. } => {
+                LensPixels { margin: pixels.margin.min(margin), ..pixels }
+            }
+        }
     }
 
     /// Projects points, or directions behind the windshield, by the lens alone.
@@ -275,8 +282,8 @@ impl LensProjection {
 const INSIDE: f32 = 1.0 - 1e-5;
 
 impl Model {
-    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`, within `max_error` of the
-    /// radius. The lens' field ends at `limit_rad`.
+    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`, within `max_error` of
+    /// the radius. The lens' field ends at `limit_rad`.
     fn round(
         max_rad: f64,
         limit_rad: f64,
@@ -435,7 +442,6 @@ mod tests {
                 let mut inside = 0;
                 let mut beyond = 0;
                 let mut max_error_px: f64 = 0.0;
-                let mut max_faded_px: f64 = 0.0;
                 for step in 0..5_000 {
                     let angle_rad = camera.limit_rad() * f64::from(step) / 4_000.0;
                     let (sin, cos) = angle_rad.sin_cos();
@@ -465,11 +471,8 @@ mod tests {
                         for ([x_px, y_px, margin], point_m) in [(found, point_m), (near, aside_m)] {
                             let at_px = view.project_extrapolated(point_m, 1.0).at_px;
                             let off = at_px - DVec2::new(x_px, y_px);
-                            // Where the refraction of a windshield fades out: 81° off the axis, less the points beside and the motion.
-                            let fades = camera.windshield.is_some() && angle_rad > 1.35;
-                            let most = if fades { &mut max_faded_px } else { &mut max_error_px };
                             if margin >= 0.0 {
-                                *most = most.max(off.length());
+                                max_error_px = max_error_px.max(off.length());
                             }
                         }
                         inside += usize::from(view.project_world(point_m).is_some());
@@ -479,15 +482,13 @@ mod tests {
                 assert!(inside > least_inside, "{name}: {inside}");
                 let is_bare = camera.windshield.is_none();
                 let is_continued = is_bare && matches!(camera.lens, Lens::FTheta(_));
-                // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that drives
-                // towards them may have them within its field: 100 of those of a telephoto lens.
+                // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that
+                // drives towards them may have them within its field: 100 of those of a telephoto lens.
                 assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
                 eprintln!("{name}: {max_error_px:.1e} px");
                 // Behind a windshield and far beyond the image 2.0e-3 px were measured.
                 let bound_px = if is_bare { 1.5e-3 } else { 2.5e-3 };
                 assert!(max_error_px < bound_px, "{name}: {max_error_px:e} px");
-                // Beside the image of a pinhole behind one, 7.9e-3 px were measured.
-                assert!(max_faded_px < 1e-2, "{name}: {max_faded_px:e} px");
             }
         }
     }

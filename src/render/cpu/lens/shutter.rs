@@ -94,8 +94,8 @@ impl SimdShutter {
     }
 
     /// A bound of how much the path of a point on the image turns during the exposure, as a share of itself, by the
-    /// point's distance from the camera in metres: how far the camera moves by the least distance, and how far it rotates.
-    /// Infinite close to the camera.
+    /// point's distance from the camera in metres: how far the camera moves by the least distance, and how far it
+    /// rotates. Infinite close to the camera.
     #[inline(always)]
     pub(super) fn turn<S: Simd>(&self, simd: S, distance_m: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);

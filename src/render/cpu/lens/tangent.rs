@@ -28,7 +28,8 @@ impl Tangent {
 
     /// Distances at angles with `t = tan(θ/2)`, beyond the line's begin.
     ///
-    /// With u the tangent of half the angle from the begin, that half has the sine `u/√(1 + u²)` and the cosine `1/√(1 + u²)`.
+    /// With u the tangent of half the angle from the begin, that half has the sine `u/√(1 + u²)` and the cosine
+    /// `1/√(1 + u²)`.
     #[inline(always)]
     pub(super) fn radius<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
@@ -52,8 +53,8 @@ impl Tangent {
         t.simd_le(widest).select(widest - t, f32x16::splat(simd, -1.0))
     }
 
-    /// How far angles with `t = tan(θ/2)` are beyond the begin of the line, at least, in radians: below 0 before it. `dt/dθ`
-    /// is `(1 + t²)/2`.
+    /// How far angles with `t = tan(θ/2)` are beyond the begin of the line, at least, in radians: below 0 before it.
+    /// `dt/dθ` is `(1 + t²)/2`.
     #[inline(always)]
     pub(super) fn past_begin_rad<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);

@@ -9,12 +9,13 @@ use crate::cpu::math::{angle_of, sin};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
-/// A windshield with polynomials from outside angles to inside angles. Directions inside are those of [`Windshield`], which
-/// fades the refraction out at large angles. Directions outside, and derivatives, are valid where the refraction is complete.
+/// A windshield with polynomials from outside angles to inside angles. Directions inside are those of [`Windshield`],
+/// which fades the refraction out at large angles. Directions outside, and derivatives, are valid where the
+/// refraction is complete.
 ///
-/// The polynomials here are by how much the angles change. A windshield changes a ray by 0.01, so what f32 rounds of that
-/// is a hundredth of what it rounds of a ray. Beside the camera this decides: from `z² = 1 - x² - y²` alone, z = 0.15 would
-/// be off by 1e-6, and the image of a lens of slopes by 0.01 px.
+/// The polynomials here are by how much the angles change. A windshield changes a ray by 0.01, so what f32 rounds of
+/// that is a hundredth of what it rounds of a ray. Beside the camera this decides: from `z² = 1 - x² - y²` alone, z =
+/// 0.15 would be off by 1e-6, and the image of a lens of slopes by 0.01 px.
 #[derive(Clone, Debug)]
 pub(super) struct SimdWindshield {
     horizontal: Polynomial2,
@@ -31,6 +32,15 @@ struct ValueAndSlopes<S: Simd> {
     value: f32x16<S>,
     by_phi: f32x16<S>,
     by_theta: f32x16<S>,
+}
+
+/// Directions behind a windshield.
+#[derive(Clone, Copy)]
+pub(super) struct Refracted<S: Simd> {
+    /// Unit directions inside.
+    pub(super) direction: Vec3x16<S>,
+    /// Not below 0 where the refraction is complete.
+    pub(super) margin: f32x16<S>,
 }
 
 /// The refraction around a direction.
@@ -64,7 +74,7 @@ impl SimdWindshield {
 
     /// Unit directions inside, of directions of any length outside.
     #[inline(always)]
-    pub(super) fn inside<S: Simd>(&self, simd: S, outside: Vec3x16<S>) -> Vec3x16<S> {
+    pub(super) fn inside<S: Simd>(&self, simd: S, outside: Vec3x16<S>) -> Refracted<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let unit = outside.scale(splat(1.0) / outside.dot(outside).sqrt());
         let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
@@ -78,7 +88,11 @@ impl SimdWindshield {
         let direction = turned(simd, unit, cosines, [by_phi, by_theta]);
         // z follows from the unit length with its sign lost.
         let refracted = share.simd_gt(splat(0.0));
-        Vec3x16 { z: refracted.select(direction.z, unit.z), ..direction }
+        let direction = Vec3x16 { z: refracted.select(direction.z, unit.z), ..direction };
+        // A NaN is not above the limit.
+        let full_z = splat(full_z as f32);
+        let margin = unit.z.simd_ge(full_z).select(unit.z - full_z, splat(-1.0));
+        Refracted { direction, margin }
     }
 
     /// The refraction around unit directions outside.
@@ -143,8 +157,8 @@ impl SimdWindshield {
     }
 }
 
-/// Unit directions with other angles φ = asin x and θ = asin y, by their cosines and by how much they change. z follows from
-/// the unit length.
+/// Unit directions with other angles φ = asin x and θ = asin y, by their cosines and by how much they change. z
+/// follows from the unit length.
 #[inline(always)]
 fn turned<S: Simd>(
     simd: S,
@@ -159,8 +173,8 @@ fn turned<S: Simd>(
     Vec3x16 { x: unit.x + x, y: unit.y + y, z }
 }
 
-/// By how much a sine changes with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`. Taylor's terms up to
-/// the 8th power of δ leave 3e-10 of `1 - cos δ` up to [`SimdWindshield::MAX_RAD`].
+/// By how much a sine changes with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`. Taylor's
+/// terms up to the 8th power of δ leave 3e-10 of `1 - cos δ` up to [`SimdWindshield::MAX_RAD`].
 #[inline(always)]
 fn sine_change<S: Simd>(simd: S, [sine, cosine]: [f32x16<S>; 2], by_rad: f32x16<S>) -> f32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);

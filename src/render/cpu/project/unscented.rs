@@ -355,8 +355,8 @@ fn add<S: Simd>((low, high): F64x16<S>, more: f32x16<S>) -> F64x16<S> {
 /// it.
 ///
 /// `at_end_m` are the centres in the camera's frame at the end of the exposure. The depth of a centre that is exposed
-/// earlier is that at its own moment: it is larger by the distance that the camera still moves until the end. `distance_m` is
-/// their distance from the camera then, rounded in every step.
+/// earlier is that at its own moment: it is larger by the distance that the camera still moves until the end.
+/// `distance_m` is their distance from the camera then, rounded in every step.
 #[inline(always)]
 fn depth<S: Simd>(
     simd: S,
