@@ -1,4 +1,8 @@
-//! Smooth functions as short Chebyshev series.
+//! Smooth functions as short series.
+//!
+//! A series is chosen by its Chebyshev terms, whose sizes bound what is left out, and evaluated by powers: half the
+//! operations, and two chains of them that do not wait for each other. The functions here are smooth beyond the ends of
+//! their range, so that the coefficients of the powers fall, too, and nothing cancels.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -9,12 +13,11 @@ const NODES: usize = 32;
 /// to 22.
 const MAX_TERMS: usize = 24;
 
-/// `f(x)/x` from 0 to a limit, as a sum of Chebyshev polynomials of `v = 2x/limit - 1`, which runs from -1
-/// to 1.
+/// `f(x)/x` from 0 to a limit, as a polynomial of `v = 2x/limit - 1`, which runs from -1 to 1.
 #[derive(Clone, Debug)]
 pub(super) struct ChebyshevSeries {
-    /// Coefficients, from degree 0.
-    terms: Vec<f32>,
+    /// Coefficients of an even power and of the odd one above it, from the highest powers to the lowest.
+    pairs: Vec<[f32; 2]>,
     /// `2/limit`.
     v_per_x: f32,
 }
@@ -48,23 +51,50 @@ impl ChebyshevSeries {
             terms.pop();
         }
         let usable = (1..=MAX_TERMS).contains(&terms.len()) && dropped.is_finite();
-        let terms = terms.iter().map(|&term| term as f32).collect();
-        usable.then_some(Self { terms, v_per_x: (2.0 / limit) as f32 })
+        usable.then(|| {
+            let powers = powers_of(&terms);
+            let odd = |even: usize| powers.get(even + 1).map_or(0.0, |&odd| odd as f32);
+            let evens = (0..powers.len()).step_by(2).rev();
+            let pairs = evens.map(|even| [powers[even] as f32, odd(even)]).collect();
+            Self { pairs, v_per_x: (2.0 / limit) as f32 }
+        })
     }
 
-    /// The value of `f(x)/x`, by Clenshaw's recurrence (1955).
+    /// The value of `f(x)/x`, by Horner's scheme in v² for the even powers and for the odd ones.
     #[inline(always)]
     pub(super) fn at<S: Simd>(&self, simd: S, x: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let v = x.mul_add(splat(self.v_per_x), splat(-1.0));
-        let twice = v + v;
-        let mut last = splat(0.0);
-        let mut before = splat(0.0);
-        for term in self.terms[1..].iter().rev() {
-            let next = twice.mul_add(last, splat(*term)) - before;
-            before = last;
-            last = next;
+        let vv = v * v;
+        let mut even_sum = splat(0.0);
+        let mut odd_sum = splat(0.0);
+        for &[even, odd] in &self.pairs {
+            even_sum = even_sum.mul_add(vv, splat(even));
+            odd_sum = odd_sum.mul_add(vv, splat(odd));
         }
-        v.mul_add(last, splat(self.terms[0])) - before
+        odd_sum.mul_add(v, even_sum)
     }
+}
+
+/// The coefficients of the powers, from degree 0, of a sum of Chebyshev polynomials: `T₀ = 1`, `T₁ = v` and
+/// `Tₖ₊₁ = 2 v Tₖ - Tₖ₋₁`.
+fn powers_of(terms: &[f64]) -> Vec<f64> {
+    let count = terms.len();
+    let mut sum = vec![0.0; count];
+    let mut before = vec![0.0; count];
+    let mut last = vec![0.0; count];
+    last[0] = 1.0;
+    for (k, term) in terms.iter().enumerate() {
+        for (sum, power) in sum.iter_mut().zip(&last) {
+            *sum += term * power;
+        }
+        let factor = if k == 0 { 1.0 } else { 2.0 };
+        let mut next: Vec<f64> = before.iter().map(|power| -power).collect();
+        for (next, power) in next[1..].iter_mut().zip(&last) {
+            *next += factor * power;
+        }
+        before = last;
+        last = next;
+    }
+    sum
 }

@@ -28,7 +28,7 @@ pub(in crate::cpu) struct Px<S: Simd> {
 
 /// The projection around 16 points.
 pub(in crate::cpu) struct Expansion<S: Simd> {
-    /// Rows that take a displacement in the camera's frame at the end of the exposure, in metres, to (a, b, c).
+    /// Rows that take a displacement in the camera's frame at the moment of exposure, in metres, to (a, b, c).
     rows: [Vec3x16<S>; 3],
     alpha: f32x16<S>,
     beta: f32x16<S>,
@@ -105,13 +105,13 @@ impl LensProjection {
         then_m: Vec3x16<S>,
         exposed: &ExposedPixels<S>,
     ) -> Option<Expansion<S>> {
-        let ExposedPixels { pixels: LensPixels { x_px, y_px, per_sin, .. }, remaining } = *exposed;
+        let ExposedPixels { pixels: LensPixels { x_px, y_px, per_sin, .. }, moment } = *exposed;
         let mut expansion = self.expand_static(simd, then_m, per_sin)?;
         let Some(shutter) = &self.shutter else { return Some(expansion) };
         let splat = |value: f32| f32x16::splat(simd, value);
 
         // The motion of the point in the camera's frame, and on the image.
-        let motion_m = shutter.velocity(simd, then_m, remaining);
+        let motion_m = shutter.velocity(simd, then_m, moment.remaining);
         let motion = expansion.components(motion_m);
         let motion_px = expansion.first_order(motion);
         let unclamped = shutter.unclamped_remaining_at(simd, x_px, y_px);
@@ -124,11 +124,6 @@ impl LensProjection {
         let rotation_rad = splat(shutter.rotation_rad());
         let terms = ShutterTerms { motion, motion_px, per_px, gain, rolls, to_limit, rotation_rad };
         expansion.shutter = Some(terms);
-
-        // From the frame at the moment of exposure to the one at the end: (row · R v) is (Rᵀ row · v).
-        for row in &mut expansion.rows {
-            *row = shutter.direction_to_end_frame(simd, *row, remaining);
-        }
         Some(expansion)
     }
 
@@ -319,17 +314,8 @@ impl<S: Simd> Expansion<S> {
         }
     }
 
-    /// The rows that take a displacement to (a, b, c), for displacements in another frame: `camera_from_other`
-    /// has the rows of its rotation.
-    #[inline(always)]
-    pub(in crate::cpu) fn in_frame(&mut self, camera_from_other: [Vec3x16<S>; 3]) {
-        let [right, down, forward] = camera_from_other;
-        for row in &mut self.rows {
-            *row = right.scale(row.x).plus(down.scale(row.y)).plus(forward.scale(row.z));
-        }
-    }
-
-    /// The image of a Gaussian's axes, times their standard deviations, in metres.
+    /// The image of a Gaussian's axes, times their standard deviations, in metres, in the camera's frame at the moment of
+    /// exposure.
     #[inline(always)]
     pub(in crate::cpu) fn axes(&self, simd: S, axes_m: [Vec3x16<S>; 3]) -> ExpandedAxes<S> {
         let zero = f32x16::splat(simd, 0.0);

@@ -1,25 +1,25 @@
 //! Lenses and rolling shutters, 16 points at a time in f32, within the lens' field.
 //!
-//! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With
-//! `t = tan(θ/2) = |(x, y)|/(|p| + z)` the angle θ needs a square root instead of an arc tangent, and the
-//! image radius r(θ) divided by t is a smooth function of t, whichever way a calibration's polynomial leads.
-//! 8 to 14 Chebyshev terms approximate it within [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel
-//! to its ray ([`LensRays`]); the number of terms is chosen when a lens is prepared. The results are within
-//! 8e-4 px of f64, also with a rolling shutter. With Newton's method instead, a step of a real six-camera rig
-//! spent four fifths of its time in it.
+//! **Lenses that are round about their axis (fisheye, f-theta) are two series.** With `t = tan(θ/2) = |(x, y)|/(|p| +
+//! z)` the angle θ needs a square root instead of an arc tangent, and the image radius r(θ) divided by t is a smooth
+//! function of t, whichever way a calibration's polynomial leads. 8 to 14 terms approximate it within
+//! [`MAX_SERIES_ERROR_PX`], and as many lead back from a pixel to its ray ([`LensRays`]); the number of terms is
+//! chosen when a lens is prepared. The results are within 8e-4 px of f64, also with a rolling shutter ([`search`]).
+//! With Newton's method instead, a step of a real six-camera rig spent four fifths of its time in it.
 //!
-//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three kinds
-//! of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field of other lenses, those for
-//! which the search finds no row, and those of cameras that this module does not describe.
+//! Beyond the field, round lenses and pinholes are continued by a line in the angle ([`tangent`]), as in f64. Three
+//! kinds of points are left to the f64 path ([`crate::unscented`]), one by one: those beyond the field of other
+//! lenses, those for which the search finds no row, and those of cameras that this module does not describe.
 
 mod chebyshev;
 mod expansion;
 mod rays;
+mod search;
 mod shutter;
 mod tangent;
 mod windshield;
 
-use fearless_simd::{f32x16, mask32x16, prelude::*};
+use fearless_simd::{f32x16, prelude::*};
 
 use super::lanes::{Vec3x16, splats};
 use crate::View;
@@ -29,6 +29,7 @@ use wildcity_scene::geometry::camera::Lens;
 use chebyshev::ChebyshevSeries;
 pub(super) use expansion::{ExpandedAxes, Remainder};
 pub(super) use rays::LensRays;
+pub(super) use search::ExposedPixels;
 use shutter::SimdShutter;
 use tangent::Tangent;
 use windshield::{Refracted, SimdWindshield};
@@ -80,14 +81,6 @@ pub(super) struct LensPixels<S: Simd> {
     pub(super) margin: f32x16<S>,
     /// Of round lenses: the distance from the principal point by the sine of the angle off the axis.
     per_sin: f32x16<S>,
-}
-
-/// Image points, and when they are exposed.
-#[derive(Clone, Copy)]
-pub(super) struct ExposedPixels<S: Simd> {
-    pub(super) pixels: LensPixels<S>,
-    /// The fraction of the exposure that remains then: 0 without a rolling shutter.
-    pub(super) remaining: f32x16<S>,
 }
 
 impl LensProjection {
@@ -158,55 +151,6 @@ impl LensProjection {
         Some(Self { shutter, ..self.clone() })
     }
 
-    /// Projects points of the camera's frame at the end of the exposure.
-    ///
-    /// With a rolling shutter the image row decides when a point is exposed, that decides where the camera
-    /// is, and that decides the row. The secant method finds the fixed point, from a first guess of the fraction
-    /// that remains; where its slope is not that of a slow motion over the image, it takes a step of the fixed-point
-    /// iteration instead. A point for which it does not converge, or that is not within the field, has a negative
-    /// margin. The search does not wait for points that are not `wanted`.
-    #[inline(always)]
-    pub(super) fn project<S: Simd>(
-        &self,
-        simd: S,
-        at_end_m: Vec3x16<S>,
-        guess: f32x16<S>,
-        wanted: mask32x16<S>,
-    ) -> ExposedPixels<S> {
-        let Some(shutter) = &self.shutter else {
-            return ExposedPixels { pixels: self.project_static(simd, at_end_m), remaining: guess };
-        };
-        let splat = |value: f32| f32x16::splat(simd, value);
-        let zero = splat(0.0);
-        let mut remaining = guess;
-        let mut round = 0;
-        // The difference between the fraction that follows from an image point and the one that it was computed for; and by
-        // how much that fraction changed in the round before.
-        let mut off_before = zero;
-        let mut step = zero;
-        loop {
-            let then_m = shutter.to_exposure_frame(simd, at_end_m, remaining);
-            let pixels = self.project_static(simd, then_m);
-            let next = shutter.remaining_at(simd, pixels.x_px, pixels.y_px);
-            let converged = SimdShutter::converged(simd, next, remaining);
-            let decided = converged | !pixels.margin.simd_ge(zero) | !wanted;
-            if round == SimdShutter::ROUNDS || decided.all_true() {
-                let margin = converged.select(pixels.margin, f32x16::splat(simd, -1.0));
-                return ExposedPixels { pixels: LensPixels { margin, ..pixels }, remaining };
-            }
-            let off = next - remaining;
-            // A point at rest on the image has -1. A NaN, as in the first round, is replaced.
-            let slope = (off - off_before) / step;
-            let slow = slope.simd_ge(splat(-1.5)) & slope.simd_le(splat(-0.5));
-            let slope = slow.select(slope, splat(-1.0));
-            let at = (remaining - off / slope).max(zero).min(splat(1.0));
-            step = at - remaining;
-            off_before = off;
-            remaining = at;
-            round += 1;
-        }
-    }
-
     /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in metres.
     #[inline(always)]
     pub(super) fn at_exposure<S: Simd>(
@@ -233,7 +177,13 @@ impl LensProjection {
         let Some(windshield) = &self.windshield else { return self.project_lens(simd, point_m) };
         let Refracted { direction, margin } = windshield.inside(simd, point_m);
         let pixels = self.project_lens(simd, direction);
-        LensPixels { margin: pixels.margin.min(margin), ..pixels }
+        match self.model {
+            Model::Round { .. } => pixels,
+            // Slopes rise too fast where the refraction fades out: 0.05 px were measured there.
+            Model::Pinhole { .. } | Model::Slopes { .. } => {
+                LensPixels { margin: pixels.margin.min(margin), ..pixels }
+            }
+        }
     }
 
     /// Projects points, or directions behind the windshield, by the lens alone.
@@ -332,8 +282,8 @@ impl LensProjection {
 const INSIDE: f32 = 1.0 - 1e-5;
 
 impl Model {
-    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`, within `max_error` of the
-    /// radius. The lens' field ends at `limit_rad`.
+    /// A lens by its radius at an angle, up to a largest angle: the series of `r(2 atan t)/t`, within `max_error` of
+    /// the radius. The lens' field ends at `limit_rad`.
     fn round(
         max_rad: f64,
         limit_rad: f64,
@@ -483,7 +433,7 @@ mod tests {
         assert!(max_error_rad < 2e-6, "{max_error_rad:e} rad");
     }
 
-    /// Points on a spiral from the axis to far beyond the end of the field.
+    /// Points on a spiral from the axis to far beyond the end of the field, and points 0.9 m beside them.
     #[test]
     fn projected_points_match_f64() {
         for (name, camera, least_inside) in cameras() {
@@ -498,21 +448,33 @@ mod tests {
                     let azimuth = 0.37 * f64::from(step);
                     let direction = DVec3::new(sin * azimuth.cos(), sin * azimuth.sin(), cos);
                     let point = (17.0 * direction).as_vec3();
-                    let [x_px, y_px, margin] = dispatch!(Level::new(), simd => {
+                    let aside = (17.0 * direction + DVec3::new(-0.5, 0.7, 0.2)).as_vec3();
+                    let (found, near) = dispatch!(Level::new(), simd => {
                         let point = Vec3x16::splat(simd, point.to_array());
-                        let zero = f32x16::splat(simd, 0.0);
-                        let wanted = zero.simd_ge(zero);
-                        let ExposedPixels { pixels, .. } =
-                            projection.project(simd, point, zero, wanted);
-                        [pixels.x_px, pixels.y_px, pixels.margin]
-                            .map(|value| f64::from(value.to_array()[0]))
+                        let distance_m = f32x16::splat(simd, 17.0);
+                        let wanted = distance_m.simd_gt(f32x16::splat(simd, 0.0));
+                        let ExposedPixels { pixels, moment } =
+                            projection.project(simd, point, distance_m, wanted);
+                        let aside = Vec3x16::splat(simd, aside.to_array());
+                        let aside = projection.at_exposure(simd, aside, moment.remaining);
+                        let near = projection.project_near(simd, aside, &moment, wanted);
+                        let of = |pixels: LensPixels<_>| {
+                            [pixels.x_px, pixels.y_px, pixels.margin]
+                                .map(|value| f64::from(value.to_array()[0]))
+                        };
+                        (of(pixels), of(near))
                     });
                     let point_m = view.world_from_camera.transform_point(point.as_dvec3());
+                    let aside_m = view.world_from_camera.transform_point(aside.as_dvec3());
                     // The others are left to the f64 path.
-                    if margin >= 0.0 {
-                        let at_px = view.project_extrapolated(point_m, 1.0).at_px;
-                        let off = at_px - DVec2::new(x_px, y_px);
-                        max_error_px = max_error_px.max(off.length());
+                    if found[2] >= 0.0 {
+                        for ([x_px, y_px, margin], point_m) in [(found, point_m), (near, aside_m)] {
+                            let at_px = view.project_extrapolated(point_m, 1.0).at_px;
+                            let off = at_px - DVec2::new(x_px, y_px);
+                            if margin >= 0.0 {
+                                max_error_px = max_error_px.max(off.length());
+                            }
+                        }
                         inside += usize::from(view.project_world(point_m).is_some());
                         beyond += usize::from(angle_rad > camera.limit_rad());
                     }
@@ -520,8 +482,8 @@ mod tests {
                 assert!(inside > least_inside, "{name}: {inside}");
                 let is_bare = camera.windshield.is_none();
                 let is_continued = is_bare && matches!(camera.lens, Lens::FTheta(_));
-                // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that drives
-                // towards them may have them within its field: 100 of those of a telephoto lens.
+                // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that
+                // drives towards them may have them within its field: 100 of those of a telephoto lens.
                 assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
                 eprintln!("{name}: {max_error_px:.1e} px");
                 // Behind a windshield and far beyond the image 2.0e-3 px were measured.

@@ -5,7 +5,7 @@
 //! motion during one exposure. "Remaining" is the fraction of the exposure that is still to come when a row
 //! is exposed: 1 for the first row, 0 for the last.
 
-use fearless_simd::{f32x16, mask32x16, prelude::*};
+use fearless_simd::{f32x16, prelude::*};
 
 use crate::cpu::lanes::{Vec3x16, splats};
 use crate::cpu::math::sin;
@@ -19,15 +19,11 @@ pub(in crate::cpu) struct SimdShutter {
     translation_m: [f32; 3],
     axis: [f32; 3],
     rotation_rad: f32,
+    /// Whether the camera rotates by more than f32 can tell.
+    rotates: bool,
 }
 
 impl SimdShutter {
-    /// Rounds of the search for the row that sees a point. Points that need more are left to the f64 path.
-    pub(super) const ROUNDS: u32 = 16;
-
-    /// The search ends when the fraction changes by at most this: 1e-6 of 1 m of motion.
-    const CONVERGED: f32 = 1e-6;
-
     /// The largest rotation during one exposure, in radians, for which [`sin`] is accurate.
     const MAX_ROTATION_RAD: f64 = 1.5;
 
@@ -41,6 +37,7 @@ impl SimdShutter {
             translation_m: translation_m.as_vec3().to_array(),
             axis: axis.as_vec3().to_array(),
             rotation_rad: rotation_rad as f32,
+            rotates: rotation_rad > 1e-9,
         })
     }
 
@@ -92,15 +89,52 @@ impl SimdShutter {
         remaining: f32x16<S>,
     ) -> Vec3x16<S> {
         let axis = Vec3x16::splat(simd, self.axis);
-        let translation_m = Vec3x16::splat(simd, self.translation_m);
-        let rotated_m = translation_m.plus(self.rotation_change(simd, translation_m, remaining));
+        let rotated_m = self.motion(simd, remaining);
         axis.cross(then_m).mul_add(f32x16::splat(simd, self.rotation_rad), rotated_m)
     }
 
-    /// Whether two fractions are the same moment.
+    /// A bound of how much the path of a point on the image turns during the exposure, as a share of itself, by the
+    /// point's distance from the camera in metres: how far the camera moves by the least distance, and how far it
+    /// rotates. Infinite close to the camera.
     #[inline(always)]
-    pub(super) fn converged<S: Simd>(simd: S, one: f32x16<S>, other: f32x16<S>) -> mask32x16<S> {
-        (one - other).abs().simd_le(f32x16::splat(simd, Self::CONVERGED))
+    pub(super) fn turn<S: Simd>(&self, simd: S, distance_m: f32x16<S>) -> f32x16<S> {
+        let splat = |value: f32| f32x16::splat(simd, value);
+        let [x, y, z] = self.translation_m;
+        let moved_m = splat((x * x + y * y + z * z).sqrt());
+        let turn = moved_m / (distance_m - moved_m);
+        let far = distance_m.simd_gt(splat(1.5) * moved_m);
+        far.select(turn, splat(f32::INFINITY)) + splat(self.rotation_rad)
+    }
+
+    /// The camera's motion in its frame while a fraction remains, in metres per unit of that.
+    #[inline(always)]
+    pub(super) fn motion<S: Simd>(&self, simd: S, remaining: f32x16<S>) -> Vec3x16<S> {
+        self.rotated(simd, Vec3x16::splat(simd, self.translation_m), remaining)
+    }
+
+    /// Points of the camera's frame at some moment in its frame when more of the exposure remains, `by` in units of it.
+    /// `motion_m` is [`Self::motion`] at that moment.
+    #[inline(always)]
+    pub(super) fn later<S: Simd>(
+        &self,
+        simd: S,
+        then_m: Vec3x16<S>,
+        motion_m: Vec3x16<S>,
+        by: f32x16<S>,
+    ) -> Vec3x16<S> {
+        // Rotations about the same axis may be exchanged.
+        self.rotated(simd, motion_m.mul_add(by, then_m), by)
+    }
+
+    /// Vectors of the camera's frame at the end of the exposure, in its frame while a fraction remains.
+    #[inline(always)]
+    pub(in crate::cpu) fn rotated<S: Simd>(
+        &self,
+        simd: S,
+        v: Vec3x16<S>,
+        remaining: f32x16<S>,
+    ) -> Vec3x16<S> {
+        if self.rotates { v.plus(self.rotation_change(simd, v, remaining)) } else { v }
     }
 
     /// Points of the camera's frame at the end of the exposure, in its frame while a fraction remains, in
@@ -113,7 +147,7 @@ impl SimdShutter {
         remaining: f32x16<S>,
     ) -> Vec3x16<S> {
         let moved_m = Vec3x16::splat(simd, self.translation_m).mul_add(remaining, at_end_m);
-        moved_m.plus(self.rotation_change(simd, moved_m, remaining))
+        self.rotated(simd, moved_m, remaining)
     }
 
     /// By how many metres the camera-space z of points is larger while a fraction remains than at the end.
@@ -125,6 +159,9 @@ impl SimdShutter {
         remaining: f32x16<S>,
     ) -> f32x16<S> {
         let translation_m = self.translation(simd, remaining);
+        if !self.rotates {
+            return translation_m.z;
+        }
         translation_m.z + self.rotation_change(simd, at_end_m.plus(translation_m), remaining).z
     }
 
@@ -152,8 +189,7 @@ impl SimdShutter {
         direction: Vec3x16<S>,
         remaining: f32x16<S>,
     ) -> Vec3x16<S> {
-        let backward = f32x16::splat(simd, 0.0) - remaining;
-        direction.plus(self.rotation_change(simd, direction, backward))
+        self.rotated(simd, direction, f32x16::splat(simd, 0.0) - remaining)
     }
 
     /// By how much rotation changes a vector, from the frame at the end to the frame while a fraction

@@ -3,7 +3,7 @@
 
 use fearless_simd::{f32x16, prelude::*};
 
-use crate::cpu::math::asin;
+use crate::cpu::math::angle_of;
 
 /// The distance from the principal point beyond an angle off the axis: a line.
 #[derive(Clone, Copy, Debug)]
@@ -28,13 +28,15 @@ impl Tangent {
 
     /// Distances at angles with `t = tan(θ/2)`, beyond the line's begin.
     ///
-    /// With u the tangent of half the angle from the begin, that half is `asin(u/√(1 + u²))`.
+    /// With u the tangent of half the angle from the begin, that half has the sine `u/√(1 + u²)` and the cosine
+    /// `1/√(1 + u²)`.
     #[inline(always)]
     pub(super) fn radius<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let one = splat(1.0);
         let u = (t - splat(self.begin)) / t.mul_add(splat(self.begin), one);
-        let half_rad = asin(simd, u / u.mul_add(u, one).sqrt());
+        let cosine = one / u.mul_add(u, one).sqrt();
+        let half_rad = angle_of(simd, u * cosine, cosine);
         (half_rad + half_rad).mul_add(splat(self.per_rad), splat(self.radius))
     }
 
@@ -51,8 +53,8 @@ impl Tangent {
         t.simd_le(widest).select(widest - t, f32x16::splat(simd, -1.0))
     }
 
-    /// How far angles with `t = tan(θ/2)` are beyond the begin of the line, at least, in radians: below 0 before it. `dt/dθ`
-    /// is `(1 + t²)/2`.
+    /// How far angles with `t = tan(θ/2)` are beyond the begin of the line, at least, in radians: below 0 before it.
+    /// `dt/dθ` is `(1 + t²)/2`.
     #[inline(always)]
     pub(super) fn past_begin_rad<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);

@@ -5,16 +5,17 @@ use glam::DVec3;
 
 use super::max_seen_rad;
 use crate::cpu::lanes::Vec3x16;
-use crate::cpu::math::{asin, sin};
+use crate::cpu::math::{angle_of, sin};
 use wildcity_scene::geometry::Camera;
 use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReference};
 
-/// A windshield with polynomials from outside angles to inside angles. It is valid at angles where the
-/// refraction is complete: at large angles [`Windshield`] fades the refraction out, and this type does not.
+/// A windshield with polynomials from outside angles to inside angles. Directions inside are those of [`Windshield`],
+/// which fades the refraction out at large angles. Directions outside, and derivatives, are valid where the
+/// refraction is complete.
 ///
-/// The polynomials here are by how much the angles change. A windshield changes a ray by 0.01, so what f32 rounds of that
-/// is a hundredth of what it rounds of a ray. Beside the camera this decides: from `z² = 1 - x² - y²` alone, z = 0.15 would
-/// be off by 1e-6, and the image of a lens of slopes by 0.01 px.
+/// The polynomials here are by how much the angles change. A windshield changes a ray by 0.01, so what f32 rounds of
+/// that is a hundredth of what it rounds of a ray. Beside the camera this decides: from `z² = 1 - x² - y²` alone, z =
+/// 0.15 would be off by 1e-6, and the image of a lens of slopes by 0.01 px.
 #[derive(Clone, Debug)]
 pub(super) struct SimdWindshield {
     horizontal: Polynomial2,
@@ -58,27 +59,38 @@ impl SimdWindshield {
     /// windshields it leaves a fiftieth.
     const ROUNDS: u32 = 24;
 
-    /// `None` if the polynomials lead from the inside to the outside.
+    /// The largest change of an angle for which [`sine_change`] is accurate, in radians.
+    const MAX_RAD: f64 = 0.5;
+
+    /// `None` if the polynomials lead from the inside to the outside, or if they change rays by more than
+    /// [`Self::MAX_RAD`].
     pub(super) fn new(windshield: &Windshield) -> Option<Self> {
         let horizontal = Polynomial2::change(windshield.horizontal(), [1, 0]);
         let vertical = Polynomial2::change(windshield.vertical(), [0, 1]);
         let forward = windshield.reference() == WindshieldReference::Forward;
-        forward.then_some(Self { horizontal, vertical })
+        let described = forward && windshield.most_rad() <= Self::MAX_RAD;
+        described.then_some(Self { horizontal, vertical })
     }
 
-    /// Directions inside, of directions of any length outside.
+    /// Unit directions inside, of directions of any length outside.
     #[inline(always)]
     pub(super) fn inside<S: Simd>(&self, simd: S, outside: Vec3x16<S>) -> Refracted<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let unit = outside.scale(splat(1.0) / outside.dot(outside).sqrt());
-        let phi = asin(simd, unit.x);
-        let theta = asin(simd, unit.y);
-        let by_phi = self.horizontal.at(simd, phi, theta);
-        let by_theta = self.vertical.at(simd, phi, theta);
-        let direction = turned(simd, unit, by_phi, by_theta);
-        let [_, full_z] = Windshield::FADES_Z;
-        let full_z = splat(full_z as f32);
+        let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
+        let phi = angle_of(simd, unit.x, cosines[0]);
+        let theta = angle_of(simd, unit.y, cosines[1]);
+        let [none_z, full_z] = Windshield::FADES_Z;
+        let per_z = splat((1.0 / (full_z - none_z)) as f32);
+        let share = ((unit.z - splat(none_z as f32)) * per_z).max(splat(0.0)).min(splat(1.0));
+        let by_phi = self.horizontal.at(simd, phi, theta) * share;
+        let by_theta = self.vertical.at(simd, phi, theta) * share;
+        let direction = turned(simd, unit, cosines, [by_phi, by_theta]);
+        // z follows from the unit length with its sign lost.
+        let refracted = share.simd_gt(splat(0.0));
+        let direction = Vec3x16 { z: refracted.select(direction.z, unit.z), ..direction };
         // A NaN is not above the limit.
+        let full_z = splat(full_z as f32);
         let margin = unit.z.simd_ge(full_z).select(unit.z - full_z, splat(-1.0));
         Refracted { direction, margin }
     }
@@ -91,14 +103,15 @@ impl SimdWindshield {
     pub(super) fn expand<S: Simd>(&self, simd: S, unit: Vec3x16<S>) -> RefractionDerivatives<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let one = splat(1.0);
-        let phi = asin(simd, unit.x);
-        let theta = asin(simd, unit.y);
+        let cosines = [cosine(simd, unit.x), cosine(simd, unit.y)];
+        let phi = angle_of(simd, unit.x, cosines[0]);
+        let theta = angle_of(simd, unit.y, cosines[1]);
         let horizontal = self.horizontal.with_slopes(simd, phi, theta);
         let vertical = self.vertical.with_slopes(simd, phi, theta);
-        let inside = turned(simd, unit, horizontal.value, vertical.value);
+        let inside = turned(simd, unit, cosines, [horizontal.value, vertical.value]);
         let Vec3x16 { x, y, z } = inside;
-        let per_cos_x = one / cosine(simd, unit.x).max(splat(1e-6));
-        let per_cos_y = one / cosine(simd, unit.y).max(splat(1e-6));
+        let per_cos_x = one / cosines[0].max(splat(1e-6));
+        let per_cos_y = one / cosines[1].max(splat(1e-6));
         let cos_x = cosine(simd, x);
         let cos_y = cosine(simd, y);
         let per_z = one / z.max(splat(1e-6));
@@ -127,8 +140,8 @@ impl SimdWindshield {
     pub(super) fn outside<S: Simd>(&self, simd: S, inside: Vec3x16<S>) -> Vec3x16<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
         let unit = inside.scale(splat(1.0) / inside.dot(inside).sqrt());
-        let inside_phi = asin(simd, unit.x);
-        let inside_theta = asin(simd, unit.y);
+        let inside_phi = angle_of(simd, unit.x, cosine(simd, unit.x));
+        let inside_theta = angle_of(simd, unit.y, cosine(simd, unit.y));
         // The change is nearly the same outside, so that each round is close to the fixed point.
         let mut phi = inside_phi;
         let mut theta = inside_theta;
@@ -144,28 +157,38 @@ impl SimdWindshield {
     }
 }
 
-/// Unit directions with other angles φ = asin x and θ = asin y, by how much these change. z follows from the unit length.
+/// Unit directions with other angles φ = asin x and θ = asin y, by their cosines and by how much they change. z
+/// follows from the unit length.
 #[inline(always)]
 fn turned<S: Simd>(
     simd: S,
     unit: Vec3x16<S>,
-    by_phi: f32x16<S>,
-    by_theta: f32x16<S>,
+    [cos_phi, cos_theta]: [f32x16<S>; 2],
+    [by_phi, by_theta]: [f32x16<S>; 2],
 ) -> Vec3x16<S> {
-    let x = sine_change(simd, unit.x, by_phi);
-    let y = sine_change(simd, unit.y, by_theta);
+    let x = sine_change(simd, [unit.x, cos_phi], by_phi);
+    let y = sine_change(simd, [unit.y, cos_theta], by_theta);
     let longer2 = x.mul_add(unit.x + unit.x + x, y * (unit.y + unit.y + y));
     let z = (unit.z * unit.z - longer2).max(f32x16::splat(simd, 0.0)).sqrt();
     Vec3x16 { x: unit.x + x, y: unit.y + y, z }
 }
 
-/// By how much a sine changes with its angle: `sin(φ + δ) - sin φ` is `2 s (cos φ cos(δ/2) - sin φ s)` with
-/// `s = sin(δ/2)`.
+/// By how much a sine changes with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`. Taylor's
+/// terms up to the 8th power of δ leave 3e-10 of `1 - cos δ` up to [`SimdWindshield::MAX_RAD`].
 #[inline(always)]
-fn sine_change<S: Simd>(simd: S, sine: f32x16<S>, by_rad: f32x16<S>) -> f32x16<S> {
-    let half = sin(simd, by_rad * f32x16::splat(simd, 0.5));
-    let along = cosine(simd, sine) * cosine(simd, half) - sine * half;
-    (half + half) * along
+fn sine_change<S: Simd>(simd: S, [sine, cosine]: [f32x16<S>; 2], by_rad: f32x16<S>) -> f32x16<S> {
+    let splat = |value: f64| f32x16::splat(simd, value as f32);
+    let square = by_rad * by_rad;
+    let fall = splat(-1.0 / 40_320.0)
+        .mul_add(square, splat(1.0 / 720.0))
+        .mul_add(square, splat(-1.0 / 24.0))
+        .mul_add(square, splat(0.5));
+    let rise = splat(1.0 / 362_880.0)
+        .mul_add(square, splat(-1.0 / 5_040.0))
+        .mul_add(square, splat(1.0 / 120.0))
+        .mul_add(square, splat(-1.0 / 6.0));
+    let rise = (rise * square).mul_add(by_rad, by_rad);
+    cosine * rise - sine * (fall * square)
 }
 
 /// The cosine of an angle within a quarter turn, from its sine.

@@ -35,9 +35,45 @@ pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4])
 /// ```
 #[inline(always)]
 pub(super) fn rotation_columns<S: Simd>(simd: S, columns: &[Lanes]) -> [Vec3x16<S>; 3] {
+    matrix_columns(simd, Quaternions::load(simd, columns))
+}
+
+/// Sixteen unit quaternions.
+#[derive(Clone, Copy)]
+pub(super) struct Quaternions<S: Simd> {
+    w: f32x16<S>,
+    v: Vec3x16<S>,
+}
+
+impl<S: Simd> Quaternions<S> {
+    #[inline(always)]
+    pub(super) fn load(simd: S, columns: &[Lanes]) -> Self {
+        let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
+        Self { w, v: Vec3x16::load(simd, columns, column::QUAT + 1) }
+    }
+
+    /// The rotations after which `first` is applied to all of them.
+    #[inline(always)]
+    pub(super) fn after(self, simd: S, [x, y, z, w]: [f32; 4]) -> Self {
+        let a = Vec3x16::splat(simd, [x, y, z]);
+        let aw = f32x16::splat(simd, w);
+        let Self { w: bw, v: b } = self;
+        Self {
+            w: (-a.x).mul_add(b.x, (-a.y).mul_add(b.y, (-a.z).mul_add(b.z, aw * bw))),
+            v: Vec3x16 {
+                x: aw.mul_add(b.x, a.x.mul_add(bw, a.y.mul_add(b.z, -(a.z * b.y)))),
+                y: aw.mul_add(b.y, a.y.mul_add(bw, a.z.mul_add(b.x, -(a.x * b.z)))),
+                z: aw.mul_add(b.z, a.z.mul_add(bw, a.x.mul_add(b.y, -(a.y * b.x)))),
+            },
+        }
+    }
+}
+
+/// Columns of the rotation matrices of unit quaternions.
+#[inline(always)]
+pub(super) fn matrix_columns<S: Simd>(simd: S, rotations: Quaternions<S>) -> [Vec3x16<S>; 3] {
     let one = f32x16::splat(simd, 1.0);
-    let w = f32x16::load_array_ref(simd, &columns[column::QUAT].0);
-    let Vec3x16 { x, y, z } = Vec3x16::load(simd, columns, column::QUAT + 1);
+    let Quaternions { w, v: Vec3x16 { x, y, z } } = rotations;
     // Below each product holds the factor 2 of the matrix.
     let x2 = x + x;
     let y2 = y + y;

@@ -9,18 +9,18 @@
 use fearless_simd::{f32x16, mask32x16, prelude::*};
 use glam::{DMat3, DQuat, DVec2, DVec3, Vec3};
 
-use super::axes::{F64x16, rotation_columns, transform_row};
+use super::angles::CenterAngles;
+use super::axes::{F64x16, Quaternions, matrix_columns, transform_row};
 use super::color::color;
 use super::splat_block::{Ellipse, LOG2_UNIT, Moments, ProjectedBlock, SplatBlock};
 use crate::View;
 use crate::constants::EXTENT_SLACK_PX;
-use crate::cpu::lanes::{Vec3x16, splats};
-use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensPixels, LensProjection, Remainder};
+use crate::cpu::lanes::Vec3x16;
+use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensProjection, Remainder};
 use crate::expansion::ExpansionBound;
 use crate::layout::{Cutoffs, Filtered, PixelFilter};
-use crate::unscented::{CullBound, Footprint, UnscentedView};
+use crate::unscented::{Footprint, UnscentedView};
 use wildcity_scene::chunk::{LANES, Lanes, column};
-use wildcity_scene::geometry::camera::WIDEST_RAD;
 use wildcity_scene::{Chunk, RenderProfile};
 
 /// One chunk in a view that is not a static pinhole.
@@ -34,6 +34,8 @@ pub(super) struct UnscentedChunkView<'a> {
     /// Rows that take a point `(x, y, z, 1)` of the chunk to the camera's frame at the end of the exposure,
     /// in metres.
     camera_from_chunk: [[f64; 4]; 3],
+    /// The rotation of these as a quaternion (x, y, z, w).
+    camera_from_chunk_rotation: [f32; 4],
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     camera_m: [f32; 3],
     size_px: [f32; 2],
@@ -63,6 +65,7 @@ impl<'a> UnscentedChunkView<'a> {
             lens,
             origin_m,
             camera_from_chunk: [0, 1, 2].map(row),
+            camera_from_chunk_rotation: camera_from_world.rotation.as_quat().to_array(),
             camera_m: camera_m.as_vec3().to_array(),
             size_px: view.camera.size_px().as_vec2().to_array(),
             filter: PixelFilter::new(profile, &view.camera),
@@ -145,17 +148,20 @@ fn project_lanes<S: Simd>(
     }
 
     // When each centre is exposed, and where the camera is then.
-    let exposed = lens.project(simd, center, splat(0.0), in_range);
-    let ExposedPixels { pixels: center_px, remaining } = exposed;
+    let exposed = lens.project(simd, center, angles.distance_m, in_range);
+    let ExposedPixels { pixels: center_px, moment } = exposed;
+    let then_m = lens.at_exposure(simd, center, moment.remaining);
+    let mut distance_m = angles.distance_m;
     let mut toward = mean.minus(Vec3x16::splat(simd, view.camera_m));
     if let Some(shutter) = lens.shutter() {
-        toward = toward.plus(shutter.translation_world(simd, remaining));
+        distance_m = then_m.dot(then_m).sqrt();
+        toward = toward.plus(shutter.translation_world(simd, moment.remaining));
     }
     *toward_m = [toward.x.to_array(), toward.y.to_array(), toward.z.to_array()];
 
     // Near and far. While the shutter rolls the depth is known only where the row was found; the f64 path
     // decides for the others.
-    let depth_m = depth(simd, at_end_m, view, lens, center, remaining);
+    let depth_m = depth(simd, at_end_m, view, lens, distance_m, moment.remaining);
     let in_depth = depth_m.simd_ge(splat(cutoffs.near_m)) & depth_m.simd_le(splat(cutoffs.far_m));
     let found = center_px.margin.simd_ge(splat(0.0));
     let is_depth = match lens.shutter() {
@@ -163,26 +169,33 @@ fn project_lanes<S: Simd>(
         Some(_) => found,
     };
     // Too far outside of the lens' field, or so far beside the image that no point of it lands there.
-    let then_m = lens.at_exposure(simd, center, remaining);
-    let least_z = splat(bound.max_center_cos as f32) * then_m.dot(then_m).sqrt();
-    let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view);
+    let least_z = splat(bound.max_center_cos as f32) * distance_m;
+    let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view.size_px, bound);
     let in_range = in_range & (in_depth | !is_depth) & !(found & too_far);
     if in_range.all_false() {
         return (SplatBlock::default(), 0);
     }
 
-    // The own axes times their standard deviations.
-    let axes = rotation_columns(simd, columns);
+    // The own axes times their standard deviations, in the camera's frame at that moment.
+    let rotations = Quaternions::load(simd, columns).after(simd, view.camera_from_chunk_rotation);
+    let [mut x, mut y, mut z] = matrix_columns(simd, rotations);
+    if let Some(shutter) = lens.shutter() {
+        x = shutter.rotated(simd, x, moment.remaining);
+        y = shutter.rotated(simd, y, moment.remaining);
+        z = shutter.rotated(simd, z, moment.remaining);
+    }
     let gaussians = CenteredBlock {
-        center,
         then_m,
-        axes_m: [axes[0].scale(scale.x), axes[1].scale(scale.y), axes[2].scale(scale.z)],
+        axes_m: [x.scale(scale.x), y.scale(scale.y), z.scale(scale.z)],
         exposed,
         depth_m,
         log2_opacity,
         in_range,
     };
-    let (mut splats, left) = expand(simd, &gaussians, view, lens, cutoffs);
+    let Some(expansion_bound) = view.unscented.expansion_bound() else {
+        return project_six_points(simd, &gaussians, view, lens, cutoffs);
+    };
+    let (mut splats, left) = expand(simd, &gaussians, view, lens, expansion_bound, cutoffs);
     if left.all_false() {
         return (splats, 0);
     }
@@ -194,11 +207,9 @@ fn project_lanes<S: Simd>(
 
 /// Sixteen Gaussians whose centres have been projected.
 struct CenteredBlock<S: Simd> {
-    /// Centres in the camera's frame at the end of the exposure, in metres.
-    center: Vec3x16<S>,
     /// Centres in the camera's frame at the moments of their exposure, in metres.
     then_m: Vec3x16<S>,
-    /// Own axes times their standard deviations, in the chunk's axes, in metres.
+    /// Own axes times their standard deviations, in the same frames, in metres.
     axes_m: [Vec3x16<S>; 3],
     /// The centres' images.
     exposed: ExposedPixels<S>,
@@ -206,16 +217,6 @@ struct CenteredBlock<S: Simd> {
     log2_opacity: f32x16<S>,
     /// Which may be seen.
     in_range: mask32x16<S>,
-}
-
-/// The rows of camera_from_chunk's rotation.
-#[inline(always)]
-fn rotation_rows<S: Simd>(simd: S, view: &UnscentedChunkView<'_>) -> [Vec3x16<S>; 3] {
-    let mut rows = [Vec3x16::splat(simd, [0.0; 3]); 3];
-    for (row, [x, y, z, _]) in rows.iter_mut().zip(view.camera_from_chunk) {
-        *row = Vec3x16::splat(simd, [x as f32, y as f32, z as f32]);
-    }
-    rows
 }
 
 /// The splats of those Gaussians for which the expansion is close enough to six points, and the others that may
@@ -226,14 +227,12 @@ fn expand<S: Simd>(
     gaussians: &CenteredBlock<S>,
     view: &UnscentedChunkView<'_>,
     lens: &LensProjection,
+    bound: &ExpansionBound,
     cutoffs: &Cutoffs,
 ) -> (SplatBlock, mask32x16<S>) {
-    let CenteredBlock { then_m, axes_m, ref exposed, depth_m, log2_opacity, in_range, .. } =
-        *gaussians;
+    let CenteredBlock { then_m, axes_m, ref exposed, depth_m, log2_opacity, in_range } = *gaussians;
     let none = (SplatBlock::default(), in_range);
-    let Some(bound) = view.unscented.expansion_bound() else { return none };
-    let Some(mut expansion) = lens.expand(simd, then_m, exposed) else { return none };
-    expansion.in_frame(rotation_rows(simd, view));
+    let Some(expansion) = lens.expand(simd, then_m, exposed) else { return none };
     let ExpandedAxes { columns, mean_shift, remainder } = expansion.axes(simd, axes_m);
     let pixels = exposed.pixels;
     let close = in_range
@@ -282,29 +281,24 @@ fn project_six_points<S: Simd>(
     cutoffs: &Cutoffs,
 ) -> (SplatBlock, u64) {
     let splat = |value: f32| f32x16::splat(simd, value);
-    let CenteredBlock { center, axes_m, ref exposed, depth_m, log2_opacity, in_range, .. } =
-        *gaussians;
+    let CenteredBlock { then_m, axes_m, ref exposed, depth_m, log2_opacity, in_range } = *gaussians;
 
     // The six points: ±√3 standard deviations along each own axis.
-    let [right, down, forward] = rotation_rows(simd, view);
     let mut margin = exposed.pixels.margin;
     let mut pairs = [[splat(0.0); 4]; 3];
     let mut mean_x = splat(0.0);
     let mut mean_y = splat(0.0);
+    let root_3 = splat(3.0_f32.sqrt());
     for (axis_m, pair) in axes_m.into_iter().zip(&mut pairs) {
-        let offset = axis_m.scale(splat(3.0_f32.sqrt()));
-        let offset = Vec3x16 { x: right.dot(offset), y: down.dot(offset), z: forward.dot(offset) };
-        let plus = center.plus(offset);
-        let minus = center.minus(offset);
-        // Each search begins with the moment at which the centre is exposed.
-        let LensPixels { x_px: ax, y_px: ay, margin: a, .. } =
-            lens.project(simd, plus, exposed.remaining, in_range).pixels;
-        let LensPixels { x_px: bx, y_px: by, margin: b, .. } =
-            lens.project(simd, minus, exposed.remaining, in_range).pixels;
-        margin = margin.min(a).min(b);
-        *pair = [ax, ay, bx, by];
-        mean_x += ax + bx;
-        mean_y += ay + by;
+        for (side, distance) in [root_3, -root_3].into_iter().enumerate() {
+            let point_m = axis_m.mul_add(distance, then_m);
+            let at = lens.project_near(simd, point_m, &exposed.moment, in_range);
+            margin = margin.min(at.margin);
+            mean_x += at.x_px;
+            mean_y += at.y_px;
+            pair[2 * side] = at.x_px;
+            pair[2 * side + 1] = at.y_px;
+        }
     }
     let sixth = splat(1.0 / 6.0);
     let mean_x = mean_x * sixth;
@@ -330,113 +324,25 @@ fn project_six_points<S: Simd>(
     (splats, in_range.to_bitmask() & !inside.to_bitmask())
 }
 
-/// The covariance of a root with six columns, and its determinant as the sum of the squares of the 15 minors.
+/// The covariance of a root with six columns, and its determinant.
+///
+/// With the rows x and y of the root, and `r = y - x (x·y)/(x·x)`, the part of y across x, the determinant is
+/// `(x·x)(r·r)`: a product of sums of squares, which f32 rounds no more than the sum of the squares of the 15 minors.
 #[inline(always)]
 fn moments_of_root<S: Simd>(simd: S, root: [[f32x16<S>; 2]; 6]) -> Moments<S> {
     let splat = |value: f32| f32x16::splat(simd, value);
-    let [mut xx, mut yy, mut xy, mut det] = [splat(0.0); 4];
-    for (i, [x, y]) in root.into_iter().enumerate() {
+    let [mut xx, mut yy, mut xy, mut across2] = [splat(0.0); 4];
+    for [x, y] in root {
         xx = x.mul_add(x, xx);
         yy = y.mul_add(y, yy);
         xy = x.mul_add(y, xy);
-        for [other_x, other_y] in &root[..i] {
-            let minor = x * *other_y - y * *other_x;
-            det = minor.mul_add(minor, det);
-        }
     }
-    Moments { xx, yy, xy, det }
-}
-
-/// Angles of 16 centres and their points, in radians, for the tests of [`CullBound`]. They are widened by the errors of the
-/// approximations here.
-struct CenterAngles<S: Simd> {
-    /// Least angle off the axis of the centres during the exposure.
-    least: f32x16<S>,
-    /// Largest angle off the axis of the centres and their points during the exposure.
-    most: f32x16<S>,
-    /// Largest angle between a centre and one of its points.
-    spread: f32x16<S>,
-    /// By how much the shutter changes that angle, if both are exposed at different moments.
-    motion: f32x16<S>,
-    /// Not close to the camera, where these bounds do not hold.
-    far: mask32x16<S>,
-    /// No point comes near the axis' other end, where the lens is not continued.
-    continued: mask32x16<S>,
-}
-
-impl<S: Simd> CenterAngles<S> {
-    #[inline(always)]
-    fn new(simd: S, center_m: Vec3x16<S>, sigma_m: f32x16<S>, bound: &CullBound) -> Self {
-        let splat = |value: f64| f32x16::splat(simd, value as f32);
-        let off_axis2 = center_m.x.mul_add(center_m.x, center_m.y * center_m.y);
-        let distance_m = center_m.z.mul_add(center_m.z, off_axis2).sqrt();
-
-        // The angle off the axis is 2 atan t with t = |(x, y)|/(|p| + z). For t up to 1, atan t is
-        // t (π/4 + 0.273 (1 - t)) within 0.004; beyond, it is π/2 - atan(1/t).
-        let t = off_axis2.sqrt() / (distance_m + center_m.z).max(splat(1e-30));
-        let steep = t.simd_gt(splat(1.0));
-        let low = steep.select(splat(1.0) / t, t);
-        let half = low * splat(-0.273).mul_add(low, splat(std::f64::consts::FRAC_PI_4 + 0.273));
-        let half = steep.select(splat(std::f64::consts::FRAC_PI_2) - half, half);
-        let off_axis = half + half;
-
-        // Below s = 1/2, asin s is at most s π/3.
-        let third_turn = splat(std::f64::consts::FRAC_PI_3);
-        let translation = splat(bound.translation_m) / distance_m;
-        let motion = translation.mul_add(third_turn, splat(bound.rotation_rad));
-        let slack = motion + splat(0.01);
-        let share = splat(3.0_f64.sqrt()) * sigma_m / (distance_m - splat(bound.translation_m));
-        let spread = share * third_turn;
-        let most = off_axis + slack + spread + splat(bound.windshield_rad);
-        Self {
-            least: off_axis - slack,
-            most,
-            spread,
-            motion,
-            far: translation.simd_lt(splat(0.5)) & share.simd_lt(splat(0.5)),
-            continued: most.simd_lt(splat(WIDEST_RAD)),
-        }
+    let slope = -(xy / xx.max(splat(1e-30)));
+    for [x, y] in root {
+        let across = x.mul_add(slope, y);
+        across2 = across.mul_add(across, across2);
     }
-
-    /// Which Gaussians certainly miss the image: the test of [`CullBound`].
-    #[inline(always)]
-    fn surely_unseen(&self, simd: S, bound: &CullBound) -> mask32x16<S> {
-        let splat = |value: f64| f32x16::splat(simd, value as f32);
-        let reach_px = self.reach_px(simd, self.spread + splat(bound.windshield_rad), bound);
-        let off_rad = self.least - splat(bound.windshield_rad + bound.image_rad);
-        let out = (off_rad * splat(bound.least_px_per_rad)).simd_gt(reach_px);
-        self.far & (self.continued & out | self.least.simd_gt(splat(bound.max_center_rad)))
-    }
-
-    /// Which Gaussians miss the image, given the images of their centres: none of their points lands farther from there
-    /// than the most pixels per radian allow. A windshield changes the angle between two rays by less than half of it.
-    #[inline(always)]
-    fn beside(
-        &self,
-        simd: S,
-        center_px: LensPixels<S>,
-        view: &UnscentedChunkView<'_>,
-    ) -> mask32x16<S> {
-        let bound = view.unscented.cull_bound();
-        let widened = f32x16::splat(simd, if bound.windshield_rad > 0.0 { 1.5 } else { 1.0 });
-        let reach_px = self.reach_px(simd, (self.spread + self.motion) * widened, bound);
-        let [width, height] = splats(simd, view.size_px);
-        let beyond = |at: f32x16<S>, side: f32x16<S>| (-at).max(at - side);
-        let off_px = beyond(center_px.x_px, width).max(beyond(center_px.y_px, height));
-        self.far & self.continued & off_px.simd_gt(reach_px)
-    }
-
-    /// How far splats reach from the images of their centres, in pixels, if their points spread by some angles.
-    #[inline(always)]
-    fn reach_px(&self, simd: S, spread_rad: f32x16<S>, bound: &CullBound) -> f32x16<S> {
-        let splat = |value: f64| f32x16::splat(simd, value as f32);
-        let mut px_per_rad = splat(f64::INFINITY);
-        for cone in bound.reaches.iter().rev() {
-            let within = self.most.simd_le(splat(cone.rad));
-            px_per_rad = within.select(splat(cone.px_per_rad), px_per_rad);
-        }
-        spread_rad.mul_add(px_per_rad, splat(bound.blur_px))
-    }
+    Moments { xx, yy, xy, det: xx * across2 }
 }
 
 #[inline(always)]
@@ -448,21 +354,22 @@ fn add<S: Simd>((low, high): F64x16<S>, more: f32x16<S>) -> F64x16<S> {
 /// Depth of centres, in metres: computed in f64 and rounded to f32 once, since splats are blended in order of
 /// it.
 ///
-/// `at_end_m` and `center` are the same centres, in the camera's frame at the end of the exposure. The depth of
-/// a centre that is exposed earlier is that at its own moment: it is larger by the distance that the camera
-/// still moves until the end.
+/// `at_end_m` are the centres in the camera's frame at the end of the exposure. The depth of a centre that is exposed
+/// earlier is that at its own moment: it is larger by the distance that the camera still moves until the end.
+/// `distance_m` is their distance from the camera then, rounded in every step.
 #[inline(always)]
 fn depth<S: Simd>(
     simd: S,
     at_end_m: [F64x16<S>; 3],
     view: &UnscentedChunkView<'_>,
     lens: &LensProjection,
-    center: Vec3x16<S>,
+    distance_m: f32x16<S>,
     remaining: f32x16<S>,
 ) -> f32x16<S> {
     let [mut x, mut y, mut z] = at_end_m;
     if !view.depth_is_distance {
         if let Some(shutter) = lens.shutter() {
+            let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
             z = add(z, shutter.z_change(simd, center, remaining));
         }
         return z.0.narrow(z.1);
@@ -474,9 +381,12 @@ fn depth<S: Simd>(
         y = add(y, translation_m.y);
         z = add(z, translation_m.z);
     }
-    let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0)).sqrt();
-    let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1)).sqrt();
-    low.narrow(high)
+    let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0));
+    let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1));
+    // A step of Newton's method from the f32 distance: its error, squared, is beyond what f32 tells.
+    let (near_low, near_high) = distance_m.widen();
+    let off = (low - near_low * near_low).narrow(high - near_high * near_high);
+    off.mul_add(f32x16::splat(simd, 0.5) / distance_m, distance_m)
 }
 
 /// Projects one Gaussian in f64 into its lane of `to`, and returns the vector from the camera to its centre,
