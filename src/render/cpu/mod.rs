@@ -285,7 +285,8 @@ impl StageTimer {
         Self::add(name, ms, stats);
     }
 
-    /// The same of two stages that alternate, each with its time in all threads: they get their shares of the wall time.
+    /// The same of two stages that alternate, each with its time in all threads: they get their shares of the wall
+    /// time.
     fn finish_both(&mut self, stages: [(&'static str, u64); 2], stats: &mut FrameStats) {
         let ms = self.lap_ms();
         let total: u64 = stages.iter().map(|(_, ns)| ns).sum();

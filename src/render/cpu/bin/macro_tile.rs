@@ -1,7 +1,7 @@
 //! Stage sort: the splats of one macro tile in order of depth, and the lists of its tiles.
 //!
-//! A thread has one macro tile at a time, with copies of its splats: they stay in the second-level cache while its tiles
-//! are sorted and drawn. Read tile by tile from where they were projected, they came from memory about twice each, and
+//! A thread has one macro tile at a time, with copies of its splats: they stay in the caches while its tiles are sorted
+//! and drawn. Read tile by tile from where they were projected, they came from memory about twice each, and
 //! `rasterize` waited for them during 40 % of its time on dense captures.
 
 use crate::cpu::project::Projected;

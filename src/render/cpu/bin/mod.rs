@@ -1,8 +1,8 @@
 //! Stages bin and sort: for every tile, the list of splats that can touch it, from the nearest.
 //!
 //! **Two levels.** Bin finds the macro tiles (up to 8 x 4 tiles) that each splat touches, and its tiles within each as a mask.
-//! It walks over the splats once, in the order in which they lie in memory. Sort takes one macro tile at a time, just before
-//! it is drawn: its splats are put in order of depth and distributed to its tiles while they stay in the cache of a core.
+//! It walks over the splats once, in the order in which they lie in memory. Sort takes one macro tile at a time, just
+//! before it is drawn: its splats are put in order of depth and distributed to its tiles while they stay in the cache of a core.
 //! Sorting each view as a whole instead, and reading its splats in that order, took twice the time on dense captures:
 //! nearly every read missed the caches.
 //!
@@ -95,8 +95,8 @@ impl Bins {
         tile.load(number, self.of_view(view));
     }
 
-    /// The macro tiles of a view, those with the most instances first: what is drawn last is small, so that no thread waits
-    /// long for another one.
+    /// The macro tiles of a view, those with the most instances first: what is drawn last is small, so that no thread
+    /// waits long for another one.
     pub(super) fn by_work(&self, view: usize) -> Vec<usize> {
         let mut instances = vec![0_u64; self.grids[view].macro_tiles()];
         for segment in self.of_view(view) {
