@@ -16,6 +16,6 @@ pub const PARTITION_CACHE_ENTRIES: usize = 64;
 pub const BINDING_BYTES_MIN: u64 = 64 << 10;
 
 /// Most splats of the views that the cpu backend renders together, counted as all Gaussians of the visible
-/// clusters. A splat takes about 66 B with its places in macro tiles, and its instances 20 B on a street: 300 MB if
-/// every Gaussian of these clusters were visible, and half of that is usual. One view alone may have more.
-pub const FRAME_SPLATS: usize = 3 << 20;
+/// clusters. A splat takes about 66 B with its places in macro tiles: 280 MB if every Gaussian of these clusters were
+/// visible, and half of that is usual. One view alone may have more.
+pub const FRAME_SPLATS: usize = 4 << 20;

@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use super::bin::MacroTile;
 use super::{Scratch, StageTimer};
 use crate::FrameStats;
 use crate::layout::Cutoffs;
@@ -15,7 +16,7 @@ pub(super) fn stage_outputs(
     cutoffs: &Cutoffs,
     stats: &mut FrameStats,
 ) -> StageOutputs {
-    let Scratch { projected, bins } = scratch;
+    let Scratch { projected, bins, .. } = scratch;
     let mut timer = StageTimer::start();
     let mut outputs = StageOutputs::default();
     // The number of the splat at each place.
@@ -43,13 +44,18 @@ pub(super) fn stage_outputs(
     }
     if last >= Stage::Bin {
         let mut lists = TileLists::default();
+        let mut loaded = MacroTile::default();
         for (view, grid) in bins.grids().iter().enumerate() {
-            for row in 0..grid.rows {
-                for column in 0..grid.columns {
+            let first_tile = lists.ranges.len();
+            lists.ranges.resize(first_tile + grid.tiles(), [0; 2]);
+            for number in 0..grid.macro_tiles() {
+                bins.load(view, number, &mut loaded);
+                for (within, [column, row]) in grid.tiles_of(number) {
                     let start = lists.instances.len() as u32;
-                    let places = bins.tile(view, column, row).iter();
-                    lists.instances.extend(places.map(|&place| index(place)));
-                    lists.ranges.push([start, lists.instances.len() as u32]);
+                    let places = loaded.tile(within).iter().map(|&splat| loaded.place(splat));
+                    lists.instances.extend(places.map(index));
+                    let tile = (row * grid.columns + column) as usize;
+                    lists.ranges[first_tile + tile] = [start, lists.instances.len() as u32];
                 }
             }
         }

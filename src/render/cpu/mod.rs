@@ -92,6 +92,7 @@ pub enum CpuError {
 struct Scratch {
     projected: project::Projected,
     bins: bin::Bins,
+    rasterizer: rasterize::Scratches,
 }
 
 impl Cpu {
@@ -172,7 +173,7 @@ impl Lane {
 }
 
 impl Scratch {
-    /// Projects, and bins and sorts if `last` is [`Stage::Bin`]. Each stage overwrites its part, so what an earlier
+    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part, so what an earlier
     /// frame left there, even one that panicked, does not matter.
     fn run(
         &mut self,
@@ -182,7 +183,7 @@ impl Scratch {
         last: Stage,
         stats: &mut FrameStats,
     ) -> Result<(), RenderError> {
-        let Self { projected, bins } = self;
+        let Self { projected, bins, .. } = self;
         let mut timer = StageTimer::start();
         projected.project(level, frame, cutoffs);
         timer.finish("project", stats);
@@ -190,9 +191,7 @@ impl Scratch {
         if last >= Stage::Bin {
             bins.bin(level, projected, frame.views, cutoffs)?;
             timer.finish("bin", stats);
-            bins.sort();
-            timer.finish("sort", stats);
-            stats.instances += bins.instances() as u64;
+            stats.instances += bins.instances();
         }
         Ok(())
     }
@@ -260,11 +259,12 @@ impl Cpu {
         let cutoffs = &Cutoffs::new(frame.profile);
         scratch.run(self.level, &frame, cutoffs, Stage::Bin, stats)?;
         let mut timer = StageTimer::start();
-        let Scratch { projected, bins } = scratch;
+        let Scratch { projected, bins, rasterizer } = scratch;
         let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
         let finished = |view: usize, target: &Target<'_>| finished(first_view + view, target);
-        stats.evaluations += rasterize::rasterize(self.level, input, targets, &finished);
-        timer.finish("rasterize", stats);
+        let work = rasterize::rasterize(self.level, input, rasterizer, targets, &finished);
+        stats.evaluations += work.evaluations;
+        timer.finish_both([("sort", work.sort_ns), ("rasterize", work.rasterize_ns)], stats);
         Ok(())
     }
 }
@@ -281,12 +281,30 @@ impl StageTimer {
 
     /// Adds the time since the end of the previous stage.
     fn finish(&mut self, name: &'static str, stats: &mut FrameStats) {
-        let now = Instant::now();
-        let ms = (now - self.start).as_secs_f64() * 1e3;
+        let ms = self.lap_ms();
+        Self::add(name, ms, stats);
+    }
+
+    /// The same of two stages that alternate, each with its time in all threads: they get their shares of the wall
+    /// time.
+    fn finish_both(&mut self, stages: [(&'static str, u64); 2], stats: &mut FrameStats) {
+        let ms = self.lap_ms();
+        let total: u64 = stages.iter().map(|(_, ns)| ns).sum();
+        for (name, ns) in stages {
+            Self::add(name, ms * ns as f64 / total.max(1) as f64, stats);
+        }
+    }
+
+    /// The time since the end of the previous stage, which ends now.
+    fn lap_ms(&mut self) -> f64 {
+        let before = std::mem::replace(&mut self.start, Instant::now());
+        (self.start - before).as_secs_f64() * 1e3
+    }
+
+    fn add(name: &'static str, ms: f64, stats: &mut FrameStats) {
         match stats.stages_ms.iter_mut().find(|(stage, _)| *stage == name) {
             Some((_, sum_ms)) => *sum_ms += ms,
             None => stats.stages_ms.push((name, ms)),
         }
-        self.start = now;
     }
 }

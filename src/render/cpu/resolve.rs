@@ -57,21 +57,9 @@ pub(super) struct Band<'a> {
     depth_m: Option<&'a mut [f32]>,
     opacity: Option<&'a mut [f32]>,
     instances: Option<&'a mut [u16]>,
-    /// Exposure and overlay of the camera; `None` if they change nothing.
-    pub(super) appearance: Option<&'a Appearance>,
 }
 
 impl Band<'_> {
-    /// Whether depth must be accumulated.
-    pub(super) fn wants_depth(&self) -> bool {
-        self.depth_m.is_some()
-    }
-
-    /// Whether the splats that halve the transmittance must be noted.
-    pub(super) fn wants_instances(&self) -> bool {
-        self.instances.is_some()
-    }
-
     /// Writes the instances of one tile with its left edge at column `left`.
     pub(super) fn write_instances(
         &mut self,
@@ -95,12 +83,16 @@ impl Band<'_> {
     }
 }
 
+/// Exposure and overlay of a target's camera; `None` if they change nothing.
+pub(super) fn appearance<'a>(target: &Target<'a>) -> Option<&'a Appearance> {
+    target.appearance.filter(|appearance| !appearance.is_identity())
+}
+
 /// Splits a target into bands, one per row of tiles of its view.
 pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>> {
     let width = view.camera.width_px as usize;
     let height = view.camera.height_px as usize;
     let pixels = width * TILE_PX as usize;
-    let appearance = target.appearance.filter(|appearance| !appearance.is_identity());
     let mut rgba = target.rgba.as_mut().map(|b| b.chunks_mut(4 * pixels));
     let mut rgb8 = target.rgb8.as_mut().map(|b| b.chunks_mut(3 * pixels));
     let mut depth_m = target.depth_m.as_mut().map(|b| b.chunks_mut(pixels));
@@ -116,7 +108,6 @@ pub(super) fn bands<'a>(target: &'a mut Target<'_>, view: &View) -> Vec<Band<'a>
             depth_m: depth_m.as_mut().and_then(Iterator::next),
             opacity: opacity.as_mut().and_then(Iterator::next),
             instances: instances.as_mut().and_then(Iterator::next),
-            appearance,
         })
         .collect()
 }

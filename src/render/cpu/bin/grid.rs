@@ -31,20 +31,36 @@ impl Grid {
         Self { size_px, columns, rows, macro_bits }
     }
 
+    /// Number of tiles.
+    pub(in crate::cpu) fn tiles(&self) -> usize {
+        self.columns as usize * self.rows as usize
+    }
+
     /// Macro tiles per row.
     pub(super) fn macro_columns(&self) -> u32 {
         self.columns.div_ceil(1 << self.macro_bits[0])
     }
 
-    pub(super) fn macro_tiles(&self) -> usize {
+    pub(in crate::cpu) fn macro_tiles(&self) -> usize {
         self.macro_columns() as usize * self.rows.div_ceil(1 << self.macro_bits[1]) as usize
     }
 
-    /// The macro tile of a tile, and the tile's number within it.
-    pub(super) fn place(&self, column: u32, row: u32) -> (usize, usize) {
+    /// The tiles of a macro tile: the number of each within it, its column and its row.
+    pub(in crate::cpu) fn tiles_of(
+        &self,
+        number: usize,
+    ) -> impl Iterator<Item = (usize, [u32; 2])> {
         let [x_bits, y_bits] = self.macro_bits;
-        let number = (row >> y_bits) * self.macro_columns() + (column >> x_bits);
-        let within = |at: u32, bits: u32| at & ((1 << bits) - 1);
-        (number as usize, (within(row, y_bits) << x_bits | within(column, x_bits)) as usize)
+        let number = number as u32;
+        let first_column = number % self.macro_columns() << x_bits;
+        let first_row = number / self.macro_columns() << y_bits;
+        let columns = first_column..self.columns.min(first_column + (1 << x_bits));
+        let rows = first_row..self.rows.min(first_row + (1 << y_bits));
+        rows.flat_map(move |row| {
+            columns.clone().map(move |column| {
+                let within = (row - first_row) << x_bits | (column - first_column);
+                (within as usize, [column, row])
+            })
+        })
     }
 }

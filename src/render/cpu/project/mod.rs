@@ -12,8 +12,8 @@
 //! their results are stored in order of (view, global id), so the output does not depend on the schedule.
 //!
 //! **Splats stay where they were projected.** They lie in pages of 256 splats that one frame leaves to the
-//! next. Bin writes 12 bytes for each macro tile of a splat and sort 4-byte places; neither moves a splat. Copying the splats into
-//! depth order was no faster to read, and it doubled the memory of a frame.
+//! next. Bin writes 12 bytes for each macro tile of a splat, and sort copies the splats of one macro tile at a time. Copying all
+//! of a frame into depth order was no faster to read, and it doubled the memory of a frame.
 //!
 //! **Every function that a hot loop calls is `#[inline(always)]`.** `fearless_simd` dispatches to an
 //! instruction set at run time, on stable Rust. A closure or an iterator adapter that remains a call of its
