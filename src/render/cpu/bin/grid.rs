@@ -52,8 +52,8 @@ impl Grid {
     ) -> impl Iterator<Item = (usize, [u32; 2])> {
         let [x_bits, y_bits] = self.macro_bits;
         let number = number as u32;
-        let first_column = number % self.macro_columns() << x_bits;
-        let first_row = number / self.macro_columns() << y_bits;
+        let first_column = (number % self.macro_columns()) << x_bits;
+        let first_row = (number / self.macro_columns()) << y_bits;
         let columns = first_column..self.columns.min(first_column + (1 << x_bits));
         let rows = first_row..self.rows.min(first_row + (1 << y_bits));
         rows.flat_map(move |row| {
