@@ -262,7 +262,7 @@ async fn a_psnr_that_cannot_be_measured_is_refused() {
     };
     refused(&fresh(&alike).await, "no version before");
     assert_eq!(fresh(&|_| {}).await.state, PushState::Ready);
-    refused(&fresh(&alike).await, "no trajectory");
+    refused(&fresh(&alike).await, "no recorded drive");
     let nowhere = |push: &mut NewPush| {
         alike(push);
         push.preview.poses = Some(Vec::new());

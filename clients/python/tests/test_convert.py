@@ -152,7 +152,7 @@ def test_drivestudio_names_its_models(tmp_path: Path) -> None:
 
     saved = {"models": {"Background": state(g), "RigidNodes": state(gaussians(5)), "Sky": {}}}
     source = save(tmp_path / "checkpoint_final.pth", saved)
-    with pytest.raises(CheckpointError, match="'Background', 'RigidNodes'; name one"):
+    with pytest.raises(CheckpointError, match="choose one of 'Background', 'RigidNodes'"):
         convert.splats(source)
     assert_same(convert.splats(source, "Background"), g)
     assert len(convert.splats(source, "RigidNodes")["means"]) == 5
