@@ -170,19 +170,22 @@ fn boxes_hide_what_moves_and_lidar_measures_depth() {
         |values: &[i64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
     let wide =
         |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
-    let points = bytes(&[0.0; 12]);
     let point_times = times(&[0, 100_000, 200_000, 900_000]);
     let identity = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
     let poses = wide(&[identity; 3].concat());
     let pose_times = times(&[0, 200_000, 1_000_000]);
-    let tensors = [
-        ("points_m", TensorView::new(Dtype::F32, vec![4, 3], &points).unwrap()),
-        ("time_us", TensorView::new(Dtype::I64, vec![4], &point_times).unwrap()),
-        ("pose_time_us", TensorView::new(Dtype::I64, vec![3], &pose_times).unwrap()),
-        ("world_from_rig", TensorView::new(Dtype::F64, vec![3, 4, 4], &poses).unwrap()),
-    ];
-    fs::write(at.join("lidar.safetensors"), serialize(tensors, None).unwrap()).unwrap();
-    let (said, made) = eval(at, "scene.ply", "views.jsonl", &["--lidar", "lidar.safetensors"]);
+    let with_points = |coordinates_m: [f32; 12]| {
+        let points = bytes(&coordinates_m);
+        let tensors = [
+            ("points_m", TensorView::new(Dtype::F32, vec![4, 3], &points).unwrap()),
+            ("time_us", TensorView::new(Dtype::I64, vec![4], &point_times).unwrap()),
+            ("pose_time_us", TensorView::new(Dtype::I64, vec![3], &pose_times).unwrap()),
+            ("world_from_rig", TensorView::new(Dtype::F64, vec![3, 4, 4], &poses).unwrap()),
+        ];
+        fs::write(at.join("lidar.safetensors"), serialize(tensors, None).unwrap()).unwrap();
+        eval(at, "scene.ply", "views.jsonl", &["--lidar", "lidar.safetensors"])
+    };
+    let (said, made) = with_points([0.0; 12]);
     assert_eq!(
         made["subject"]["lidar"],
         json!({"file": "lidar.safetensors", "points": 3, "left_out": 1})
@@ -196,15 +199,7 @@ fn boxes_hide_what_moves_and_lidar_measures_depth() {
     assert!(seen.iter().all(|lidar| number(&lidar["mean_m"]) < 3.0), "{found:?}");
 
     // Points that no image sees are told, and not a mean of nothing.
-    let points = bytes(&[500.0; 12]);
-    let tensors = [
-        ("points_m", TensorView::new(Dtype::F32, vec![4, 3], &points).unwrap()),
-        ("time_us", TensorView::new(Dtype::I64, vec![4], &point_times).unwrap()),
-        ("pose_time_us", TensorView::new(Dtype::I64, vec![3], &pose_times).unwrap()),
-        ("world_from_rig", TensorView::new(Dtype::F64, vec![3, 4, 4], &poses).unwrap()),
-    ];
-    fs::write(at.join("lidar.safetensors"), serialize(tensors, None).unwrap()).unwrap();
-    let (said, made) = eval(at, "scene.ply", "views.jsonl", &["--lidar", "lidar.safetensors"]);
+    let (said, made) = with_points([500.0; 12]);
     assert!(said.contains("no LiDAR point was compared") && !said.contains("NaN"), "{said}");
     let page = fs::read_to_string(at.join("out/report.html")).unwrap();
     assert!(page.contains("no LiDAR point was compared"));
