@@ -33,6 +33,7 @@ pub const BLOCKS: usize = (CELL_M / BLOCK_M) as usize;
 /// one cluster per block, and every chunk costs each frame some work. Cells of a skyline or a sky have only
 /// a few Gaussians each.
 pub const SPARSE_CELL: usize = BLOCKS * BLOCKS * CLUSTER;
+
 /// Indices of the columns of a lane group. The SH coefficients come last: coefficient-major, then red,
 /// green, blue.
 pub mod column {
