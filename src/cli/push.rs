@@ -8,7 +8,7 @@ use anyhow::Context as _;
 use crate::cli::limits;
 use wildcity_client::{
     AllCells, CellSelection, ConnectOptions, HttpClient, NewPush, PreviewRequest, Push as Pushed,
-    PushFile, PushReport, PushState,
+    PushFile, PushFrame, PushReport, PushState,
 };
 use wildcity_twin::ingest;
 
@@ -40,6 +40,11 @@ pub(super) struct Push {
     /// Metres per unit of the files.
     #[arg(long, default_value_t = 1.0)]
     scale: f64,
+
+    /// The frame of the files, after --axes and --scale: `twin`, or `capture` for the axes and the unit with which the
+    /// capture was imported, before `wildcity twin align` [default: twin]
+    #[arg(long, value_enum, value_name = "FRAME", hide_possible_values = true)]
+    frame: Option<FrameName>,
 
     /// `all`, or a cell to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64 j) m.
     /// Gaussians in other cells are left out [default: the cells that the Gaussians lie in]
@@ -73,6 +78,13 @@ pub(super) struct Push {
     min_psnr_db: Option<f64>,
 }
 
+/// A frame, as it is called on the wire.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum FrameName {
+    Twin,
+    Capture,
+}
+
 /// `--server` and its token, for every command that connects to a server.
 #[derive(Debug, clap::Args)]
 pub(super) struct Server {
@@ -89,7 +101,8 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity push street.ply --twin street --axes y-down-z-forward
   wildcity push block7.spz block8.spz --twin city --server http://sim:8080 --token-file token
-  wildcity push block7.ply --twin city --base 12 --cells 3,-1 --cells 4,-1";
+  wildcity push block7.ply --twin city --base 12 --cells 3,-1 --cells 4,-1
+  wildcity push block7.ply --twin city --axes y-down-z-forward --frame capture   (city was aligned)";
 
 impl Push {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -135,6 +148,10 @@ impl Push {
             // One id for this run: if an answer is lost, the client sends the same push again under this id.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
             files,
+            frame: self.frame.map(|frame| match frame {
+                FrameName::Twin => PushFrame::Twin,
+                FrameName::Capture => PushFrame::Capture,
+            }),
             base: self.base,
             cells,
             record: self.record.clone(),
@@ -210,6 +227,19 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         if unnamed > 0 {
             writeln!(out, "bad         and {unnamed} more")?;
         }
+    }
+    let frame = match (report.frame, report.aligned) {
+        (Some(PushFrame::Twin), true) => {
+            "the twin's; it was aligned: files in the axes of its capture need --frame capture"
+        }
+        (Some(PushFrame::Capture), true) => "the capture's; turned, moved and scaled as the twin was",
+        (Some(PushFrame::Capture), false) => {
+            "the capture's, which is the twin's: it was never aligned"
+        }
+        (Some(PushFrame::Twin), false) | (None, _) => "",
+    };
+    if !frame.is_empty() {
+        writeln!(out, "frame       {frame}")?;
     }
     if let Some(ranges) = report.ranges {
         let [low, high] = ranges.mean_m;

@@ -109,6 +109,7 @@ impl Generate {
             trajectories: vec![drive],
             sky: None,
             geo: None,
+            twin_from_capture: None,
             provenance: Provenance::of(format!(
                 "city {}: {}{}",
                 wildcity_generate::REVISION,

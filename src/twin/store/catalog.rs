@@ -358,6 +358,9 @@ impl Catalog {
         if manifest.sh_degree > sh::MAX_DEGREE {
             return Err(damaged(format!("SH degree is {}, not 0 to 3", manifest.sh_degree)));
         }
+        if let Some(alignment) = manifest.twin_from_capture {
+            alignment.check().map_err(|error| damaged(format!("its alignment: {error}")))?;
+        }
         let objects = manifest.chunks.iter().map(|chunk| &chunk.object);
         let sky = manifest.sky.iter().map(|sky| &sky.object);
         let views = manifest.views.iter().map(|views| &views.object);

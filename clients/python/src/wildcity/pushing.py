@@ -62,6 +62,7 @@ def push(
     token: str | None = None,
     axes: str = "identity",
     scale: float = 1.0,
+    frame: Literal["twin", "capture"] | None = None,
     cells: Literal["all"] | Sequence[tuple[int, int]] | None = None,
     base: int | None = None,
     record: Literal["f32", "h52", "q32", "q24"] | None = None,
@@ -80,6 +81,8 @@ def push(
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
     axes, scale: axis convention and metres per unit of the files, as in `wildcity import`.
+    frame: "twin", which is the default, or "capture": the axes and the unit with which the capture was imported, before
+        `wildcity twin align`. `report["frame"]` is the one that was taken, and `report["aligned"]` says whether they differ.
     cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.
     base: the version that the scene was trained from; cells that changed since then are not overwritten.
     record, levels, profile, note: storage format, levels of detail, changes of the render profile as
@@ -106,7 +109,7 @@ def push(
     if min_psnr_db is not None:
         request["golden"] = {"min_psnr_db": min_psnr_db}
     cells = cells if cells is None or isinstance(cells, str) else [(x, y) for x, y in cells]
-    optional = {"cells": cells, "base": base, "record": record, "note": note}
+    optional = {"frame": frame, "cells": cells, "base": base, "record": record, "note": note}
     request |= {name: value for name, value in optional.items() if value is not None}
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
     # The request has an id, so the server carries it out once even if it is repeated after a lost answer.
