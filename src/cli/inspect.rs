@@ -8,6 +8,7 @@ use wildcity_scene::geometry::Bounds;
 use wildcity_twin::store::Version;
 
 use super::directories::{TwinVersion, Twins};
+use super::output::counted;
 use super::time::utc;
 
 /// Show the contents of a twin: counts, bounds in metres, hashes, and its chunks.
@@ -65,7 +66,8 @@ fn summary(
     writeln!(out, "manifest    {hash}")?;
     writeln!(out, "created     {}", utc(*created_us))?;
     writeln!(out, "gaussians   {}, SH degree {}", manifest.gaussians(), manifest.sh_degree)?;
-    writeln!(out, "objects     {} chunks, {stored_bytes} bytes", manifest.chunks.len())?;
+    let chunks = counted(manifest.chunks.len(), "chunk");
+    writeln!(out, "objects     {chunks}, {stored_bytes} bytes")?;
     let record = manifest.record;
     let bits = record.bits(manifest.sh_degree);
     writeln!(out, "record      {record}, {bits} bits per Gaussian before compression")?;

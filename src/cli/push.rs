@@ -12,7 +12,7 @@ use wildcity_client::{
 };
 use wildcity_twin::ingest;
 
-use super::progress;
+use super::{packed_folder, progress};
 
 /// Push trained scenes to a server, as a new version of a twin.
 ///
@@ -22,7 +22,8 @@ use super::progress;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// Scene files of the formats that `wildcity import` reads, and the files that they name.
+    /// Scene files of the formats that `wildcity import` reads, and the files that they name. Of a SOG, the folder, or
+    /// its meta.json or lod-meta.json alone, is enough.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 
@@ -68,7 +69,7 @@ pub(super) struct Push {
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     settings: Vec<String>,
 
-    /// Description of this version; `wildcity inspect` shows it.
+    /// Description of this version; `wildcity twin log` shows it.
     #[arg(long)]
     note: Option<String>,
 
@@ -138,12 +139,7 @@ impl Push {
         client: &HttpClient,
         cells: Option<CellSelection>,
     ) -> anyhow::Result<Pushed> {
-        let mut files = Vec::with_capacity(self.files.len());
-        for path in &self.files {
-            let upload = upload(client, path).await?;
-            let name = name_beside(&self.files, path);
-            files.push(PushFile { upload, axes: self.axes.clone(), scale: self.scale, name });
-        }
+        let files = upload_all(client, &self.files, &self.axes, self.scale).await?;
         let asked = NewPush {
             // One id for this run: if an answer is lost, the client sends the same push again under this id.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
@@ -173,8 +169,27 @@ impl Push {
     }
 }
 
+/// Uploads files, with progress bars, and gives them as a request has them. A folder with a SOG is one archive.
+pub(super) async fn upload_all(
+    client: &HttpClient,
+    paths: &[PathBuf],
+    axes: &str,
+    scale: f64,
+) -> anyhow::Result<Vec<PushFile>> {
+    let mut files = Vec::with_capacity(paths.len());
+    for path in paths {
+        let packed = packed_folder::pack(path, paths.len() == 1)?;
+        let (upload, name) = match &packed {
+            Some(packed) => (upload(client, packed.path()).await?, None),
+            None => (upload(client, path).await?, name_beside(paths, path)),
+        };
+        files.push(PushFile { upload, axes: axes.to_owned(), scale, name });
+    }
+    Ok(files)
+}
+
 /// Uploads a file, with a progress bar. Returns the id of the upload.
-pub(super) async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
+async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
     let bar = progress::bytes("uploading");
     let upload = client.upload(path, &mut progress::show(&bar)).await;
     let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
@@ -184,7 +199,7 @@ pub(super) async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<S
 
 /// The name by which the first of some files names another one, `textures/paint.png`, if that lies below its folder. A
 /// file beside it has its own name.
-pub(super) fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
+fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
     let below = path.strip_prefix(files.first()?.parent()?).ok()?;
     let steps: Option<Vec<&str>> = below.iter().map(|step| step.to_str()).collect();
     steps.filter(|steps| steps.len() > 1).map(|steps| steps.join("/"))
@@ -232,7 +247,9 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         (Some(PushFrame::Twin), true) => {
             "the twin's; it was aligned: files in the axes of its capture need --frame capture"
         }
-        (Some(PushFrame::Capture), true) => "the capture's; turned, moved and scaled as the twin was",
+        (Some(PushFrame::Capture), true) => {
+            "the capture's; turned, moved and scaled as the twin was"
+        }
         (Some(PushFrame::Capture), false) => {
             "the capture's, which is the twin's: it was never aligned"
         }

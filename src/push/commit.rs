@@ -57,7 +57,8 @@ pub(crate) fn commit(
                 trajectories: old.map(|old| old.trajectories.clone()).unwrap_or_default(),
                 sky: old.and_then(|old| old.sky.clone()).map(NewSky::Kept),
                 geo: old.and_then(|old| old.geo.clone()),
-                twin_from_capture: old.map_or(Ok(None), Manifest::alignment)
+                twin_from_capture: old
+                    .map_or(Ok(None), Manifest::alignment)
                     .map_err(StoreError::from)?,
                 provenance,
             };

@@ -158,6 +158,11 @@ impl Provenance {
         let builder = concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned();
         Self { source, builder, options: Vec::new() }
     }
+
+    /// The description of the push that it comes from, if the push had one.
+    pub fn note(&self) -> Option<&str> {
+        self.options.iter().find_map(|option| option.strip_prefix("note="))
+    }
 }
 
 impl Manifest {

@@ -13,8 +13,7 @@ use crate::support::TestServer;
 
 /// Two alignments, one after the other: tilted ground and another unit, and then turned ground.
 fn edits() -> [Value; 2] {
-    let ground =
-        json!({"points": [[0, 0, 2], [4, 0, 3], [0, 4, 1]], "above": [0, 0, 50]});
+    let ground = json!({"points": [[0, 0, 2], [4, 0, 3], [0, 4, 1]], "above": [0, 0, 50]});
     let scale = json!({"points": [[0, 0, 0], [0, 1, 0]], "distance_m": 1.75});
     let again = json!({"points": [[0, 0, -1], [9, 1, -1], [0, 8, 2]], "above": [0, 0, 50]});
     [json!({"ground": ground, "scale": scale}), json!({"ground": again})]
@@ -131,9 +130,8 @@ async fn a_push_in_the_frame_of_the_capture_lies_as_if_it_had_been_aligned_with_
     assert!(off.iter().all(|&off| off > 0.1), "{off:?}");
     let z_m = |corner: usize| report.ranges.unwrap().mean_m[corner][2];
     let found = after.means_m.iter().map(|mean| mean[2]);
-    let found = found.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| {
-        [low.min(z), high.max(z)]
-    });
+    let found =
+        found.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)]);
     assert!((z_m(0) - found[0]).abs() < 1e-4 && (z_m(1) - found[1]).abs() < 1e-4, "{found:?}");
 
     // The alignment stays, and the version says that its files were aligned.

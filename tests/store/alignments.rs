@@ -17,11 +17,7 @@ fn turn(axis: DVec3, metres_per_unit: f64) -> Alignment {
     Alignment { new_from_old: Pose { position_m, rotation }, metres_per_unit }
 }
 
-fn edit(
-    catalog: &Catalog,
-    base: &Version,
-    alignment: Alignment,
-) -> Result<Version, StoreError> {
+fn edit(catalog: &Catalog, base: &Version, alignment: Alignment) -> Result<Version, StoreError> {
     let edit = Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
     catalog.edit(base, edit, &mut |_, _| {})
 }

@@ -61,18 +61,8 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     let body: http::NewPush = read_body(body)?;
     // The hash is computed from the parsed body, so that white space does not make it a different push.
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
-    let http::NewPush {
-        id,
-        files,
-        frame,
-        base,
-        cells,
-        record,
-        levels,
-        profile,
-        note,
-        preview,
-    } = body;
+    let http::NewPush { id, files, frame, base, cells, record, levels, profile, note, preview } =
+        body;
     let preview_poses = preview
         .poses
         .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES));

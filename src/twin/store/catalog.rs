@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use crate::limits;
-use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_scene::manifest::{ChunkEntry, Provenance, Section};
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{Chunk, Manifest, PagePool, sh};
 
@@ -235,6 +235,15 @@ impl Catalog {
             Ok(LogEntry { number, hash, created_us, commit, parent, kind })
         };
         self.numbers(name)?.into_iter().map(entry).collect()
+    }
+
+    /// Where a version of the log comes from, from its manifest alone.
+    ///
+    /// # Errors
+    /// As [`Catalog::version`].
+    pub fn provenance(&self, name: &str, entry: &LogEntry) -> Result<Provenance, StoreError> {
+        self.check_not_collected(name, entry.number)?;
+        Ok(self.manifest(name, &entry.hash)?.provenance)
     }
 
     /// Reads one section of a chunk, compares it with its hash, and decodes it. Nothing else of the

@@ -239,15 +239,8 @@ impl Commit {
 
     /// A manifest with the cells that were put, and no others. Its table is not written yet.
     fn new_manifest(&mut self, settings: VersionSettings) -> Result<Manifest, StoreError> {
-        let VersionSettings {
-            profile,
-            rig,
-            trajectories,
-            sky,
-            geo,
-            twin_from_capture,
-            provenance,
-        } = settings;
+        let VersionSettings { profile, rig, trajectories, sky, geo, twin_from_capture, provenance } =
+            settings;
         Ok(Manifest {
             format: Manifest::FORMAT,
             twin: self.name.clone(),
