@@ -5,7 +5,10 @@ use std::path::Path;
 use wildcity_scene::Gaussians;
 use wildcity_twin::ingest::{self, IngestError};
 
-use crate::format_files::{Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz4, spz_plain, streamed, usdz, zip_of};
+use crate::format_files::{
+    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz,
+    zip_of,
+};
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, safetensors};
 
 /// A scene's files. The first one is the file that is given to the reader.

@@ -7,7 +7,8 @@ use wildcity_scene::Gaussians;
 use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, StopFlag};
 
 use crate::format_files::{
-    Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, streamed, usdz, zip_of,
+    Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, streamed,
+    usdz, zip_of,
 };
 use crate::scene_files::gaussians;
 use crate::{read, refusal};

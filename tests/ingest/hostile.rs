@@ -3,7 +3,10 @@
 use wildcity_scene::Gaussians;
 
 use crate::corpus::{COUNT, corpus};
-use crate::format_files::{Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz4, spz_plain, streamed, usdz, webp, zip_of};
+use crate::format_files::{
+    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz, webp,
+    zip_of,
+};
 use crate::refusal;
 use crate::scene_files::gaussians;
 
