@@ -6,8 +6,8 @@
 //! queue     the pushes of a server: waiting, running, ended not long ago
 //! status    the progress of a push
 //! source    reads scene files and converts them to the twin's axes; `wildcity import` uses it, too
-//! read      joins the files of one push
-//! frame     takes what was read from the capture's axes to those of an aligned twin
+//! read      joins the files of one push, and takes them to the twin's frame
+//! frame     the axes of a push: the twin's, or those of its capture before it was aligned
 //! report    what the files hold, and which cells would change
 //! preview   compares small images before and after
 //! commit    writes the version

@@ -27,7 +27,6 @@ use crate::base::find_base;
 use crate::blocking::run_blocking;
 use crate::commit::{NewContent, commit};
 use crate::error::PushError;
-use crate::frame;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
 use crate::queue::{PushQueue, Turn};
@@ -171,7 +170,7 @@ fn compare_cells(
     mut scene: PushedScene,
     base: Option<&Version>,
 ) -> Result<CheckedScene, PushError> {
-    let placed = frame::to_twin(request.frame, &mut scene, base);
+    let placed = scene.place_in_twin(request.frame, base);
     placed.inspect_err(|_| push.set_report(scene.report.clone()))?;
     let PushedScene { mut gaussians, hashes, options, mut report } = scene;
     // All cells of a twin have one SH degree. Coefficients of zero raise a lower one.
