@@ -30,7 +30,7 @@ impl PushedScene {
     ///
     /// # Errors
     /// [`PushError::Content`]: a Gaussian is outside its bounds there.
-    pub(crate) fn to_twin(
+    pub(crate) fn place_in_twin(
         &mut self,
         frame: Frame,
         base: Option<&Version>,
