@@ -70,7 +70,7 @@ fn stored(server: &TestServer, twin: &str) -> Gaussians {
     catalog.visit_full_detail(&version, &|_| true, &mut |part| all.append(&part)).unwrap();
     let mut order: Vec<usize> = (0..all.len()).collect();
     order.sort_by(|&a, &b| all.logit_opacities[a].total_cmp(&all.logit_opacities[b]));
-    all.select(order.into_iter())
+    all.select(order)
 }
 
 /// The largest difference of two scenes in each of their fields: means, rotations, scales, colours.
