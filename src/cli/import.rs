@@ -15,6 +15,7 @@ use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
 use super::input_files::read_trajectories;
+use super::output;
 use super::profile_options::ProfileOptions;
 use super::progress;
 use super::rig::rig_of;
@@ -194,13 +195,13 @@ impl Import {
         let stored_bytes = manifest.stored_bytes();
         writeln!(
             std::io::stdout().lock(),
-            "twin {} version {}: {} Gaussians of SH degree {} in {} chunks, {:.1} MB\n\
+            "twin {} version {}: {} Gaussians of SH degree {} in {}, {:.1} MB\n\
              {}\nblake3 {}",
             self.twin,
             version.number,
             manifest.gaussians(),
             manifest.sh_degree,
-            manifest.chunks.len(),
+            output::counted(manifest.chunks.len(), "chunk"),
             stored_bytes as f64 / 1e6,
             catalog.dir().join(&self.twin).display(),
             version.hash,

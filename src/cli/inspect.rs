@@ -3,10 +3,12 @@
 use std::io::{self, Write};
 
 use wildcity_scene::Manifest;
+use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Bounds;
 use wildcity_twin::store::Version;
 
 use super::directories::{TwinVersion, Twins};
+use super::output::counted;
 use super::time::utc;
 
 /// Show the contents of a twin: counts, bounds in metres, hashes, and its chunks.
@@ -46,21 +48,26 @@ impl Inspect {
             });
             writeln!(out, "{json:#}")?;
         } else {
-            summary(&mut out, &version)?;
+            summary(&mut out, &version, version.manifest.alignment()?)?;
             table(&mut out, &version.manifest)?;
         }
         Ok(())
     }
 }
 
-fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
+fn summary(
+    out: &mut impl Write,
+    version: &Version,
+    alignment: Option<Alignment>,
+) -> io::Result<()> {
     let Version { number, hash, created_us, manifest } = version;
     let stored_bytes = manifest.stored_bytes();
     writeln!(out, "twin        {} version {number}", manifest.twin)?;
     writeln!(out, "manifest    {hash}")?;
     writeln!(out, "created     {}", utc(*created_us))?;
     writeln!(out, "gaussians   {}, SH degree {}", manifest.gaussians(), manifest.sh_degree)?;
-    writeln!(out, "objects     {} chunks, {stored_bytes} bytes", manifest.chunks.len())?;
+    let chunks = counted(manifest.chunks.len(), "chunk");
+    writeln!(out, "objects     {chunks}, {stored_bytes} bytes")?;
     let record = manifest.record;
     let bits = record.bits(manifest.sh_degree);
     writeln!(out, "record      {record}, {bits} bits per Gaussian before compression")?;
@@ -108,6 +115,14 @@ fn summary(out: &mut impl Write, version: &Version) -> io::Result<()> {
         let keyframes = trajectory.keyframes.len();
         let length_m = trajectory.length_m();
         writeln!(out, "trajectory  {}: {keyframes} keyframes, {length_m:.1} m", trajectory.name)?;
+    }
+    if let Some(Alignment { new_from_old, metres_per_unit }) = alignment {
+        let moved = new_from_old.position_m.to_array();
+        let q = new_from_old.q_wxyz();
+        writeln!(
+            out,
+            "alignment   {metres_per_unit:.6} m per unit of the capture, after q {q:.4?} and xyz {moved:.3?}"
+        )?;
     }
     let provenance = &manifest.provenance;
     writeln!(out, "source      {}", provenance.source)?;

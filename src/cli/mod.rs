@@ -33,6 +33,7 @@ mod limits;
 mod lod;
 mod map;
 mod output;
+mod packed_folder;
 mod placement;
 mod profile_options;
 mod progress;

@@ -22,6 +22,12 @@ pub(super) fn write(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
     written.with_context(cannot)
 }
 
+/// A number of things: `1 chunk`, `2 chunks`.
+pub(super) fn counted(number: usize, thing: &str) -> String {
+    let s = if number == 1 { "" } else { "s" };
+    format!("{number} {thing}{s}")
+}
+
 /// Creates the directory of `--out`, if it is missing.
 pub(super) fn create_dir(dir: &Path) -> anyhow::Result<()> {
     anyhow::ensure!(

@@ -8,11 +8,11 @@ use anyhow::Context as _;
 use crate::cli::limits;
 use wildcity_client::{
     AllCells, CellSelection, ConnectOptions, HttpClient, NewPush, PreviewRequest, Push as Pushed,
-    PushFile, PushReport, PushState,
+    PushFile, PushFrame, PushReport, PushState,
 };
 use wildcity_twin::ingest;
 
-use super::progress;
+use super::{packed_folder, progress};
 
 /// Push trained scenes to a server, as a new version of a twin.
 ///
@@ -22,7 +22,8 @@ use super::progress;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// Scene files of the formats that `wildcity import` reads, and the files that they name.
+    /// Scene files of the formats that `wildcity import` reads, and the files that they name. Of a SOG, the folder, or
+    /// its meta.json or lod-meta.json alone, is enough.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 
@@ -40,6 +41,11 @@ pub(super) struct Push {
     /// Metres per unit of the files.
     #[arg(long, default_value_t = 1.0)]
     scale: f64,
+
+    /// The frame of the files, after --axes and --scale: `twin`, or `capture` for the axes and the unit with which the
+    /// capture was imported, before `wildcity twin align` [default: twin]
+    #[arg(long, value_enum, value_name = "FRAME", hide_possible_values = true)]
+    frame: Option<FrameName>,
 
     /// `all`, or a cell to replace as X,Y; may be given again. Cell (i, j) is centred on (64 i, 64 j) m.
     /// Gaussians in other cells are left out [default: the cells that the Gaussians lie in]
@@ -63,7 +69,7 @@ pub(super) struct Push {
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     settings: Vec<String>,
 
-    /// Description of this version; `wildcity inspect` shows it.
+    /// Description of this version; `wildcity twin log` shows it.
     #[arg(long)]
     note: Option<String>,
 
@@ -71,6 +77,13 @@ pub(super) struct Push {
     /// trajectory, is lower than this, in dB.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
+}
+
+/// A frame, as it is called on the wire.
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum FrameName {
+    Twin,
+    Capture,
 }
 
 /// `--server` and its token, for every command that connects to a server.
@@ -89,7 +102,8 @@ const EXAMPLES: &str = "\
 Examples:
   wildcity push street.ply --twin street --axes y-down-z-forward
   wildcity push block7.spz block8.spz --twin city --server http://sim:8080 --token-file token
-  wildcity push block7.ply --twin city --base 12 --cells 3,-1 --cells 4,-1";
+  wildcity push block7.ply --twin city --base 12 --cells 3,-1 --cells 4,-1
+  wildcity push block7.ply --twin city --axes y-down-z-forward --frame capture   (city was aligned)";
 
 impl Push {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -125,16 +139,15 @@ impl Push {
         client: &HttpClient,
         cells: Option<CellSelection>,
     ) -> anyhow::Result<Pushed> {
-        let mut files = Vec::with_capacity(self.files.len());
-        for path in &self.files {
-            let upload = upload(client, path).await?;
-            let name = name_beside(&self.files, path);
-            files.push(PushFile { upload, axes: self.axes.clone(), scale: self.scale, name });
-        }
+        let files = upload_all(client, &self.files, &self.axes, self.scale).await?;
         let asked = NewPush {
             // One id for this run: if an answer is lost, the client sends the same push again under this id.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
             files,
+            frame: self.frame.map(|frame| match frame {
+                FrameName::Twin => PushFrame::Twin,
+                FrameName::Capture => PushFrame::Capture,
+            }),
             base: self.base,
             cells,
             record: self.record.clone(),
@@ -156,8 +169,27 @@ impl Push {
     }
 }
 
+/// Uploads files, with progress bars, and gives them as a request has them. A folder with a SOG is one archive.
+pub(super) async fn upload_all(
+    client: &HttpClient,
+    paths: &[PathBuf],
+    axes: &str,
+    scale: f64,
+) -> anyhow::Result<Vec<PushFile>> {
+    let mut files = Vec::with_capacity(paths.len());
+    for path in paths {
+        let packed = packed_folder::pack(path, paths.len() == 1)?;
+        let (upload, name) = match &packed {
+            Some(packed) => (upload(client, packed.path()).await?, None),
+            None => (upload(client, path).await?, name_beside(paths, path)),
+        };
+        files.push(PushFile { upload, axes: axes.to_owned(), scale, name });
+    }
+    Ok(files)
+}
+
 /// Uploads a file, with a progress bar. Returns the id of the upload.
-pub(super) async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
+async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
     let bar = progress::bytes("uploading");
     let upload = client.upload(path, &mut progress::show(&bar)).await;
     let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
@@ -167,7 +199,7 @@ pub(super) async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<S
 
 /// The name by which the first of some files names another one, `textures/paint.png`, if that lies below its folder. A
 /// file beside it has its own name.
-pub(super) fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
+fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
     let below = path.strip_prefix(files.first()?.parent()?).ok()?;
     let steps: Option<Vec<&str>> = below.iter().map(|step| step.to_str()).collect();
     steps.filter(|steps| steps.len() > 1).map(|steps| steps.join("/"))
@@ -210,6 +242,21 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         if unnamed > 0 {
             writeln!(out, "bad         and {unnamed} more")?;
         }
+    }
+    let frame = match (report.frame, report.aligned) {
+        (Some(PushFrame::Twin), true) => {
+            "the twin's; it was aligned: files in the axes of its capture need --frame capture"
+        }
+        (Some(PushFrame::Capture), true) => {
+            "the capture's; turned, moved and scaled as the twin was"
+        }
+        (Some(PushFrame::Capture), false) => {
+            "the capture's, which is the twin's: it was never aligned"
+        }
+        (Some(PushFrame::Twin), false) | (None, _) => "",
+    };
+    if !frame.is_empty() {
+        writeln!(out, "frame       {frame}")?;
     }
     if let Some(ranges) = report.ranges {
         let [low, high] = ranges.mean_m;

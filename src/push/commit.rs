@@ -1,6 +1,6 @@
 //! Writes the version of a push: all of its cells, or none.
 
-use wildcity_scene::Gaussians;
+use wildcity_scene::{Gaussians, Manifest};
 use wildcity_twin::store::{
     Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
     VersionSettings,
@@ -21,7 +21,7 @@ pub(crate) struct NewContent<'a> {
 }
 
 /// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push
-/// of all cells replaces the twin, but keeps rig, trajectories, sky and place on the earth of the base.
+/// of all cells replaces the twin, but keeps rig, trajectories, sky, place on the earth and alignment of the base.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,
@@ -57,6 +57,9 @@ pub(crate) fn commit(
                 trajectories: old.map(|old| old.trajectories.clone()).unwrap_or_default(),
                 sky: old.and_then(|old| old.sky.clone()).map(NewSky::Kept),
                 geo: old.and_then(|old| old.geo.clone()),
+                twin_from_capture: old
+                    .map_or(Ok(None), Manifest::alignment)
+                    .map_err(StoreError::from)?,
                 provenance,
             };
             commit.set_views(old.and_then(|old| old.views.clone()));

@@ -139,6 +139,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         StoreError::Clamped { .. }
         | StoreError::Profile(_)
         | StoreError::FieldMismatch { .. }
+        | StoreError::Alignment(_)
         | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
         | StoreError::ViewSize { .. }

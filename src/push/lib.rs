@@ -6,7 +6,8 @@
 //! queue     the pushes of a server: waiting, running, ended not long ago
 //! status    the progress of a push
 //! source    reads scene files and converts them to the twin's axes; `wildcity import` uses it, too
-//! read      joins the files of one push
+//! read      joins the files of one push, and takes them to the twin's frame
+//! frame     the axes of a push: the twin's, or those of its capture before it was aligned
 //! report    what the files hold, and which cells would change
 //! preview   compares small images before and after
 //! commit    writes the version
@@ -24,6 +25,7 @@ mod blocking;
 mod commit;
 mod edit;
 mod error;
+mod frame;
 pub mod limits;
 mod preview;
 mod publish;
@@ -38,6 +40,7 @@ pub use asset::{AssetRequest, AssetSettings, AssetSource, make_asset, publish_as
 pub use base::{check_base, default_id};
 pub use edit::{DriveRequest, EditRequest, Survey, publish_edit, survey};
 pub use error::PushError;
+pub use frame::Frame;
 pub use preview::PsnrPreview;
 pub use publish::{Viewpoints, publish};
 pub use queue::{Begun, PushQueue, QueueLimits};

@@ -17,6 +17,7 @@ use std::sync::Arc;
 use tokio::time::{Instant, timeout, timeout_at};
 
 use wildcity_scene::Gaussians;
+use wildcity_scene::align::Alignment;
 use wildcity_scene::chunk::cell_at;
 use wildcity_session::{Engine, LatestPin};
 use wildcity_twin::residency::Viewpoint;
@@ -152,7 +153,9 @@ async fn check(
     };
     if let Some(changed) = changed {
         let progress = |done, total| push.set_progress(done, total);
-        let poses = request.preview_poses.clone();
+        let alignment = request.frame.alignment(base.as_deref())?.unwrap_or(Alignment::IDENTITY);
+        let poses = request.preview_poses.as_ref();
+        let poses = poses.map(|poses| poses.iter().map(|pose| alignment.pose(pose)).collect());
         scene.report.preview = preview_psnr(engine, changed, poses, frames_by, &progress).await?;
         push.set_report(scene.report.clone());
     }
@@ -160,13 +163,15 @@ async fn check(
     Ok(scene)
 }
 
-/// Finds the cells that the push replaces, and completes the report with them.
+/// Takes the scene to the twin's frame, finds the cells that the push replaces, and completes the report with both.
 fn compare_cells(
     push: &Push,
     request: &PushRequest,
-    scene: PushedScene,
+    mut scene: PushedScene,
     base: Option<&Version>,
 ) -> Result<CheckedScene, PushError> {
+    let placed = scene.place_in_twin(request.frame, base);
+    placed.inspect_err(|_| push.set_report(scene.report.clone()))?;
     let PushedScene { mut gaussians, hashes, options, mut report } = scene;
     // All cells of a twin have one SH degree. Coefficients of zero raise a lower one.
     if let Some(base) = base

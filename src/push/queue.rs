@@ -215,6 +215,7 @@ impl Entries {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::frame::Frame;
     use crate::request::CellSelection;
     use crate::status::PushedVersion;
 
@@ -232,6 +233,7 @@ mod tests {
             files: Vec::new(),
             base: None,
             cells: CellSelection::Touched,
+            frame: Frame::Twin,
             record: None,
             levels: true,
             profile: Vec::new(),

@@ -3,9 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::Gaussians;
+use wildcity_scene::validate::{self, Field};
 use wildcity_twin::ingest::{self, IngestError, ListedFiles, ReadLimits};
+use wildcity_twin::store::Version;
 
 use crate::error::PushError;
+use crate::frame::{Frame, twin_from_capture};
 use crate::limits;
 use crate::report::{FileReport, PushReport, Ranges};
 use crate::request::RequestedFile;
@@ -20,6 +23,30 @@ pub(crate) struct PushedScene {
     /// The axes and scale of each file.
     pub(crate) options: Vec<String>,
     pub(crate) report: PushReport,
+}
+
+impl PushedScene {
+    /// Turns, moves and scales the Gaussians to the frame of their base. The report says in which frame they were.
+    ///
+    /// # Errors
+    /// [`PushError::Content`]: a Gaussian is outside its bounds there.
+    pub(crate) fn place_in_twin(
+        &mut self,
+        frame: Frame,
+        base: Option<&Version>,
+    ) -> Result<(), PushError> {
+        self.report.frame = frame;
+        self.report.is_aligned = base.map(twin_from_capture).transpose()?.flatten().is_some();
+        let Some(alignment) = frame.alignment(base)? else { return Ok(()) };
+        alignment.apply(&mut self.gaussians);
+        self.report.ranges = Ranges::of(&self.gaussians);
+        validate::check(&self.gaussians, &Field::twin_name).map_err(|bad| PushError::Content {
+            reason: format!("in the axes of the twin, {bad}: check the scale of the files"),
+            cells: Vec::new(),
+        })?;
+        self.options.push(format!("align={alignment}"));
+        Ok(())
+    }
 }
 
 /// What the files of one push may become.

@@ -6,6 +6,7 @@ use wildcity_scene::{Gaussians, Manifest};
 use wildcity_twin::ingest::BadGaussian;
 
 use crate::error::PushError;
+use crate::frame::Frame;
 use crate::limits;
 use crate::preview::psnr::PsnrPreview;
 use crate::request::CellSelection;
@@ -17,6 +18,10 @@ pub struct PushReport {
     pub files: Vec<FileReport>,
     /// Gaussians of all files.
     pub gaussians: u64,
+    /// The frame in which the files were.
+    pub frame: Frame,
+    /// Whether the base was aligned, so that the frame of its capture is another one.
+    pub is_aligned: bool,
     /// Gaussians that lie in none of the replaced cells.
     pub left_out: u64,
     /// Highest SH degree of the files.

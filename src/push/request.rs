@@ -8,6 +8,7 @@ use wildcity_scene::rig::is_name;
 use wildcity_scene::{RecordFormat, RenderProfile};
 
 use crate::error::PushError;
+use crate::frame::Frame;
 use crate::limits;
 use crate::source::SourceAxes;
 
@@ -22,6 +23,8 @@ pub struct PushRequest {
     pub request_hash: blake3::Hash,
     /// The files, which become one scene.
     pub files: Vec<RequestedFile>,
+    /// The frame of the files and of [`PushRequest::preview_poses`].
+    pub frame: Frame,
     /// Version that the scene was trained from; the latest if there is none.
     pub base: Option<u64>,
     /// The cells that the push replaces.

@@ -7,6 +7,7 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::align::{Alignment, AlignmentError};
 use crate::geo::GeoAnchor;
 use crate::geometry::Bounds;
 
@@ -45,6 +46,11 @@ pub struct Manifest {
     /// Where the world lies on the earth, if that is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub geo: Option<GeoAnchor>,
+    /// From the axes and the unit with which the capture was imported to the twin's: all alignments since then as
+    /// one. None if the twin was never aligned; older versions have it in their provenance alone
+    /// ([`Manifest::alignment`]).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub twin_from_capture: Option<Alignment>,
     /// Where the version comes from.
     pub provenance: Provenance,
 }
@@ -152,11 +158,34 @@ impl Provenance {
         let builder = concat!("wildcity ", env!("CARGO_PKG_VERSION")).to_owned();
         Self { source, builder, options: Vec::new() }
     }
+
+    /// The description of the push that it comes from, if the push had one.
+    pub fn note(&self) -> Option<&str> {
+        self.options.iter().find_map(|option| option.strip_prefix("note="))
+    }
 }
 
 impl Manifest {
     /// The layout version that this build writes.
     pub const FORMAT: u32 = 1;
+
+    /// From the axes and the unit with which the capture was imported to the twin's, if the twin was aligned since.
+    ///
+    /// A version without [`Manifest::twin_from_capture`] was never aligned, or by a program that wrote alignments only
+    /// as options `align=` of the provenance.
+    ///
+    /// # Errors
+    /// An option of the provenance cannot be read.
+    pub fn alignment(&self) -> Result<Option<Alignment>, AlignmentError> {
+        if self.twin_from_capture.is_some() {
+            return Ok(self.twin_from_capture);
+        }
+        let mut options = self.provenance.options.iter().filter_map(|o| o.strip_prefix("align="));
+        options.try_fold(None, |first: Option<Alignment>, text| {
+            let next: Alignment = text.parse()?;
+            Ok(Some(first.map_or(next, |first| next.after(&first))))
+        })
+    }
 
     /// Number of Gaussians in all chunks at full detail.
     pub fn gaussians(&self) -> u64 {

@@ -71,6 +71,10 @@ fn a_damaged_demo_twin_is_built_again() {
     let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
     assert!(drive().contains("building the demo twin in "));
     assert!(!drive().contains("building"), "built once");
+    let names = fs::read_dir(dir.path().join("out")).unwrap();
+    let names: Vec<String> =
+        names.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    assert!(names.iter().all(|name| !name.contains("uploads")), "{names:?}");
     let version = catalog.version("demo", None).unwrap();
     let object = |hash: &str| dir.path().join("twins/demo/objects").join(&hash[..2]).join(hash);
     for hash in [&version.manifest.chunks[3].object, &version.hash] {

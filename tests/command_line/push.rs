@@ -4,7 +4,10 @@ use std::fs::{self, File};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-use crate::http::{get, in_cell, write};
+use serde_json::{Value, json};
+
+use crate::format_files::streamed;
+use crate::http::{get, in_cell, post, write};
 use crate::served::Served;
 use crate::support::{self, TestServer};
 
@@ -44,6 +47,91 @@ async fn a_file_is_pushed_and_reported() {
     let done = tokio::task::block_in_place(|| run(&["--cells", "x"]));
     assert!(!done.status.success());
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 3);
+}
+
+/// Runs the command, and returns whether it succeeded, and what it said.
+fn wildcity(arguments: &[&str]) -> (bool, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
+    let done = tokio::task::block_in_place(|| command.args(arguments).output().unwrap());
+    let text = [done.stdout, done.stderr].concat();
+    (done.status.success(), String::from_utf8(text).unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
+    let server = TestServer::start().await;
+    let url = format!("http://{}", server.address());
+    let twins = server.twins.path().to_str().unwrap().to_owned();
+    let dir = tempfile::tempdir().unwrap();
+    let block = write(dir.path(), "block.ply", &in_cell([0, 0], 40, 1));
+    let block = block.to_str().unwrap();
+    let push = |note: &str, more: &[&str]| {
+        let (ok, said) = wildcity(
+            &[&["push", block, "--twin", "test", "--server", &url, "--note", note], more].concat(),
+        );
+        assert!(ok, "{said}");
+        said
+    };
+    let never = push("first", &["--frame", "capture"]);
+    assert!(never.contains("frame       the capture's, which is the twin's"), "{never}");
+    assert!(!push("first", &["--cells", "all"]).contains("frame"));
+    let twice = json!({"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 2}});
+    assert_eq!(post(&server, "/v1/twins/test/edits", &twice).await.status, 200);
+    let twin = push("in\nmetres", &["--cells", "0,0"]);
+    assert!(twin.contains("it was aligned") && twin.contains("need --frame capture"), "{twin}");
+    let capture = push("epoch 30", &["--cells", "0,0", "--frame", "capture"]);
+    assert!(capture.contains("frame       the capture's; turned, moved"), "{capture}");
+    let (ok, wrong) = wildcity(&["push", block, "--twin", "test", "--frame", "world"]);
+    assert!(!ok && wrong.contains("--frame"), "{wrong}");
+
+    let (_, inspected) = wildcity(&["inspect", "test", "--twins", &twins]);
+    assert!(inspected.contains("alignment   2.000000 m per unit of the capture"), "{inspected}");
+    assert!(inspected.contains("objects     1 chunk,"), "{inspected}");
+    // An edit has the note of its base in its provenance, which is not its own.
+    let (ok, log) = wildcity(&["twin", "log", "test", "--twins", &twins]);
+    let notes: Vec<&str> = log.lines().map(|line| line[46..].trim_start()[64..].trim()).collect();
+    assert!(ok, "{log}");
+    assert_eq!(notes, ["", "first", "first", "", "in metres", "epoch 30"], "{log}");
+    let (_, log) = wildcity(&["twin", "log", "test", "--twins", &twins, "--json"]);
+    let notes: Vec<Value> = log
+        .lines()
+        .map(|line| serde_json::from_str::<Value>(line).unwrap()["note"].clone())
+        .collect();
+    assert_eq!(json!(notes), json!([null, "first", "first", null, "in\nmetres", "epoch 30"]));
+    // A manifest that is damaged costs its note alone.
+    let hash = log.lines().nth(1).unwrap();
+    let hash = serde_json::from_str::<Value>(hash).unwrap()["hash"].as_str().unwrap().to_owned();
+    let object = server.twins.path().join("test/objects").join(&hash[..2]).join(&hash);
+    fs::write(object, "{}").unwrap();
+    let (ok, log) = wildcity(&["twin", "log", "test", "--twins", &twins]);
+    assert!(ok && log.contains("version 2: no note: ") && log.contains("epoch 30"), "{log}");
+}
+
+/// A streamed SOG has more files than a push: its folder is one archive.
+#[tokio::test(flavor = "multi_thread")]
+async fn the_folder_of_a_sog_is_pushed_as_one_file() {
+    let server = TestServer::start().await;
+    let url = format!("http://{}", server.address());
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("street");
+    for (name, bytes) in streamed() {
+        let path = folder.join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, bytes).unwrap();
+    }
+    fs::write(folder.join("video.mp4"), "not a part").unwrap();
+    let hash = |text: &str| text.lines().last().unwrap().to_owned();
+    let mut pushed = Vec::new();
+    for given in [folder.clone(), folder.join("lod-meta.json")] {
+        let given = given.to_str().unwrap();
+        let (ok, said) = wildcity(&["push", given, "--twin", "sog", "--server", &url]);
+        assert!(ok && said.contains("street.zip: 50 Gaussians"), "{said}");
+        pushed.push(hash(&said));
+    }
+    assert_eq!(pushed[0], pushed[1], "the same archive");
+    fs::remove_file(folder.join("lod-meta.json")).unwrap();
+    let (ok, said) = wildcity(&["push", folder.to_str().unwrap(), "--twin", "sog"]);
+    assert!(!ok && said.contains("is a folder without lod-meta.json or meta.json"), "{said}");
 }
 
 #[test]

@@ -6,9 +6,9 @@ use wildcity_scene::Gaussians;
 use wildcity_twin::ingest::{self, IngestError};
 
 use crate::format_files::{
-    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, usdz, zip_of,
+    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz,
+    zip_of,
 };
-use crate::formats::streamed;
 use crate::scene_files::{gaussians, gsplat_tensors, inria_columns, ply, safetensors};
 
 /// A scene's files. The first one is the file that is given to the reader.

@@ -7,7 +7,8 @@ use wildcity_scene::Gaussians;
 use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, StopFlag};
 
 use crate::format_files::{
-    Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, usdz, zip_of,
+    Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, streamed,
+    usdz, zip_of,
 };
 use crate::scene_files::gaussians;
 use crate::{read, refusal};
@@ -213,30 +214,6 @@ fn sog_comes_back_as_folder_and_archive() {
             assert_eq!(read(&zip_of(&files, is_packed)).unwrap(), folder, "{name}");
         }
     }
-}
-
-/// Two blocks with two levels: 50 Gaussians, of which the finest level has 20 + 20; and an
-/// environment.
-pub(crate) fn streamed() -> Files {
-    let place = |file: usize, offset: usize, count: usize| {
-        format!(r#"{{"file":{file},"offset":{offset},"count":{count}}}"#)
-    };
-    let leaf = |fine: String, coarse: String| format!(r#"{{"lods":{{"1":{coarse},"0":{fine}}}}}"#);
-    let tree = format!(
-        r#"{{"children":[{},{}]}}"#,
-        leaf(place(1, 20, 20), place(0, 5, 5)),
-        leaf(place(1, 0, 20), place(0, 0, 5))
-    );
-    let json = format!(
-        r#"{{"lodLevels":2,"filenames":["coarse/meta.json","0/meta.json"],
-        "environment":"sky/meta.json","tree":{tree}}}"#
-    );
-    let mut files = vec![("lod-meta.json".to_owned(), json.into_bytes())];
-    for (folder, count, sh_degree) in [("0", 45, 2), ("sky", 10, 0), ("coarse", 10, 2)] {
-        let part = sog(&gaussians(count, sh_degree, 20.0, 7), 2).into_iter();
-        files.extend(part.map(|(name, bytes)| (format!("{folder}/{name}"), bytes)));
-    }
-    files
 }
 
 #[test]

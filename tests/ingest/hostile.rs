@@ -4,9 +4,9 @@ use wildcity_scene::Gaussians;
 
 use crate::corpus::{COUNT, corpus};
 use crate::format_files::{
-    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, usdz, webp, zip_of,
+    Files, glb, gltf, gzip, ksplat, nurec_plain, sog, splat, spz_plain, spz4, streamed, usdz, webp,
+    zip_of,
 };
-use crate::formats::streamed;
 use crate::refusal;
 use crate::scene_files::gaussians;
 

@@ -28,6 +28,19 @@ fn answers_are_the_golden_ones() {
 }
 
 #[test]
+fn pushes_are_the_golden_ones() {
+    let (asked, answered) = (new_push(), push());
+    check_json("vectors/http/new_push_capture.json", &asked);
+    check_json("vectors/http/push_capture.json", &answered);
+    let text = String::from_utf8(read("vectors/http/new_push_capture.json")).unwrap();
+    assert_eq!(decode::<http::NewPush>(&text).as_ref(), Ok(&asked));
+    let answer = read("vectors/http/push_capture.json");
+    assert_eq!(serde_json::from_slice::<http::Push>(&answer).unwrap(), answered);
+    let wrong = decode::<http::NewPush>(&text.replace("\"capture\"", "\"world\"")).unwrap_err();
+    assert_eq!(wrong.mistake.field.as_deref(), Some("frame"));
+}
+
+#[test]
 fn absent_fields_have_defaults() {
     let open = Request::Open(Box::new(Open { seq: 1, ..Open::twin("street") }));
     let parse = |text: &str| serde_json::from_str::<Request>(text);
@@ -356,6 +369,49 @@ fn requests() -> Vec<(&'static str, Request)> {
         ("resume_also", resume(vec!["run-18".into()])),
         ("step_many", Request::StepMany { seq: 3, steps: many }),
     ]
+}
+
+/// A push of files in the axes of the capture.
+fn new_push() -> http::NewPush {
+    let file = http::PushFile {
+        upload: "blake3-0".into(),
+        axes: "y-down-z-forward".into(),
+        scale: 1.0,
+        name: None,
+    };
+    http::NewPush {
+        id: Some("epoch-30".into()),
+        files: vec![file],
+        frame: Some(http::PushFrame::Capture),
+        base: Some(3),
+        cells: None,
+        record: None,
+        levels: true,
+        profile: Vec::new(),
+        note: Some("epoch 30".into()),
+        preview: http::PreviewRequest::default(),
+    }
+}
+
+/// The answer once it is ready: the base was aligned.
+fn push() -> http::Push {
+    let report = http::PushReport {
+        gaussians: 120_000,
+        frame: Some(http::PushFrame::Capture),
+        aligned: true,
+        cells: vec![http::CellReport { cell: [0, 0], before: 100_000, after: 120_000 }],
+        ..http::PushReport::default()
+    };
+    http::Push {
+        id: "epoch-30".into(),
+        twin: "city".into(),
+        state: http::PushState::Ready,
+        progress: http::Progress { done: 0, total: 0 },
+        version: Some(4),
+        version_hash: Some(blake3::hash(b"a manifest").to_hex().to_string()),
+        report: Some(report),
+        error: None,
+    }
 }
 
 /// Two poses of a drive.

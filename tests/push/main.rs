@@ -16,6 +16,7 @@ mod support;
 
 mod actors;
 mod edits;
+mod frames;
 mod hostile;
 mod metrics;
 mod pushes;

@@ -17,7 +17,8 @@ const EXACT: StorageOptions = StorageOptions { record: RecordFormat::F32, levels
 /// The settings of `street`.
 fn settings() -> VersionSettings {
     let NewVersion { profile, rig, trajectories, sky, geo, provenance, .. } = street(&EMPTY);
-    VersionSettings { profile, rig, trajectories, sky, geo, provenance }
+    let twin_from_capture = None;
+    VersionSettings { profile, rig, trajectories, sky, geo, twin_from_capture, provenance }
 }
 
 static EMPTY: Gaussians = Gaussians {

@@ -151,9 +151,10 @@ fn settings_are_replaced_whole() {
             street(&gaussians(0, 0, 1.0, 0));
         let commit = change(&catalog, [0, 0], 1);
         let id = commit.id().to_owned();
-        let version = commit
-            .replace(None, VersionSettings { profile, rig, trajectories, sky, geo, provenance })
-            .unwrap();
+        let twin_from_capture = None;
+        let settings =
+            VersionSettings { profile, rig, trajectories, sky, geo, twin_from_capture, provenance };
+        let version = commit.replace(None, settings).unwrap();
         assert_eq!(version.manifest.gaussians(), 300);
         assert_eq!(catalog.versions("street").unwrap()[0].commit, Some(id));
     });

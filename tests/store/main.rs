@@ -12,6 +12,7 @@ mod sky_network;
 mod versions;
 
 mod actors;
+mod alignments;
 mod commits;
 mod damage;
 mod everywhere;

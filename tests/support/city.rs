@@ -34,6 +34,7 @@ pub(crate) fn city() -> &'static City {
             trajectories: vec![drive.clone()],
             sky: None,
             geo: None,
+            twin_from_capture: None,
             provenance: Provenance::of("test".into()),
         };
         commit.replace(None, settings).unwrap();

@@ -11,6 +11,8 @@ use std::io::Write;
 use wildcity_scene::{Gaussians, sh};
 
 use gltf_files::unit;
+
+use crate::scene_files::gaussians;
 pub(crate) use gltf_files::{glb, gltf, opacity};
 
 fn byte(value: f64) -> u8 {
@@ -389,4 +391,28 @@ pub(crate) fn usdz(payload: Vec<u8>) -> Vec<u8> {
     let layer = b"#usda 1.0\n".to_vec();
     let files = [("default.usda".to_owned(), layer), ("scene.nurec".to_owned(), gzip(&payload))];
     zip_of(&files, false)
+}
+
+/// Two blocks with two levels: 50 Gaussians, of which the finest level has 20 + 20; and an
+/// environment.
+pub(crate) fn streamed() -> Files {
+    let place = |file: usize, offset: usize, count: usize| {
+        format!(r#"{{"file":{file},"offset":{offset},"count":{count}}}"#)
+    };
+    let leaf = |fine: String, coarse: String| format!(r#"{{"lods":{{"1":{coarse},"0":{fine}}}}}"#);
+    let tree = format!(
+        r#"{{"children":[{},{}]}}"#,
+        leaf(place(1, 20, 20), place(0, 5, 5)),
+        leaf(place(1, 0, 20), place(0, 0, 5))
+    );
+    let json = format!(
+        r#"{{"lodLevels":2,"filenames":["coarse/meta.json","0/meta.json"],
+        "environment":"sky/meta.json","tree":{tree}}}"#
+    );
+    let mut files = vec![("lod-meta.json".to_owned(), json.into_bytes())];
+    for (folder, count, sh_degree) in [("0", 45, 2), ("sky", 10, 0), ("coarse", 10, 2)] {
+        let part = sog(&gaussians(count, sh_degree, 20.0, 7), 2).into_iter();
+        files.extend(part.map(|(name, bytes)| (format!("{folder}/{name}"), bytes)));
+    }
+    files
 }

@@ -86,6 +86,7 @@ pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
     NewPush {
         id: None,
         files: uploads.iter().map(file).collect(),
+        frame: None,
         base: None,
         cells: None,
         record: None,

@@ -29,7 +29,7 @@ const CRATES: &[(&str, &[&str])] = &[
     ("opentelemetry_sdk", &["src/cli/serve/log.rs"]),
     ("tracing_opentelemetry", &["src/cli/serve/log.rs"]),
     ("flate2", &["src/twin/ingest"]),
-    ("zip", &["src/twin/ingest/archive.rs", "src/cli/alpasim"]),
+    ("zip", &["src/twin/ingest/archive.rs", "src/cli/alpasim", "src/cli/packed_folder.rs"]),
     ("image_webp", &["src/twin/ingest/sog"]),
 ];
 

@@ -11,14 +11,17 @@ import socket
 import struct
 import subprocess
 import threading
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import wildcity
-from wildcity import Camera, Pose, PushFailed, PushProgress, Refused, Rig
+from conftest import vector
+from wildcity import Camera, Pose, PushFailed, PushProgress, Refused, Rig, pushing
 from wildcity.http_client import HttpClient
+from wildcity.pushing import upload_all
 
 RIG = Rig("one", (Camera("front", 96, 64, 60.0, 60.0, 48.0, 32.0, Pose((-15, 0, 1.5), (0.5, -0.5, 0.5, -0.5))),))
 TOKEN = "pusher-pusher-pusher"
@@ -102,6 +105,76 @@ def test_a_scene_becomes_a_twin_and_then_another_version(server: str, tmp_path: 
         assert after.metadata.version == 2
         assert after.metadata.frame_hash != before.metadata.frame_hash
     assert wildcity.rollback("street", 1, server=server) == 3
+
+
+def test_the_frame_of_a_push(server: str, tmp_path: Path) -> None:
+    first, second = write_ply(tmp_path / "a.ply", 0.0, 1), write_ply(tmp_path / "b.ply", 0.0, 2)
+    wildcity.push(first, twin="aligned", server=server)
+    never = wildcity.push(first, twin="aligned", server=server, frame="capture")
+    assert (never.version, never.report["frame"], never.report.get("aligned")) == (1, "capture", None)
+    twice = {"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 2}}
+    HttpClient(server, None, 60.0).json("POST", "/v1/twins/aligned/edits", twice)
+    tops = []
+    frames: list[Literal["twin", "capture"] | None] = [None, "twin", "capture"]
+    for frame in frames:
+        pushed = wildcity.push(second, twin="aligned", server=server, frame=frame, cells="all")
+        assert (pushed.report["frame"], pushed.report["aligned"]) == (frame or "twin", True)
+        tops.append(pushed.report["ranges"]["mean_m"][1][2])
+    assert tops[0] == tops[1] == pytest.approx(tops[2] / 2)
+    with pytest.raises(Refused) as refused:
+        wildcity.push(second, twin="aligned", server=server, frame="world")  # type: ignore[arg-type]
+    assert (refused.value.code, refused.value.field) == ("invalid_request", "frame")
+
+
+def test_a_push_in_the_frame_of_the_capture_is_the_golden_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sent: list[dict[str, Any]] = []
+
+    def answer(_: HttpClient, method: str, path: str, body: Any) -> Any:
+        if path == "/v1/uploads":
+            return {"id": "blake3-0", "complete": True}
+        sent.append(body)
+        assert (method, path) == ("POST", "/v1/twins/city/pushes")
+        return vector("http/push_capture.json")
+
+    monkeypatch.setattr(HttpClient, "json_with_retries", answer)
+    path = write_ply(tmp_path / "a.ply", 0.0, 1)
+    pushed = wildcity.push(
+        path, twin="city", axes="y-down-z-forward", frame="capture", base=3, note="epoch 30", push_id="epoch-30"
+    )
+    golden = vector("http/new_push_capture.json")
+    # What is empty may be left out.
+    assert {name: value for name, value in sent[0].items() if value != []} == {
+        name: value for name, value in golden.items() if value != {}
+    }
+    assert (pushed.version, pushed.report["frame"], pushed.report["aligned"]) == (4, "capture", True)
+
+
+def test_the_folder_of_a_sog_is_one_archive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    folder = tmp_path / "street"
+    (folder / "0").mkdir(parents=True)
+    for name in ("lod-meta.json", "0/meta.json", "0/means_l.webp", "video.mp4"):
+        (folder / name).write_text(name)
+    names: list[list[str]] = []
+    archives: list[bytes] = []
+
+    def upload(_: HttpClient, path: Path, __: object) -> str:
+        assert path.name == "street.zip"
+        with zipfile.ZipFile(path) as archive:
+            names.append(archive.namelist())
+            assert archive.read("0/means_l.webp") == b"0/means_l.webp"
+        archives.append(path.read_bytes())
+        return "blake3-0"
+
+    monkeypatch.setattr(pushing, "_upload", upload)
+    client = HttpClient("http://127.0.0.1:1", None, 1.0)
+    wanted = [{"upload": "blake3-0", "axes": "identity", "scale": 1.0}]
+    for path in (folder, folder / "lod-meta.json"):
+        os.utime(folder / "0" / "meta.json", (0, len(names)))
+        assert upload_all(client, [path], "identity", 1.0, lambda _: None) == wanted
+    assert names == [["0/means_l.webp", "0/meta.json", "lod-meta.json"]] * 2 and archives[0] == archives[1]
+    (folder / "lod-meta.json").unlink()
+    with pytest.raises(ValueError, match=r"is a folder without lod-meta\.json or meta\.json"):
+        upload_all(client, [folder], "identity", 1.0, lambda _: None)
 
 
 def test_refusals_raise_typed_errors(server: str, tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ async fn main() -> anyhow::Result<()> {
             scale: 1.0,
             name: None,
         }],
+        frame: None,
         base: None,
         cells: None,
         record: None,

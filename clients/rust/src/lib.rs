@@ -51,8 +51,8 @@ pub use options::ConnectOptions;
 pub use wildcity_protocol as protocol;
 pub use wildcity_protocol::http::{
     ActorAsset, ActorBox, ActorClass, ActorLevel, ActorList, ActorProvenance, AllCells, CellReport,
-    CellSelection, DamagedActor, NewActor, NewPush, PreviewRequest, Push, PushFile, PushReport,
-    PushState, Upload,
+    CellSelection, DamagedActor, NewActor, NewPush, PreviewRequest, Push, PushFile, PushFrame,
+    PushReport, PushState, Upload,
 };
 pub use wildcity_protocol::message::{
     Action, BranchPoint, Drive, DrivePose, DriveSection, Dynamics, DynamicsChoice, DynamicsModel,

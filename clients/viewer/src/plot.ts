@@ -1,4 +1,4 @@
-// Where the time of each step went: one stacked bar per observation.
+// Where the time of each step went: one stacked bar per step. The legend has the mean of each stage.
 
 import { Drawing, colour, el, fixed } from "./dom";
 import type { Metadata } from "./protocol";
@@ -47,7 +47,7 @@ export class StagePlot {
       const ms = this.bars.reduce((sum, bar) => sum + (bar.parts.find((part) => part.name === name)?.ms ?? 0), 0);
       return { name, ms: ms / this.bars.length };
     });
-    this.legend.replaceChildren(...means.filter(({ ms }) => ms >= 0.05).map(({ name, ms }) => {
+    this.legend.replaceChildren(el("span", {}, "mean ms"), ...means.filter(({ ms }) => ms >= 0.05).map(({ name, ms }) => {
       const swatch = el("i");
       swatch.style.background = this.colourOf(name);
       return el("span", { title: `mean of the last ${this.bars.length} steps` }, swatch, `${name} `, el("b", {}, fixed(ms, ms < 9.95 ? 1 : 0)));
@@ -71,6 +71,6 @@ export class StagePlot {
     context.fillStyle = colour("dim");
     context.font = `11px ${colour("font")}`;
     const median = sorted[Math.floor(sorted.length / 2)];
-    if (median !== undefined) context.fillText(`median ${fixed(median, median < 9.95 ? 1 : 0)} ms`, 6, 13);
+    if (median !== undefined) context.fillText(`a bar is a step; their median is ${fixed(median, median < 9.95 ? 1 : 0)} ms`, 6, 13);
   }
 }

@@ -60,6 +60,9 @@ pub struct NewPush {
     /// The scene files, which are merged into one scene.
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 256)))]
     pub files: Vec<PushFile>,
+    /// The frame of the files, after their axes and scale, and of `golden.poses`. If absent, that of the twin.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame: Option<PushFrame>,
     /// The version that the push is based on. If absent, the latest.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub base: Option<u64>,
@@ -112,6 +115,18 @@ pub struct PushFile {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(length(min = 1, max = 1_024)))]
     pub name: Option<String>,
+}
+
+/// The frame of a push.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum PushFrame {
+    /// The axes and metres of the base version.
+    Twin,
+    /// The axes and the unit with which the capture was imported, before the twin was aligned. Those of the twin if it
+    /// never was.
+    Capture,
 }
 
 /// The cells that a push replaces.
@@ -238,6 +253,12 @@ pub struct PushReport {
     pub left_out: u64,
     /// Degree of the spherical harmonics.
     pub sh_degree: u8,
+    /// The frame that the files were taken to be in. Older servers do not say it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub frame: Option<PushFrame>,
+    /// Whether the base version was aligned: the frame of the capture is then another one than that of the twin.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub aligned: bool,
     /// Smallest and largest values over all Gaussians. Absent if there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ranges: Option<Ranges>,

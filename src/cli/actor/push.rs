@@ -5,14 +5,14 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 
-use wildcity_client::{ActorAsset, ActorBox, ActorClass, HttpClient, NewActor, PushFile};
+use wildcity_client::{ActorAsset, ActorBox, ActorClass, HttpClient, NewActor};
 use wildcity_push::AssetSettings;
 use wildcity_scene::ActorClass as Class;
 
 use super::asset_options::AssetOptions;
 use super::summary::Summary;
 use crate::cli::progress;
-use crate::cli::push::{Server, name_beside, upload};
+use crate::cli::push::{Server, upload_all};
 
 /// Make an asset on a running server from files of this machine, as `wildcity actor import` does on the server's own.
 ///
@@ -58,12 +58,7 @@ impl Push {
         settings: AssetSettings,
     ) -> anyhow::Result<ActorAsset> {
         let AssetOptions { axes, scale, .. } = &self.options;
-        let mut files = Vec::with_capacity(self.files.len());
-        for path in &self.files {
-            let upload = upload(client, path).await?;
-            let name = name_beside(&self.files, path);
-            files.push(PushFile { upload, axes: axes.clone(), scale: *scale, name });
-        }
+        let files = upload_all(client, &self.files, axes, *scale).await?;
         let AssetSettings { name, class, mesh_gaussians, record } = settings;
         let asked = NewActor {
             class: match class {

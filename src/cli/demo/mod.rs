@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
+use anyhow::Context as _;
 use clap::ValueEnum as _;
 use glam::DMat3;
 use serde_json::json;
@@ -131,11 +132,14 @@ impl Demo {
         if self.off_trajectory.is_some() {
             demo_twin(&twins, SPOILED_TWIN, StorageOptions::default(), Some(SPOILED_BY))?;
         }
+        // Uploads are needed until they are pushed, and the viewer of --view pushes some.
+        let uploads = tempfile::Builder::new().prefix(".uploads").tempdir_in(&self.out);
+        let uploads = uploads.with_context(|| format!("cannot write to {}", self.out.display()))?;
         let directories = Directories {
             twins,
             episodes: self.out.join("episodes"),
             scenarios: self.out.join("scenarios"),
-            uploads: self.out.join("uploads"),
+            uploads: uploads.path().to_owned(),
         };
         let config = Config {
             cache: self.twins.cache(),

@@ -109,6 +109,7 @@ impl Generate {
             trajectories: vec![drive],
             sky: None,
             geo: None,
+            twin_from_capture: None,
             provenance: Provenance::of(format!(
                 "city {}: {}{}",
                 wildcity_generate::REVISION,
@@ -128,11 +129,11 @@ impl Generate {
         let stored_bytes = manifest.stored_bytes();
         writeln!(
             std::io::stdout().lock(),
-            "twin {} version {}: {count} Gaussians in {} chunks, {:.2} GiB, {:.1} bytes each; \
+            "twin {} version {}: {count} Gaussians in {}, {:.2} GiB, {:.1} bytes each; \
              {seconds:.0} s, {:.0} Gaussians/s\nblake3 {}",
             self.twin,
             version.number,
-            manifest.chunks.len(),
+            output::counted(manifest.chunks.len(), "chunk"),
             stored_bytes as f64 / f64::from(1 << 30),
             stored_bytes as f64 / count as f64,
             count as f64 / seconds,

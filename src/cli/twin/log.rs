@@ -1,12 +1,14 @@
 //! `wildcity twin log`.
 
+use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 use crate::cli::time::utc;
-use wildcity_twin::store::{CommitKind, LogEntry};
+use wildcity_scene::manifest::Provenance;
+use wildcity_twin::store::{CommitKind, LogEntry, StoreError};
 
-/// Show all versions of a twin, oldest first: when and how each was made, and from which version.
+/// Show all versions of a twin, oldest first: when and how each was made, from which version, and the note of its push.
 #[derive(Debug, clap::Args)]
 #[command(
     after_long_help = "Examples:\n  wildcity twin log street\n  wildcity twin log street --json | jq .created_us"
@@ -19,7 +21,7 @@ pub(super) struct Log {
     #[command(flatten)]
     twins: Twins,
 
-    /// Print one JSON object per line: number, hash, created_us, kind, parent, commit.
+    /// Print one JSON object per line: number, hash, created_us, kind, parent, commit, note.
     #[arg(long)]
     json: bool,
 }
@@ -27,12 +29,20 @@ pub(super) struct Log {
 impl Log {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
-        for entry in self.twins.catalog()?.versions(&self.twin)? {
+        let catalog = self.twins.catalog()?;
+        let mut provenances: BTreeMap<u64, Provenance> = BTreeMap::new();
+        for entry in catalog.versions(&self.twin)? {
+            match catalog.provenance(&self.twin, &entry) {
+                Ok(provenance) => drop(provenances.insert(entry.number, provenance)),
+                Err(StoreError::GarbageCollected { .. }) => {}
+                Err(error) => writeln!(io::stderr(), "version {}: no note: {error}", entry.number)?,
+            }
+            let note = own_note(&provenances, &entry);
             let LogEntry { number, hash, created_us, commit, parent, kind } = entry;
             if self.json {
                 let line = serde_json::json!({
                     "number": number, "hash": hash, "created_us": created_us, "kind": kind,
-                    "parent": parent, "commit": commit,
+                    "parent": parent, "commit": commit, "note": note,
                 });
                 writeln!(out, "{line}")?;
             } else {
@@ -41,9 +51,22 @@ impl Log {
                 let edited = kind == CommitKind::Import && parent.is_some();
                 let how = if edited { format!("edit{from}") } else { format!("{kind}{from}") };
                 let when = utc(created_us);
-                writeln!(out, "{number:>6}  {when}  {how:<16}  {hash}")?;
+                // A note may have lines; a version has one.
+                let note = note.map(|note| format!("  {}", note.replace(char::is_control, " ")));
+                let note = note.unwrap_or_default();
+                writeln!(out, "{number:>6}  {when}  {how:<16}  {hash}{note}")?;
             }
         }
         Ok(())
     }
+}
+
+/// The note of a version, if it is its own: an edit has the provenance of its base, with the base's note.
+fn own_note<'a>(provenances: &'a BTreeMap<u64, Provenance>, entry: &LogEntry) -> Option<&'a str> {
+    let provenance = provenances.get(&entry.number)?;
+    let note = provenance.note()?;
+    let base = entry.parent.and_then(|parent| provenances.get(&parent));
+    let is_inherited = entry.kind != CommitKind::Rollback
+        && base.is_some_and(|base| base.source == provenance.source && base.note() == Some(note));
+    (!is_inherited).then_some(note)
 }

@@ -338,6 +338,7 @@ fn of_store(error: &StoreError) -> WireFault {
         | StoreError::Clamped { .. }
         | StoreError::Profile(_)
         | StoreError::FieldMismatch { .. }
+        | StoreError::Alignment(_)
         | StoreError::Scattered { .. }
         | StoreError::ManifestSize { .. }
         | StoreError::ViewSize { .. }

@@ -14,7 +14,7 @@ use crate::spool::{Announced, Upload};
 use wildcity_episode::{EpisodeFile, Listed};
 use wildcity_protocol::http;
 use wildcity_push::{
-    CellChange, CellSelection, DriveRequest, EditRequest, FileReport, PushError, PushReport,
+    CellChange, CellSelection, DriveRequest, EditRequest, FileReport, Frame, PushError, PushReport,
     PushRequest, PushedVersion, RequestedFile, SourceAxes, State, Status, Survey,
 };
 use wildcity_scene::Rig;
@@ -61,7 +61,8 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
     let body: http::NewPush = read_body(body)?;
     // The hash is computed from the parsed body, so that white space does not make it a different push.
     let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
-    let http::NewPush { id, files, base, cells, record, levels, profile, note, preview } = body;
+    let http::NewPush { id, files, frame, base, cells, record, levels, profile, note, preview } =
+        body;
     let preview_poses = preview
         .poses
         .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES));
@@ -70,6 +71,10 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         twin,
         request_hash,
         files: requested_files(files)?,
+        frame: match frame {
+            None | Some(http::PushFrame::Twin) => Frame::Twin,
+            Some(http::PushFrame::Capture) => Frame::Capture,
+        },
         base,
         cells: match cells {
             None => CellSelection::Touched,
@@ -156,6 +161,11 @@ fn report(report: &PushReport) -> http::PushReport {
         gaussians: report.gaussians,
         left_out: report.left_out,
         sh_degree: report.sh_degree,
+        frame: Some(match report.frame {
+            Frame::Twin => http::PushFrame::Twin,
+            Frame::Capture => http::PushFrame::Capture,
+        }),
+        aligned: report.is_aligned,
         ranges: report.ranges.map(|ranges| http::Ranges {
             mean_m: ranges.mean_m,
             scale_m: ranges.scale_m,

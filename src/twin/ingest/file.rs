@@ -25,8 +25,8 @@ pub enum FileError {
     OutsideFolder,
     /// A scene of a push names it, and the push has none or several files of this name.
     #[error(
-        "is not the name of exactly one file of this push; push it together with the file that names it, or a \
-         streamed SOG as one .zip"
+        "is not the name of exactly one file of this push; push it together with the file that names it, or all of a \
+         SOG as one .zip"
     )]
     NotListed,
     /// The scene names it again.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use crate::limits;
-use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_scene::manifest::{ChunkEntry, Provenance, Section};
 use wildcity_scene::rig::is_name;
 use wildcity_scene::{Chunk, Manifest, PagePool, sh};
 
@@ -237,6 +237,15 @@ impl Catalog {
         self.numbers(name)?.into_iter().map(entry).collect()
     }
 
+    /// Where a version of the log comes from, from its manifest alone.
+    ///
+    /// # Errors
+    /// As [`Catalog::version`].
+    pub fn provenance(&self, name: &str, entry: &LogEntry) -> Result<Provenance, StoreError> {
+        self.check_not_collected(name, entry.number)?;
+        Ok(self.manifest(name, &entry.hash)?.provenance)
+    }
+
     /// Reads one section of a chunk, compares it with its hash, and decodes it. Nothing else of the
     /// chunk is read.
     ///
@@ -357,6 +366,9 @@ impl Catalog {
         }
         if manifest.sh_degree > sh::MAX_DEGREE {
             return Err(damaged(format!("SH degree is {}, not 0 to 3", manifest.sh_degree)));
+        }
+        if let Some(alignment) = manifest.twin_from_capture {
+            alignment.check().map_err(|error| damaged(format!("its alignment: {error}")))?;
         }
         let objects = manifest.chunks.iter().map(|chunk| &chunk.object);
         let sky = manifest.sky.iter().map(|sky| &sky.object);

@@ -239,7 +239,8 @@ impl Commit {
 
     /// A manifest with the cells that were put, and no others. Its table is not written yet.
     fn new_manifest(&mut self, settings: VersionSettings) -> Result<Manifest, StoreError> {
-        let VersionSettings { profile, rig, trajectories, sky, geo, provenance } = settings;
+        let VersionSettings { profile, rig, trajectories, sky, geo, twin_from_capture, provenance } =
+            settings;
         Ok(Manifest {
             format: Manifest::FORMAT,
             twin: self.name.clone(),
@@ -253,6 +254,7 @@ impl Commit {
             sky: sky.map(|sky| sky.put(&mut *self.staging)).transpose()?,
             views: self.views.clone().flatten(),
             geo,
+            twin_from_capture,
             provenance,
         })
     }
@@ -275,6 +277,8 @@ impl Commit {
         manifest.rig = rig.or(manifest.rig);
         manifest.trajectories = trajectories.unwrap_or(manifest.trajectories);
         manifest.geo = geo.unwrap_or(manifest.geo);
+        // Before the provenance is replaced, which may be the only place that has it.
+        manifest.twin_from_capture = manifest.alignment()?;
         manifest.provenance = provenance;
         let own = manifest.chunks.into_iter().map(|chunk| ([chunk.cell[1], chunk.cell[0]], chunk));
         let mut chunks: BTreeMap<_, _> = own.collect();
@@ -285,7 +289,7 @@ impl Commit {
 
     /// Checks that the `new` manifest reverts nothing that other commits changed from the base to the
     /// latest version. The same change on both sides is not a conflict; the other one may be this commit's
-    /// own first attempt.
+    /// own first attempt. If others aligned the twin, every change is one: it was made for the old axes.
     fn check_overlap(
         &self,
         base: &Version,
@@ -297,8 +301,11 @@ impl Commit {
         let changed: BTreeSet<_> = ours.cells.iter().map(|differs| differs.cell).collect();
         let cells = theirs.cells.iter().map(|differs| differs.cell);
         let cells: Vec<_> = cells.filter(|cell| changed.contains(cell)).collect();
+        let changes_any = !ours.cells.is_empty() || !ours.settings.is_empty();
         let mut settings = theirs.settings;
-        settings.retain(|field| ours.settings.contains(field));
+        settings.retain(|&field| {
+            ours.settings.contains(&field) || (field == Diff::ALIGNMENT && changes_any)
+        });
         if cells.is_empty() && settings.is_empty() {
             return Ok(());
         }

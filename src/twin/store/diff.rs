@@ -15,7 +15,7 @@ pub struct Diff {
     /// Number of cells that are the same in both.
     pub kept: u64,
     /// Fields of the manifest that differ, among `profile`, `sh_degree`, `record`, `rig`,
-    /// `trajectories`, `sky`, `geo`.
+    /// `trajectories`, `sky`, `views`, `geo`, `alignment`.
     pub settings: Vec<&'static str>,
 }
 
@@ -53,6 +53,9 @@ impl Catalog {
 }
 
 impl Diff {
+    /// The setting that differs if one version is in other axes than the other.
+    pub(super) const ALIGNMENT: &str = "alignment";
+
     /// The differences between two manifests.
     pub fn between(before: &Manifest, after: &Manifest) -> Self {
         let mut cells: BTreeMap<_, [Option<&ChunkEntry>; 2]> = BTreeMap::new();
@@ -80,6 +83,7 @@ impl Diff {
             ("sky", before.sky != after.sky),
             ("views", before.views != after.views),
             ("geo", before.geo != after.geo),
+            (Self::ALIGNMENT, before.twin_from_capture != after.twin_from_capture),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
         Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }

@@ -29,11 +29,13 @@ impl Catalog {
     /// Makes a version with the Gaussians of another one in other axes and another unit, and with other drives.
     ///
     /// The rig stays as it is, since it is in metres of the vehicle, and so does the profile. A place on the earth is
-    /// of the old axes, and is dropped if they change. All Gaussians are in memory at once. `progress` gets the number
-    /// of Gaussians written and in all.
+    /// of the old axes, and is dropped if they change. The version remembers the alignment, with earlier ones, as the
+    /// way from its capture. All Gaussians are in memory at once. `progress` gets the number of Gaussians written and
+    /// in all.
     ///
     /// # Errors
-    /// The base cannot be read; what the edit makes is out of a twin's bounds; others changed the twin since the base
+    /// The base cannot be read; what the edit makes is out of a twin's bounds, or all alignments together are out of
+    /// theirs; others changed the twin since the base
     /// ([`StoreError::Overlap`]); or as a commit.
     pub fn edit(
         &self,
@@ -62,6 +64,9 @@ impl Catalog {
             return commit.change(base.number, change);
         }
 
+        let before = manifest.alignment()?;
+        let twin_from_capture = before.map_or(alignment, |before| alignment.after(&before));
+        twin_from_capture.check()?;
         let mut gaussians = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
         self.visit_full_detail(base, &|_| true, &mut |section| gaussians.append(&section))?;
         alignment.apply(&mut gaussians);
@@ -72,6 +77,7 @@ impl Catalog {
             trajectories,
             sky: manifest.sky.as_ref().map(|sky| NewSky::Kept(turned(sky, &alignment))),
             geo: None,
+            twin_from_capture: Some(twin_from_capture),
             provenance,
         };
         if manifest.views.is_some() {

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::ingest::IngestError;
 use crate::limits;
 use wildcity_scene::RecordFormat;
+use wildcity_scene::align::AlignmentError;
 use wildcity_scene::geo::GeoError;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::rig::RigError;
@@ -281,6 +282,9 @@ pub enum StoreError {
     /// The place of the world on the earth is invalid.
     #[error(transparent)]
     Geo(#[from] GeoError),
+    /// The alignment of a version cannot be used.
+    #[error("the alignment of the twin with its capture: {0}")]
+    Alignment(#[from] AlignmentError),
     /// A trajectory of a commit cannot be used.
     #[error(transparent)]
     Trajectory(#[from] TrajectoryError),

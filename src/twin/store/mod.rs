@@ -27,8 +27,8 @@
 //!
 //! **On conflict, the commit reads the winning record.** Its own record means that the answer to an
 //! earlier attempt was lost: the commit succeeded. Changes to other cells mean that the commit is
-//! rebased on the winner. Changes to the same cells are an error that names them
-//! ([`StoreError::Overlap`]).
+//! rebased on the winner. Changes to the same cells, or an alignment to other axes, are an error that
+//! names them ([`StoreError::Overlap`]).
 //!
 //! **The log record, and not the manifest, stores when and how a version was made.** So a version's hash is a
 //! hash of its content, and a rollback is a new record with an old hash.

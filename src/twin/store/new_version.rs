@@ -75,7 +75,15 @@ impl Catalog {
         } = new;
         check_name(name)?;
         validate::check(gaussians, &Field::twin_name).map_err(IngestError::from)?;
-        let settings = VersionSettings { profile, rig, trajectories, sky, geo, provenance };
+        let settings = VersionSettings {
+            profile,
+            rig,
+            trajectories,
+            sky,
+            geo,
+            twin_from_capture: None,
+            provenance,
+        };
         settings.check()?;
         let mut commit = self.begin(name, CommitKind::Import, storage)?;
         commit.put(gaussians, None, progress)?;

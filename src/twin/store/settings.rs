@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use wildcity_scene::align::Alignment;
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RenderProfile, Rig, Trajectory};
@@ -22,6 +23,8 @@ pub struct VersionSettings {
     pub sky: Option<NewSky>,
     /// Where the world lies on the earth.
     pub geo: Option<GeoAnchor>,
+    /// From the axes and the unit of the capture to the twin's, if they differ.
+    pub twin_from_capture: Option<Alignment>,
     /// Where it comes from.
     pub provenance: Provenance,
 }

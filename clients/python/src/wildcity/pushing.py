@@ -14,6 +14,7 @@ from typing import Any, BinaryIO, Literal
 
 from .errors import Code, ConnectFailed, PushFailed, Refused
 from .http_client import ATTEMPTS, RETRY_DELAY_S, HttpClient
+from .packing import packed
 from .protocol import Drive, decode
 
 CHUNK_BYTES = 1 << 20
@@ -62,6 +63,7 @@ def push(
     token: str | None = None,
     axes: str = "identity",
     scale: float = 1.0,
+    frame: Literal["twin", "capture"] | None = None,
     cells: Literal["all"] | Sequence[tuple[int, int]] | None = None,
     base: int | None = None,
     record: Literal["f32", "h52", "q32", "q24"] | None = None,
@@ -75,11 +77,14 @@ def push(
 ) -> Push:
     """Uploads scene files, makes them the next version of a twin, and returns when that version is ready.
 
-    files: one or more files, which are merged into one scene.
+    files: one or more files, which are merged into one scene; or a folder with a SOG, or its `meta.json` or
+        `lod-meta.json` alone.
     twin: name of the twin; it is created if it does not exist.
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
     axes, scale: axis convention and metres per unit of the files, as in `wildcity import`.
+    frame: "twin", which is the default, or "capture": the axes and the unit with which the capture was imported, before
+        `wildcity twin align`. `report["frame"]` is the one that was taken; `report["aligned"]` says whether they differ.
     cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.
     base: the version that the scene was trained from; cells that changed since then are not overwritten.
     record, levels, profile, note: storage format, levels of detail, changes of the render profile as
@@ -106,7 +111,7 @@ def push(
     if min_psnr_db is not None:
         request["golden"] = {"min_psnr_db": min_psnr_db}
     cells = cells if cells is None or isinstance(cells, str) else [(x, y) for x, y in cells]
-    optional = {"cells": cells, "base": base, "record": record, "note": note}
+    optional = {"frame": frame, "cells": cells, "base": base, "record": record, "note": note}
     request |= {name: value for name, value in optional.items() if value is not None}
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
     # The request has an id, so the server carries it out once even if it is repeated after a lost answer.
@@ -193,14 +198,18 @@ def upload_all(
     report: Callable[[PushProgress], None],
 ) -> list[dict[str, Any]]:
     """Uploads files, and returns them as a request has them. A file in a folder beside the first one is named with
-    that folder, as the first one names it."""
+    that folder, as the first one names it. A folder with a SOG is one archive."""
     files: list[dict[str, Any]] = []
     for path in map(Path, paths):
-        file = {"upload": _upload(http_client, path, report), "axes": axes, "scale": scale}
+        with packed(path, is_only=len(paths) == 1) as sent:
+            upload = _upload(http_client, sent, report)
+        file = {"upload": upload, "axes": axes, "scale": scale}
+        files.append(file)
+        if sent != path:
+            continue
         folder = Path(paths[0]).parent
         if path.is_relative_to(folder) and path.parent != folder:
             file["name"] = path.relative_to(folder).as_posix()
-        files.append(file)
     return files
 
 

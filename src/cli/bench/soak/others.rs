@@ -91,6 +91,7 @@ impl Pusher {
             let push = NewPush {
                 id: None,
                 files: vec![file],
+                frame: None,
                 base: None,
                 cells: None,
                 record: None,

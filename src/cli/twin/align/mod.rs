@@ -22,7 +22,8 @@ use crate::cli::{output, progress};
 /// Without --apply nothing changes: the command prints the ground that it found, and draws the twin before and after,
 /// with the ground as a grid. Look at the picture, then run the command again with --apply: that makes a new version,
 /// with the drives and the sky of the old one in the new axes. The twin's place on the earth is dropped, because it
-/// was that of the old axes. Open sessions keep the version that they have.
+/// was that of the old axes. Open sessions keep the version that they have. The version remembers the change:
+/// `wildcity push --frame capture` pushes files that are still in the axes of the capture.
 ///
 /// The ground is the plane with most of the scene on it and little of it below. The same twin gives the same plane.
 /// All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH degree 3, and as much for the picture.
