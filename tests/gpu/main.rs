@@ -24,6 +24,7 @@ mod truths;
 mod vectors;
 
 mod actors;
+mod automatic;
 mod cameras;
 mod definition;
 mod determinism;
