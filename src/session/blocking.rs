@@ -18,9 +18,9 @@ pub(crate) async fn run_blocking<T: Send + 'static>(
         .map_err(|_| SessionError::Crashed)
 }
 
-/// Runs `work` on this thread: for work of microseconds that may have to wait for a disk. Two changes of threads would take
-/// longer than the work does. If it does wait, another thread takes over the other tasks of this one; only a runtime of a single
-/// thread has none.
+/// Runs `work` on this thread: for work of microseconds that may have to wait for a disk. Two changes of threads would
+/// take longer than the work does. If it does wait, another thread takes over the other tasks of this one; only a
+/// runtime of a single thread has none.
 pub(crate) fn run_in_place<T>(work: impl FnOnce() -> T) -> T {
     match Handle::current().runtime_flavor() {
         RuntimeFlavor::CurrentThread => work(),
