@@ -151,6 +151,10 @@ pub const LEASE: Duration = Duration::from_secs(900);
 /// Time between two renewals of a lease. Two in a row may fail before the lease ends.
 pub const LEASE_RENEWAL: Duration = Duration::from_secs(300);
 
+/// Distances from a viewpoint to a block that a frame computes on the thread of its session, to find the sections that
+/// it draws: 0.1 ms. More of them, as in a city, are computed on another thread.
+pub const DEMAND_IN_PLACE: usize = 1 << 14;
+
 /// Shortest and longest time that prefetching looks ahead. Between them it is three times the 99th
 /// percentile of the load times. 1 s, for a local disk, is 30 m at 30 m/s; 5 s cover a slow remote store.
 pub const PREFETCH_AHEAD: (Duration, Duration) = (Duration::from_secs(1), Duration::from_secs(5));

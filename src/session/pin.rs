@@ -10,6 +10,7 @@ use wildcity_twin::residency::{PinnedScene, Resident, Viewpoint};
 
 use crate::blocking::run_blocking;
 use crate::error::SessionError;
+use crate::limits;
 
 /// Waits until all sections that a frame needs are in memory, and pins them.
 ///
@@ -22,15 +23,20 @@ pub(crate) async fn pin(
     viewpoints: Vec<Viewpoint>,
 ) -> Result<PinnedScene, SessionError> {
     let (reply, answer) = oneshot::channel();
-    let request = run_blocking(move || {
+    let is_small = resident.blocks() * viewpoints.len() <= limits::DEMAND_IN_PLACE;
+    let request = move || {
         let done = Box::new(move |pinned| {
             // Sending fails if the deadline has passed and the receiver is gone.
             let _ = reply.send(pinned);
         });
         resident.request(&viewpoints, &profile, done)
-    });
+    };
+    // Reads nothing, and takes less time than to wake another thread unless the twin is large.
     // Dropping the request takes the frame out of the pager's queue.
-    let request = request.await??;
+    let request = match is_small {
+        true => request()?,
+        false => run_blocking(request).await??,
+    };
     match timeout_at(deadline, answer).await {
         Ok(Ok(pinned)) => Ok(pinned?),
         Ok(Err(_)) => Err(SessionError::Crashed),

@@ -98,11 +98,15 @@ impl BlockIndex {
     ) -> Vec<SectionRef> {
         let focal_px = longest_focal_px(viewpoints);
         let distance_m = |bounds: &Bounds| {
-            let from = |viewpoint: &Viewpoint| bounds.distance_m(viewpoint.position_m);
-            viewpoints.iter().map(from).fold(f64::INFINITY, f64::min)
+            // Square roots round monotonically, so that one of the least square gives the least distance.
+            let squared_m2 = |viewpoint: &Viewpoint| {
+                let at_m = viewpoint.position_m;
+                at_m.clamp(bounds.min_m, bounds.max_m).distance_squared(at_m)
+            };
+            viewpoints.iter().map(squared_m2).fold(f64::INFINITY, f64::min).sqrt()
         };
         let mut sections = Vec::new();
-        self.visit(profile.reach_m, &distance_m, &mut |block, distance_m| {
+        self.visit(profile.reach_m, distance_m, |block, distance_m| {
             let levels = block.levels(manifest);
             let level = coarsest_level(levels, focal_px, distance_m, profile.tau_px);
             sections.push(block.section_ref(level));
@@ -118,8 +122,8 @@ impl BlockIndex {
     pub(super) fn visit(
         &self,
         reach_m: Option<f64>,
-        distance_m: &dyn Fn(&Bounds) -> f64,
-        see: &mut dyn FnMut(&Block, f64),
+        distance_m: impl Fn(&Bounds) -> f64,
+        mut see: impl FnMut(&Block, f64),
     ) {
         let is_near = |bounds: &Bounds| reach_m.is_none_or(|reach_m| distance_m(bounds) <= reach_m);
         let groups = self.groups.iter().filter(|group| is_near(&group.bounds));
@@ -133,6 +137,11 @@ impl BlockIndex {
                 see(block, distance_m);
             }
         }
+    }
+
+    /// Number of blocks.
+    pub(super) fn blocks(&self) -> usize {
+        self.blocks.len()
     }
 
     /// Bounding box of the whole version.

@@ -1,6 +1,5 @@
 //! A session's share of the memory, and what it prefetches.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use parking_lot::Mutex;
@@ -118,10 +117,10 @@ impl Prefetcher {
     pub fn prefetch(&self, places: &[(Urgency, Vec<Viewpoint>)], profile: &RenderProfile) {
         let mut sections: Vec<SectionRef> = Vec::new();
         let mut urgencies: Vec<Urgency> = Vec::new();
-        let mut seen = BTreeSet::new();
+        let mut seen = vec![false; self.resident.sections()];
         for (urgency, viewpoints) in places {
             for section in self.resident.demand(viewpoints, profile) {
-                if seen.insert(section) {
+                if !std::mem::replace(&mut seen[self.resident.position(section)], true) {
                     sections.push(section);
                     urgencies.push(*urgency);
                 }

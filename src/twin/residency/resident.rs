@@ -176,6 +176,11 @@ impl Resident {
         self.sky.as_ref()
     }
 
+    /// Number of its blocks.
+    pub fn blocks(&self) -> usize {
+        self.index.blocks()
+    }
+
     /// Memory that all levels of the whole version would take, in bytes.
     pub fn total_bytes(&self) -> u64 {
         self.total_bytes
@@ -197,8 +202,18 @@ impl Resident {
         self.shared.pager.load_times().quantile(0.99)
     }
 
+    /// Number of its sections.
+    pub(super) fn sections(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Which of all sections it is, chunk by chunk.
+    pub(super) fn position(&self, section: SectionRef) -> usize {
+        self.first[section.chunk] + section.section
+    }
+
     pub(super) fn requested(&self, sections: Vec<SectionRef>) -> RequestedSections {
-        let id = |section: &SectionRef| self.ids[self.first[section.chunk] + section.section];
+        let id = |&section: &SectionRef| self.ids[self.position(section)];
         RequestedSections {
             version: self.version.clone(),
             sky: self.sky.clone(),

@@ -39,7 +39,7 @@ pub(super) fn worst_case_bytes(
     let bound = |area: Bounds| {
         let mut bytes = 0;
         let distance_m = |bounds: &Bounds| (gap_m(&area, bounds) - extent.radius_m).max(0.0);
-        index.visit(profile.reach_m, &distance_m, &mut |block, distance_m| {
+        index.visit(profile.reach_m, distance_m, |block, distance_m| {
             let levels = block.levels(manifest);
             let level = coarsest_level(levels, extent.focal_px, distance_m, profile.tau_px);
             bytes += Chunk::bytes_of(manifest.sh_degree, levels[level].count.into());

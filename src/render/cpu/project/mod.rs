@@ -31,6 +31,7 @@ use std::ops::Range;
 
 use fearless_simd::{Level, dispatch, prelude::*};
 use parking_lot::Mutex;
+use prefetch_index::prefetch_index;
 use rayon::prelude::*;
 
 use self::light::Light;
@@ -41,10 +42,14 @@ use crate::layout::{ChunkShadow, ChunkView, Cutoffs, Frustum, Splat};
 use crate::unscented::UnscentedView;
 use crate::{FIRST_ACTOR_INSTANCE, Frame, TWIN_INSTANCE, View};
 use wildcity_scene::Chunk;
-use wildcity_scene::chunk::{CLUSTER, Cluster, LANES};
+use wildcity_scene::chunk::{CLUSTER, Cluster, LANES, Lanes};
 
 /// Clusters of a unit: 4,096 Gaussians take about 100 µs, long enough to outweigh scheduling them.
 const UNIT_CLUSTERS: usize = 16;
+
+/// How many blocks ahead memory is read. The loads of the block itself would come too late: the processor cannot see
+/// past the computations of one block to the loads of the next.
+const AHEAD: usize = 2;
 
 /// Splats of a page.
 const PAGE: usize = 1 << PAGE_BITS;
@@ -358,6 +363,14 @@ fn add_jobs<'a>(
     jobs.extend(ranges.filter(visible).map(job));
 }
 
+/// Begins to read a block from memory.
+#[inline(always)]
+fn prefetch(columns: &[Lanes]) {
+    for column in 0..columns.len() {
+        prefetch_index(columns, column);
+    }
+}
+
 /// Projects the visible clusters of a job, one block of 16 Gaussians after the other.
 #[inline(always)]
 fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut Vec<Splat>) {
@@ -369,6 +382,8 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
         let light = job.light.on(cluster);
         let first = k * CLUSTER / LANES;
         for block in first..(first + CLUSTER / LANES).min(blocks) {
+            let ahead = (block + AHEAD).min(blocks - 1);
+            prefetch(job.chunk.lane_group(ahead));
             let columns = job.chunk.lane_group(block);
             let degree = job.chunk.sh_degree();
             let projected = match &job.projection {
