@@ -241,7 +241,7 @@ impl<'a> Slabs<'a> {
 
     /// The last slab had too many splats.
     fn halve(&mut self, cut: &Cut) {
-        self.gaussians = 0.5 * self.gaussians;
+        self.gaussians *= 0.5;
         if let Some([near, far]) = cut.halves() {
             self.halves.extend([far, near]);
         }
