@@ -128,6 +128,8 @@ pub struct FrameStats {
     pub instances: u64,
     /// Number of Gaussian-pixel evaluations of the rasterizer, with those of idle lanes.
     pub evaluations: u64,
+    /// The most that was held in the machine's memory between two stages, in bytes. 0 if the backend does not count it.
+    pub held_bytes: u64,
 }
 
 /// Why a frame was not rendered. Its targets may have been written in part.
@@ -257,6 +259,16 @@ pub trait Backend: Send + Sync {
     /// need not wait for the large one, even if [`Backend::frames_in_flight`] is 1.
     fn renders_beside(&self) -> bool {
         false
+    }
+
+    /// Limits what it holds between the stages of a frame, in bytes. With less memory a frame is drawn in more parts, one
+    /// after the other; its images do not depend on it.
+    fn limit_frame_bytes(&self, _bytes: u64) {}
+
+    /// The most that it holds in the machine's memory between the stages of a frame of these views, whatever the scene,
+    /// in bytes.
+    fn frame_bytes(&self, _views: &[View]) -> u64 {
+        0
     }
 
     /// Renders all views into their targets, `targets[i]` for `views[i]`, and calls `on_view_done` for each.

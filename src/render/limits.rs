@@ -15,7 +15,17 @@ pub const PARTITION_CACHE_ENTRIES: usize = 64;
 /// Smallest limit of a binding that the gpu backend supports: one cluster of SH degree 3 takes 34 kB.
 pub const BINDING_BYTES_MIN: u64 = 64 << 10;
 
-/// Most splats of the views that the cpu backend renders together, counted as all Gaussians of the visible
-/// clusters. A splat takes about 66 B with its places in macro tiles: 280 MB if every Gaussian of these clusters were
-/// visible, and half of that is usual. One view alone may have more.
-pub const FRAME_SPLATS: usize = 4 << 20;
+/// What a Gaussian of a visible cluster is expected to take between the stages of the cpu backend, in bytes: 48 of its
+/// splat, and for each of the 1.3 macro tiles that it touches 24 of a pair, 16 of keys and a list, twice as much as is
+/// usual, since half of these Gaussians are not visible.
+pub const SPLAT_BYTES: u64 = 128;
+
+/// The least that a splat takes there, with one macro tile and one tile, in bytes.
+pub const LEAST_SPLAT_BYTES: u64 = 92;
+
+/// Most bytes that the cpu backend holds between the stages of a large frame: 4 million Gaussians of visible clusters,
+/// as many as six full-size views of a street of 700,000 have. Small frames beside it take a quarter as much.
+pub const LANE_BYTES: u64 = 512 << 20;
+
+/// The least that it is given: 32,000 Gaussians, so that each slab is worth the time to find it.
+pub const LANE_BYTES_MIN: u64 = 4 << 20;

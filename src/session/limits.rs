@@ -118,6 +118,13 @@ pub const DT_MIN_US: i64 = 1_000;
 /// Longest simulated time of a step, in microseconds.
 pub const DT_MAX_US: i64 = 10_000_000;
 
+/// What frames may take between the stages of the renderer is one in so many of the bytes of memory for twins. A frame
+/// that would take more is drawn in parts, which costs little: 128 MiB of 1 GiB are a million Gaussians at once.
+pub const FRAME_SHARE: u64 = 8;
+
+/// Bytes per pixel of a JPEG file for which memory is set aside: twice those of a street of quality 90.
+pub const JPEG_PIXEL_BYTES: u64 = 1;
+
 /// Frames that may wait for the renderer. A session waits for one at a time, and may leave an abandoned
 /// one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
@@ -194,6 +201,9 @@ pub const PRELOAD_TIMEOUT: Duration = Duration::from_secs(60);
 /// Time between two checks whether the preload is complete. Twenty checks a second add little to seconds of
 /// loading.
 pub const PRELOAD_POLL: Duration = Duration::from_millis(50);
+
+// Answers are what is set aside for images.
+const _: () = assert!(ANSWERS_BYTES == wildcity_twin::limits::IMAGE_BYTES);
 
 // The largest answer fits the budget while no other session has one.
 const _: () = assert!(OBSERVATION_BYTES as u64 <= ANSWERS_BYTES);

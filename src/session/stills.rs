@@ -12,7 +12,7 @@ use wildcity_scene::RenderProfile;
 use wildcity_scene::actor::PlacedChunk;
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::geometry::Pose;
-use wildcity_twin::residency::{Reservation, Resident, ResidentActor, RigExtent};
+use wildcity_twin::residency::{FrameBytes, Reservation, Resident, ResidentActor, RigExtent};
 
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
@@ -67,7 +67,8 @@ impl Stills {
     ) -> Result<Self, SessionError> {
         let profile = resident.version.manifest.profile;
         Engine::bake_sky(resident.clone(), profile).await?;
-        let reservation = Engine::reserve(resident, extent(views), profile).await?;
+        let frame = frame_bytes(&engine, views);
+        let reservation = Engine::reserve(resident, extent(views), profile, frame).await?;
         let number = engine.new_session_number();
         Ok(Self { engine, reservation, profile, number })
     }
@@ -76,7 +77,10 @@ impl Stills {
     pub async fn covers(&self, views: &[View]) -> Result<bool, SessionError> {
         let resident = self.reservation.resident().clone();
         let needed = Engine::worst_case_bytes(resident, extent(views), self.profile).await?;
-        Ok(needed <= self.reservation.bytes())
+        let FrameBytes { stages, images } = frame_bytes(&self.engine, views);
+        let frame = self.reservation.frame();
+        let frame_fits = stages <= frame.stages && images <= frame.images;
+        Ok(frame_fits && needed <= self.reservation.scene_bytes())
     }
 
     /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than [`MAX_VIEWS`] are
@@ -112,8 +116,7 @@ impl Stills {
     ) -> Result<Vec<Vec<u8>>, SessionError> {
         let views: Vec<View> = stills.iter().map(|still| still.view).collect();
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        // The pixels, and a copy that is encoded.
-        let _share = self.engine.answer_budget().reserve(6 * pixels)?;
+        let _share = self.engine.answer_budget().reserve(STILL_PIXEL_BYTES * pixels)?;
 
         // Load before the job is queued, so that no render thread waits for a disk.
         let resident = self.reservation.resident().clone();
@@ -170,6 +173,18 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
 }
 
 /// The focal length of the finest view, and how far the views are from their middle.
+/// Bytes of a pixel of a still: the pixels, and a copy that is encoded.
+const STILL_PIXEL_BYTES: u64 = 6;
+
+/// What a frame of stills takes beside its scene. Of more than [`MAX_VIEWS`] views several frames are made.
+fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
+    let frames = views.chunks(MAX_VIEWS).map(|views| {
+        let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
+        FrameBytes { images: STILL_PIXEL_BYTES * pixels, ..engine.frame_bytes(views) }
+    });
+    frames.max_by_key(FrameBytes::sum).unwrap_or_default()
+}
+
 fn extent(views: &[View]) -> RigExtent {
     let viewpoints = viewpoints(views);
     let count = viewpoints.len().max(1) as f64;

@@ -2,6 +2,9 @@
 
 use std::time::Duration;
 
+/// Most bytes that are set aside for the images of all sessions: as many as all answers may have together.
+pub const IMAGE_BYTES: u64 = 9 << 30;
+
 /// Longest PLY header, in bytes. INRIA's with SH degree 3 has 1.5 kB.
 pub const PLY_HEADER_BYTES: usize = 64 << 10;
 

@@ -9,8 +9,12 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-use glam::DVec3;
+use glam::{DQuat, DVec3};
+use wildcity_render::cpu::{Cpu, Simd};
+use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::RenderProfile;
+use wildcity_scene::geometry::camera::{Fisheye, Lens, Pinhole};
+use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_twin::residency::{Cache, Viewpoint};
 use wildcity_twin::store::Catalog;
 
@@ -57,6 +61,43 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
     let allowed = before + 120 * n as u64 + CONSTANT_BYTES;
     assert!(peak <= allowed, "loading: from {before} to {peak} bytes, {allowed} allowed");
     assert!(peak - before >= 92 * n as u64, "the chunks are in memory");
+
+    // A frame of all of it through wide lenses: as much as the backend says, if it may have 48 MiB. At once its splats
+    // take 200 MiB.
+    let backend = Cpu::new(2, Simd::Best).unwrap();
+    backend.limit_frame_bytes(48 << 20);
+    let views = views();
+    let mut images: Vec<Vec<u8>> =
+        views.iter().map(|view| vec![1; 3 * view.camera.pixels()]).collect();
+    let mut draw = |views: &[View]| {
+        let target = |rgb8| Target { rgb8: Some(rgb8), ..Target::default() };
+        let mut targets: Vec<_> = images.iter_mut().map(|image| target(&mut image[..])).collect();
+        let frame = Frame { scene: &scene, profile: &everything, views };
+        backend.render(&frame, &mut targets[..views.len()], &|_, _| {}).unwrap();
+    };
+    let before = status_bytes("self", "VmRSS").unwrap();
+    // Resets the peak.
+    fs::write("/proc/self/clear_refs", "5").unwrap();
+    for _ in 0..3 {
+        draw(&views);
+    }
+    let taken = status_bytes("self", "VmHWM").unwrap() - before;
+    let allowed = backend.frame_bytes(&views) + CONSTANT_BYTES;
+    assert!(taken <= allowed, "frames: {taken} bytes, {allowed} allowed");
+    assert!(taken > 16 << 20, "frames: {taken} bytes cannot be all");
+}
+
+/// Four cameras, with a lens and without, that see most of the scene, along its length.
+fn views() -> Vec<View> {
+    let camera =
+        Camera::from_pinhole(480, 300, Pinhole { fx: 200.0, fy: 200.0, cx: 240.0, cy: 150.0 });
+    let lens = Lens::Fisheye(Fisheye::new([-0.03, -0.005, -0.0008, 0.001], None));
+    let rotation = DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2);
+    let at = |x: f64| Pose { position_m: DVec3::new(x, 0.0, 0.0), rotation };
+    [-60.0, -90.0]
+        .into_iter()
+        .flat_map(|x| [View::new(camera, at(x)), View::new(Camera { lens, ..camera }, at(x))])
+        .collect()
 }
 
 /// Writes a large file of a small one's rows, shifted by whole cells, without holding it: this

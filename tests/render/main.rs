@@ -32,4 +32,5 @@ mod normals;
 mod others;
 mod parity;
 mod sky;
+mod slabs;
 mod small_images;

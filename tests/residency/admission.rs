@@ -5,7 +5,7 @@ use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use wildcity_scene::Chunk;
-use wildcity_twin::residency::{Cache, ResidencyError, RigExtent, SectionRef};
+use wildcity_twin::residency::{Cache, FrameBytes, ResidencyError, RigExtent, SectionRef};
 
 use crate::scene_files::{Random, gaussians};
 use crate::streaming::{PROFILE, TEST_TIMEOUT, commit, demo, eyes, pixels, unlimited, views};
@@ -32,6 +32,43 @@ fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
     assert_eq!(cache.stats().reserved_bytes, 2 * worst_case_bytes);
     drop(held);
     assert!(resident.reserve(EXTENT).is_ok(), "what is given back is there again");
+    assert_eq!(cache.stats().reserved_bytes, 0);
+}
+
+/// What frames hold while they are rendered counts once, their images for each session, and both are taken from the
+/// sections in memory.
+#[test]
+fn frames_take_memory_from_the_sections() {
+    let all = unlimited().open("demo", None).unwrap();
+    let scene_bytes = all.worst_case_bytes_with(EXTENT, &PROFILE);
+    let images = scene_bytes / 8;
+    let limit_bytes = 4 * scene_bytes;
+    let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+    let resident = cache.open("demo", None).unwrap();
+    let reserve = |stages| resident.reserve_with(EXTENT, &PROFILE, FrameBytes { stages, images });
+    for station_m in (0..10).map(|k| 60.0 * f64::from(k)) {
+        drop(resident.scene(&eyes(&views(demo().at(station_m))), &PROFILE).unwrap());
+    }
+    assert!(cache.stats().held_bytes > scene_bytes, "{:?}", cache.stats());
+
+    // A frame that takes everything that its scene leaves.
+    let first = reserve(limit_bytes - scene_bytes - images).unwrap();
+    assert_eq!(first.bytes(), limit_bytes);
+    assert!(cache.stats().held_bytes <= scene_bytes, "{:?}", cache.stats());
+    assert!(matches!(reserve(0), Err(ResidencyError::NoRoom { .. })));
+    drop(first);
+
+    let stages = scene_bytes / 2;
+    let first = reserve(stages).unwrap();
+    let mut second = reserve(stages / 2).unwrap();
+    let scenes_bytes = (2 * scene_bytes).min(resident.total_bytes());
+    assert_eq!(cache.stats().reserved_bytes, scenes_bytes + stages + 2 * images);
+    let frame = second.frame();
+    second.exchange(resident.clone(), scene_bytes).unwrap();
+    assert_eq!(second.frame(), frame);
+    drop(first);
+    assert_eq!(cache.stats().reserved_bytes, scene_bytes + stages / 2 + images);
+    drop(second);
     assert_eq!(cache.stats().reserved_bytes, 0);
 }
 

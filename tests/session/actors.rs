@@ -21,7 +21,7 @@ use wildcity_session::{
 };
 use wildcity_sim::ego::Action;
 use wildcity_sim::{Command, Dynamics, EgoModel};
-use wildcity_twin::residency::Cache;
+use wildcity_twin::residency::{Cache, FrameBytes};
 use wildcity_twin::store::StoredActor;
 
 use crate::actor_records::replay;
@@ -414,10 +414,12 @@ async fn assets_count_against_the_memory_of_twins() {
     let second = open(&bench_, "a", options.clone()).await;
     let third = open(&bench_, "b", options.clone()).await;
     let with = stats(&bench_.engine).reserved_bytes;
-    let sessions = first.reserved_bytes() * 3;
+    let scene_bytes = first.reservation().scene_bytes();
+    let FrameBytes { stages, images } = first.reservation().frame();
     let whole = first.resident().total_bytes();
-    assert_eq!(reserved_bytes, first.reserved_bytes().min(whole));
-    assert_eq!(with, sessions.min(whole) + bytes, "one copy for two sessions of two actors");
+    assert_eq!(reserved_bytes, scene_bytes.min(whole) + stages + images);
+    let sessions = (3 * scene_bytes).min(whole) + stages + 3 * images;
+    assert_eq!(with, sessions + bytes, "one copy for two sessions of two actors");
     drop((second, third));
     assert_eq!(stats(&bench_.engine).reserved_bytes, reserved_bytes);
 

@@ -5,6 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use glam::{DQuat, DVec3};
+use wildcity_render::cpu::Cpu;
+use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera};
 use wildcity_session::{
@@ -23,7 +25,37 @@ pub(crate) struct Bench {
 }
 
 pub(crate) fn bench(cache: Cache) -> Bench {
-    bench_with(cache, Arc::new(crate::images::cpu()))
+    bench_with(cache, Arc::new(ForSections(crate::images::cpu())))
+}
+
+/// The cpu backend with no memory set aside for its stages: small limits are then those of sections.
+struct ForSections(Cpu);
+
+impl Backend for ForSections {
+    fn name(&self) -> &'static str {
+        self.0.name()
+    }
+
+    fn detail(&self) -> String {
+        self.0.detail()
+    }
+
+    fn threads(&self) -> usize {
+        self.0.threads()
+    }
+
+    fn renders_beside(&self) -> bool {
+        self.0.renders_beside()
+    }
+
+    fn render(
+        &self,
+        frame: &Frame<'_>,
+        targets: &mut [Target<'_>],
+        finished: OnViewDone<'_>,
+    ) -> Result<FrameStats, RenderError> {
+        self.0.render(frame, targets, finished)
+    }
 }
 
 pub(crate) fn bench_with(cache: Cache, backend: Arc<dyn wildcity_render::Backend>) -> Bench {
@@ -243,10 +275,31 @@ async fn a_session_that_does_not_fit_is_refused_until_another_closes() {
     let probe = bench(unlimited());
     let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
     assert!(2 * reserved_bytes < all.total_bytes());
-    let bench = bench(Cache::limited(demo().catalog(), Some(2 * reserved_bytes - 1)));
+    // What frames hold while they are rendered counts once.
+    let bench = bench(Cache::limited(demo().catalog(), Some(reserved_bytes * 3 / 2)));
     let first = bench.session("first", None).await.unwrap();
     let refused = bench.session("second", None).await.unwrap_err();
     assert!(refused.to_string().contains(&reserved_bytes.to_string()), "{refused}");
     first.close(wildcity_session::Outcome::Completed).await;
     bench.session("second", None).await.unwrap();
+}
+
+/// What the renderer holds between its stages is within what is reserved, and the budget decides how much that is.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_session_reserves_what_its_frames_hold() {
+    let mut reserved = Vec::new();
+    for limit_bytes in [1 << 29, 1 << 30] {
+        let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
+        let backend = Arc::new(crate::images::cpu());
+        let bench = bench_with(cache, backend.clone());
+        let session = bench.session("a", None).await.unwrap();
+        let frame = session.reservation().frame();
+        let views = views(demo().at(0.0));
+        assert!(frame.stages >= backend.frame_bytes(&views), "{frame:?}");
+        assert!(frame.images > 0 && frame.stages > limit_bytes / 8, "{frame:?}");
+        assert!(frame.sum() + session.reservation().scene_bytes() == session.reserved_bytes());
+        assert_eq!(session.reserved_bytes(), bench.engine.residency().reserved_bytes);
+        reserved.push(frame.stages);
+    }
+    assert_eq!(reserved[1] - reserved[0], (1 << 29) / 8, "an eighth of the budget");
 }

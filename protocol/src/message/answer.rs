@@ -222,7 +222,7 @@ pub struct Opened {
     pub outputs: Outputs,
     /// The twin's recorded trajectories.
     pub trajectories: Vec<TrajectoryInfo>,
-    /// Memory of the server that is reserved for the largest frame of the session, in bytes.
+    /// Memory of the server that is reserved for the largest frame of the session and its images, in bytes.
     pub reserved_bytes: u64,
     /// The repair of the images.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -96,8 +96,8 @@ pub(super) struct Serve {
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     no_shared_memory: bool,
 
-    /// Memory that the Gaussians of all twins may take, in GiB, for example 2 or 0.5 [default: three
-    /// quarters of the machine's]. A session is refused if its largest frame does not fit into memory
+    /// Memory that the Gaussians of all twins and the frames that show them may take, in GiB, for example 2 or
+    /// 0.5 [default: three quarters of the machine's]. A session is refused if its largest frame does not fit into memory
     /// together with those of the other sessions; the rest of the memory is a cache for later frames.
     #[arg(long, value_name = "N", value_parser = gib)]
     memory_gib: Option<f64>,

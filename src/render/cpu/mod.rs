@@ -3,11 +3,12 @@
 //! Each file is a stage: `project`, `bin`, `sort`, `rasterize`, `resolve`. The images are
 //! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
 //! splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that would
-//! exceed it together are rendered one half after the other.
+//! exceed it together are rendered one half after the other, and one view that would in slabs of depths.
 
 mod appearance;
 mod background;
 mod bin;
+mod drawing;
 mod export;
 mod lanes;
 mod lens;
@@ -16,9 +17,12 @@ mod part;
 mod project;
 mod rasterize;
 mod resolve;
+mod slabs;
 mod sort;
+mod unfinished;
 
 use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 use std::time::Instant;
 
 use fearless_simd::Level;
@@ -28,10 +32,11 @@ use rayon::ThreadPool;
 use crate::limits;
 
 use self::background::Background;
-use self::part::FramePart;
+use self::drawing::{Drawing, Stages};
+use self::part::{FramePart, PartError};
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
-use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
+use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 
 /// The f32 backend.
 #[derive(Debug)]
@@ -40,6 +45,8 @@ pub struct Cpu {
     /// For frames that are rendered while another one is; `None` if its threads cannot be started.
     side: OnceLock<Option<Lane>>,
     level: Level,
+    /// Most bytes that the main lane holds between the stages of a frame.
+    lane_bytes: AtomicU64,
 }
 
 /// Threads and buffers for one frame at a time. With threads of its own, a frame gets its share of the cores; tasks of
@@ -54,6 +61,8 @@ struct Lane {
 struct BusyLane<'a> {
     pool: &'a ThreadPool,
     scratch: MutexGuard<'a, Scratch>,
+    /// Most bytes that it may hold between the stages.
+    most_bytes: u64,
 }
 
 /// Instruction sets that can be requested; the default is the best one of the machine.
@@ -87,6 +96,9 @@ pub enum CpuError {
     Threads(rayon::ThreadPoolBuildError),
 }
 
+/// The side lane may hold one in so many of the bytes of the main lane.
+const SIDE_SHARE: u64 = 4;
+
 /// Buffers that each frame fills anew.
 #[derive(Debug, Default)]
 struct Scratch {
@@ -118,17 +130,20 @@ impl Cpu {
         };
         let level = level.ok_or(CpuError::NoSuchSimd(simd))?;
         let main = Lane::new(threads, "render").map_err(CpuError::Threads)?;
-        Ok(Self { main, side: OnceLock::new(), level })
+        let lane_bytes = AtomicU64::new(limits::LANE_BYTES);
+        Ok(Self { main, side: OnceLock::new(), level, lane_bytes })
     }
 
     /// A lane that is free, or the main one as soon as it is.
     fn lane(&self) -> BusyLane<'_> {
-        if let Some(free) = self.main.try_take() {
+        let most_bytes = self.lane_bytes.load(Relaxed);
+        if let Some(free) = self.main.try_take(most_bytes) {
             return free;
         }
         let threads = self.main.pool.current_num_threads();
         let side = self.side.get_or_init(|| Lane::new(threads, "render-side").ok());
-        side.as_ref().and_then(Lane::try_take).unwrap_or_else(|| self.main.take())
+        let side = side.as_ref().and_then(|side| side.try_take(most_bytes / SIDE_SHARE));
+        side.unwrap_or_else(|| self.main.take(most_bytes))
     }
 
     /// Runs the stages up to and including `last`, and returns their outputs, for another backend to continue
@@ -143,12 +158,19 @@ impl Cpu {
     ) -> Result<(StageOutputs, FrameStats), RenderError> {
         frame.check_views()?;
         frame.check_splats(self.name())?;
-        let BusyLane { pool, mut scratch } = self.lane();
+        let BusyLane { pool, mut scratch, .. } = self.lane();
         let scratch = &mut *scratch;
         let cutoffs = Cutoffs::new(frame.profile);
         pool.install(|| {
             let mut stats = FrameStats::default();
-            scratch.run(self.level, frame, &cutoffs, last, &mut stats)?;
+            let stages =
+                Stages { level: self.level, frame, cutoffs: &cutoffs, most_bytes: u64::MAX };
+            match project::with_jobs(frame, |jobs| {
+                stages.run(scratch, jobs, None, last, &mut stats)
+            }) {
+                Err(PartError::Render(error)) => return Err(error),
+                Ok(()) | Err(PartError::Overflow) => {}
+            }
             let outputs = export::stage_outputs(scratch, last, &cutoffs, &mut stats);
             Ok((outputs, stats))
         })
@@ -163,37 +185,13 @@ impl Lane {
         Ok(Self { pool, scratch: Mutex::default() })
     }
 
-    fn try_take(&self) -> Option<BusyLane<'_>> {
-        self.scratch.try_lock().map(|scratch| BusyLane { pool: &self.pool, scratch })
+    fn try_take(&self, most_bytes: u64) -> Option<BusyLane<'_>> {
+        let scratch = self.scratch.try_lock()?;
+        Some(BusyLane { pool: &self.pool, scratch, most_bytes })
     }
 
-    fn take(&self) -> BusyLane<'_> {
-        BusyLane { pool: &self.pool, scratch: self.scratch.lock() }
-    }
-}
-
-impl Scratch {
-    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part, so what an earlier
-    /// frame left there, even one that panicked, does not matter.
-    fn run(
-        &mut self,
-        level: Level,
-        frame: &Frame<'_>,
-        cutoffs: &Cutoffs,
-        last: Stage,
-        stats: &mut FrameStats,
-    ) -> Result<(), RenderError> {
-        let Self { projected, bins, .. } = self;
-        let mut timer = StageTimer::start();
-        projected.project(level, frame, cutoffs);
-        timer.finish("project", stats);
-        stats.visible_pairs += projected.len() as u64;
-        if last >= Stage::Bin {
-            bins.bin(level, projected, frame.views, cutoffs)?;
-            timer.finish("bin", stats);
-            stats.instances += bins.instances();
-        }
-        Ok(())
+    fn take(&self, most_bytes: u64) -> BusyLane<'_> {
+        BusyLane { pool: &self.pool, scratch: self.scratch.lock(), most_bytes }
     }
 }
 
@@ -216,6 +214,15 @@ impl Backend for Cpu {
         true
     }
 
+    fn limit_frame_bytes(&self, bytes: u64) {
+        let accepted_bytes = bytes.clamp(limits::LANE_BYTES_MIN, limits::LANE_BYTES);
+        self.lane_bytes.store(accepted_bytes, Relaxed);
+    }
+
+    fn frame_bytes(&self, views: &[View]) -> u64 {
+        drawing::most_held_bytes(self.lane_bytes.load(Relaxed), views, self.threads())
+    }
+
     fn render(
         &self,
         frame: &Frame<'_>,
@@ -227,45 +234,26 @@ impl Backend for Cpu {
         // Outside of the pool: baking a sky waits for other threads, and a thread that waits within its own
         // rayon pool may start unrelated work of the pool.
         let backgrounds = Background::of(frame)?;
-        let BusyLane { pool, mut scratch } = self.lane();
+        let BusyLane { pool, mut scratch, most_bytes } = self.lane();
         let scratch = &mut *scratch;
+        let cutoffs = Cutoffs::new(frame.profile);
         pool.install(|| {
-            let mut stats = FrameStats::default();
             let part = FramePart { frame: *frame, backgrounds: &backgrounds, first_view: 0 };
-            self.render_part(scratch, part, targets, finished, &mut stats)?;
-            Ok(stats)
+            let stats = FrameStats::default();
+            let mut drawing = Drawing {
+                level: self.level,
+                cutoffs: &cutoffs,
+                most_bytes,
+                scratch,
+                finished,
+                stats,
+            };
+            let drawn = drawing.draw(part, targets);
+            let stats = drawing.stats;
+            scratch.bins.trim(most_bytes / 2);
+            scratch.rasterizer.trim(most_bytes / 4);
+            drawn.map(|()| stats)
         })
-    }
-}
-
-impl Cpu {
-    /// Renders a part of a frame; views that together have more splats than fit into
-    /// [`limits::FRAME_SPLATS`] one half after the other. The images do not depend on it.
-    fn render_part(
-        &self,
-        scratch: &mut Scratch,
-        part: FramePart<'_>,
-        targets: &mut [Target<'_>],
-        finished: OnViewDone<'_>,
-        stats: &mut FrameStats,
-    ) -> Result<(), RenderError> {
-        let FramePart { frame, backgrounds, first_view } = part;
-        if frame.views.len() > 1 && part.max_splats() > limits::FRAME_SPLATS {
-            let [first, second] = part.halves();
-            let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
-            self.render_part(scratch, first, of_first, finished, stats)?;
-            return self.render_part(scratch, second, of_second, finished, stats);
-        }
-        let cutoffs = &Cutoffs::new(frame.profile);
-        scratch.run(self.level, &frame, cutoffs, Stage::Bin, stats)?;
-        let mut timer = StageTimer::start();
-        let Scratch { projected, bins, rasterizer } = scratch;
-        let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
-        let finished = |view: usize, target: &Target<'_>| finished(first_view + view, target);
-        let work = rasterize::rasterize(self.level, input, rasterizer, targets, &finished);
-        stats.evaluations += work.evaluations;
-        timer.finish_both([("sort", work.sort_ns), ("rasterize", work.rasterize_ns)], stats);
-        Ok(())
     }
 }
 

@@ -5,8 +5,33 @@ use rayon::prelude::*;
 use super::background::Background;
 use crate::layout::Frustum;
 use crate::unscented::UnscentedView;
-use crate::{Frame, View, limits};
+use crate::{Frame, RenderError, View};
 use wildcity_scene::chunk::{CLUSTER, Cluster};
+
+/// A part of a frame needs more memory than it may have between its stages.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Overflow;
+
+/// Why a part of a frame was not drawn.
+#[derive(Debug)]
+pub(super) enum PartError {
+    /// It is to be drawn in smaller parts.
+    Overflow,
+    /// The frame fails.
+    Render(RenderError),
+}
+
+impl From<Overflow> for PartError {
+    fn from(_: Overflow) -> Self {
+        Self::Overflow
+    }
+}
+
+impl From<RenderError> for PartError {
+    fn from(error: RenderError) -> Self {
+        Self::Render(error)
+    }
+}
 
 /// Some of a frame's views, which are rendered together.
 #[derive(Clone, Copy)]
@@ -39,12 +64,12 @@ impl FramePart<'_> {
         ]
     }
 
-    /// A bound of its splats: all Gaussians of actors and of the clusters that its views may see. Small scenes are not
-    /// looked at, but have a bound below [`limits::FRAME_SPLATS`].
-    pub(super) fn max_splats(&self) -> usize {
+    /// A bound of its splats: all Gaussians of actors and of the clusters that its views may see. Scenes with at most
+    /// `few` for all views are not looked at.
+    pub(super) fn max_splats(&self, few: usize) -> usize {
         let Frame { scene, views, .. } = self.frame;
         let all = scene.gaussians() * views.len();
-        if all <= limits::FRAME_SPLATS {
+        if all <= few {
             return all;
         }
         let of_actors: usize = scene.placed.iter().map(|placed| placed.chunk.len()).sum();

@@ -24,6 +24,7 @@ use super::bin::{Bins, Grid, MacroTile};
 use super::math::exp2;
 use super::project::Projected;
 use super::resolve::{self, BLOCKS, Band, HalvedBy, NOT_HALVED, TileSums};
+use super::unfinished::{Continued, UnfinishedTile};
 use crate::constants::{BLOCK_PX, TILE_PX};
 use crate::layout::{Cutoffs, Splat};
 use crate::{OnViewDone, Target, View};
@@ -47,6 +48,17 @@ pub(super) struct Input<'a> {
 /// What threads keep from macro tile to macro tile. Not in use.
 #[derive(Debug, Default)]
 pub(super) struct Scratches(Mutex<Vec<Box<Scratch>>>);
+
+impl Scratches {
+    /// Frees what threads keep if it is more than `most_bytes`.
+    pub(super) fn trim(&mut self, most_bytes: u64) {
+        let scratches = self.0.get_mut();
+        let bytes: usize = scratches.iter().map(|scratch| scratch.macro_tile.held_bytes()).sum();
+        if bytes as u64 > most_bytes {
+            scratches.clear();
+        }
+    }
+}
 
 /// Of one thread.
 #[derive(Debug, Default)]
@@ -78,10 +90,12 @@ struct Drawing<'a> {
     bands: Vec<Mutex<Band<'a>>>,
 }
 
-/// Sorts and draws all views, and calls `on_view_done` as each is complete.
+/// Sorts and draws all views, and calls `on_view_done` as each is complete. Of a slab there is one view, complete after
+/// the last one.
 pub(super) fn rasterize(
     level: Level,
     input: Input<'_>,
+    continued: Option<Continued<'_>>,
     scratches: &Scratches,
     targets: &mut [Target<'_>],
     on_view_done: OnViewDone<'_>,
@@ -104,7 +118,7 @@ pub(super) fn rasterize(
             input.bins.by_work(index).into_iter().par_bridge().for_each(|number| {
                 let mut scratch = scratches.0.lock().pop().unwrap_or_default();
                 let work = dispatch!(level, simd => {
-                    draw_macro_tile(simd, input, &drawing, number, &mut scratch)
+                    draw_macro_tile(simd, input, continued, &drawing, number, &mut scratch)
                 });
                 scratch.macro_tile.trim();
                 scratches.0.lock().push(scratch);
@@ -113,8 +127,10 @@ pub(super) fn rasterize(
                 rasterize_ns.fetch_add(work.rasterize_ns, Relaxed);
             });
             drop(drawing);
-            target.finish(view);
-            on_view_done(index, target);
+            if continued.is_none_or(|slab| slab.is_last) {
+                target.finish(view);
+                on_view_done(index, target);
+            }
         },
     );
     Work {
@@ -177,15 +193,18 @@ impl Default for Batch {
 /// Where one tile is accumulated.
 struct TileOutput<'a> {
     sums: &'a mut TileSums,
+    /// A bit for each block in which some pixel has not stopped.
+    live: &'a mut u16,
     halved_by: &'a mut HalvedBy,
     wants: Wants,
 }
 
-/// Sorts and draws one macro tile of one view, and resolves its tiles into the target's bands.
+/// Sorts and draws one macro tile of one view, and resolves its tiles into the target's bands after the last slab.
 #[inline(always)]
 fn draw_macro_tile<S: Simd>(
     simd: S,
     input: Input<'_>,
+    continued: Option<Continued<'_>>,
     drawing: &Drawing<'_>,
     number: usize,
     scratch: &mut Scratch,
@@ -193,30 +212,51 @@ fn draw_macro_tile<S: Simd>(
     let Drawing { view, wants, background, .. } = *drawing;
     let Scratch { macro_tile, batch } = scratch;
     let start = Instant::now();
+    let mut unfinished = continued.map(|slab| slab.tiles.0[number].lock());
+    let is_last = continued.is_none_or(|slab| slab.is_last);
     input.bins.load(view, number, macro_tile);
+    if !is_last && macro_tile.is_empty() {
+        return Work::default();
+    }
     let sorted = Instant::now();
     macro_tile.copy_splats(input.projected);
 
     let mut sky_scratch = background.and_then(Background::scratch);
     let mut halved_by = NOT_HALVED;
     let mut evaluations = 0;
-    for (within, [column, row]) in drawing.grid.tiles_of(number) {
+    // Of earlier slabs.
+    let has_sums = unfinished.as_ref().is_some_and(|tiles| !tiles.is_empty());
+    for (index, (within, [column, row])) in drawing.grid.tiles_of(number).enumerate() {
         let at_px = [column * TILE_PX, row * TILE_PX];
         let mut sums = TileSums::default();
-        let mut output = TileOutput { sums: &mut sums, halved_by: &mut halved_by, wants };
+        let mut live = u16::MAX;
+        if let (true, Some(tiles)) = (has_sums, &mut unfinished) {
+            sums = tiles[index].sums;
+            live = tiles[index].live;
+        }
+        let mut output =
+            TileOutput { sums: &mut sums, live: &mut live, halved_by: &mut halved_by, wants };
         evaluations += rasterize_tile(simd, input, macro_tile, within, at_px, batch, &mut output);
+        if wants.instances {
+            let mut band = drawing.bands[row as usize].lock();
+            band.write_instances(&halved_by, at_px[0], input.projected, has_sums);
+            halved_by = NOT_HALVED;
+        }
+        if let (false, Some(tiles)) = (is_last, &mut unfinished) {
+            let tile = UnfinishedTile { sums, live };
+            match has_sums {
+                true => tiles[index] = tile,
+                false => tiles.push(tile),
+            }
+            continue;
+        }
         if let Some(background) = background {
             background.add(simd, at_px, &mut sky_scratch, &mut sums);
         }
         if let Some(appearance) = drawing.appearance {
             appearance::apply(simd, appearance, at_px, &mut sums);
         }
-        let mut band = drawing.bands[row as usize].lock();
-        if wants.instances {
-            band.write_instances(&halved_by, at_px[0], input.projected);
-            halved_by = NOT_HALVED;
-        }
-        resolve::resolve(simd, &sums, at_px[0], &mut band);
+        resolve::resolve(simd, &sums, at_px[0], &mut drawing.bands[row as usize].lock());
     }
     Work {
         evaluations,
@@ -236,10 +276,12 @@ fn rasterize_tile<S: Simd>(
     batch: &mut Batch,
     output: &mut TileOutput<'_>,
 ) -> u64 {
-    // A bit for each block in which some pixel has not stopped.
-    let mut live = u16::MAX;
+    let mut live = *output.live;
     let mut evaluations = 0;
     for indices in macro_tile.tile(within).chunks(BATCH) {
+        if live == 0 {
+            break;
+        }
         // Read all splats first: their cache misses overlap, and cost little more than one.
         let splats = batch.splats.iter_mut().zip(indices);
         match macro_tile.copies() {
@@ -283,10 +325,8 @@ fn rasterize_tile<S: Simd>(
             live &= !(u16::from(stopped) << block);
             evaluations += count as u64 * LANES as u64;
         }
-        if live == 0 {
-            break;
-        }
     }
+    *output.live = live;
     evaluations
 }
 

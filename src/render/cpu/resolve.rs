@@ -26,7 +26,7 @@ pub(super) type HalvedBy = [[u32; LANES]; BLOCKS];
 pub(super) const NOT_HALVED: HalvedBy = [[0; LANES]; BLOCKS];
 
 /// Accumulated values of the 256 pixels of a tile, block by block.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 pub(super) struct TileSums {
     /// Linear premultiplied red, green, blue.
@@ -60,12 +60,14 @@ pub(super) struct Band<'a> {
 }
 
 impl Band<'_> {
-    /// Writes the instances of one tile with its left edge at column `left`.
+    /// Writes the instances of one tile with its left edge at column `left`. If there are some of earlier slabs, those
+    /// of pixels that were halved there stay.
     pub(super) fn write_instances(
         &mut self,
         halved_by: &HalvedBy,
         left: u32,
         projected: &Projected,
+        has_some: bool,
     ) {
         let Some(instances) = &mut self.instances else { return };
         let edge = BLOCK_PX as usize;
@@ -75,8 +77,11 @@ impl Band<'_> {
             for y in 0..edge.min(self.rows.saturating_sub(row)) {
                 for x in 0..edge.min(self.width.saturating_sub(column)) {
                     let pixel = (row + y) * self.width + column + x;
-                    let place = halved_by[y * edge + x].checked_sub(1);
-                    instances[pixel] = place.map_or(0, |place| projected.instance(place));
+                    match halved_by[y * edge + x].checked_sub(1) {
+                        Some(place) => instances[pixel] = projected.instance(place),
+                        None if has_some => {}
+                        None => instances[pixel] = 0,
+                    }
                 }
             }
         }

@@ -15,13 +15,13 @@ use std::time::Duration;
 use parking_lot::Mutex;
 use tokio::time::{Instant, sleep};
 
-use wildcity_render::{Backend, RenderError};
+use wildcity_render::{Backend, RenderError, View};
 use wildcity_repair::Models;
 use wildcity_scene::actor::ActorAsset;
 use wildcity_scene::{Rays, RenderProfile};
 use wildcity_twin::residency::{
-    Cache, Prefetcher, Reservation, ResidencyError, Resident, ResidentActor, RigExtent, Stats,
-    Urgency, Viewpoint,
+    Cache, FrameBytes, Prefetcher, Reservation, ResidencyError, Resident, ResidentActor, RigExtent,
+    Stats, Urgency, Viewpoint,
 };
 use wildcity_twin::store::Catalog;
 
@@ -89,6 +89,7 @@ impl Engine {
     pub fn start(settings: EngineSettings) -> Result<Arc<Self>, SessionError> {
         let EngineSettings { cache, episodes, scenarios, backend, step_timeout, repairs, mcap } =
             settings;
+        backend.limit_frame_bytes(cache.limit_bytes() / limits::FRAME_SHARE);
         let exports = mcap.then(|| Exports::start(episodes.clone())).transpose()?;
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
@@ -293,7 +294,8 @@ impl Engine {
         baked.map_err(SessionError::Sky)
     }
 
-    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin it drives.
+    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin it drives, and what it takes beside
+    /// its scene.
     ///
     /// # Errors
     /// Too little memory is left.
@@ -301,8 +303,20 @@ impl Engine {
         resident: Arc<Resident>,
         extent: RigExtent,
         profile: RenderProfile,
+        frame: FrameBytes,
     ) -> Result<Reservation, SessionError> {
-        Ok(run_blocking(move || resident.reserve_with(extent, &profile)).await??)
+        Ok(run_blocking(move || resident.reserve_with(extent, &profile, frame)).await??)
+    }
+
+    /// What a frame of some views takes beside its scene and its images.
+    pub(crate) fn frame_bytes(&self, views: &[View]) -> FrameBytes {
+        let backend = self.queue.backend();
+        let stages = backend.frame_bytes(views);
+        let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
+        // Beside a large frame another one is rendered, which may have a quarter of its memory.
+        let has_other = backend.renders_beside() && pixels > limits::LARGE_PIXELS;
+        let beside = if has_other { stages / 4 } else { 0 };
+        FrameBytes { stages: stages + beside, images: 0 }
     }
 
     /// Memory that the worst frame of a rig needs, in bytes.

@@ -375,6 +375,34 @@ impl ObservationLayout {
         pixels * limits::ANSWER_PIXELS / self.pixel_limit()
     }
 
+    /// Bytes of a session's answers to steps: the one that is made, and the one before it, which is kept for a repeated
+    /// request. What a session shows of earlier times comes on top.
+    pub(crate) fn answers_bytes(&self) -> u64 {
+        let PixelMaps { depth, opacity, normals, instances } = self.maps;
+        let maps = [
+            (depth, 4),
+            (opacity, 4),
+            (normals, limits::NORMAL_BYTES),
+            (instances, limits::INSTANCE_BYTES),
+        ];
+        let maps = maps.iter().map(|&(held, bytes)| if held { bytes } else { 0 }).sum::<u64>();
+        let colour = match self.encoding {
+            Encoding::Raw | Encoding::Png => 3,
+            Encoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
+        };
+        2 * self.rig_pixels() * (maps + colour)
+    }
+
+    /// Bytes of the images that no answer holds while a frame is rendered: pixels that are encoded, and maps from which
+    /// trust and normals are computed.
+    pub(crate) fn rendered_bytes(&self, has_trust: bool) -> u64 {
+        let PixelMaps { depth, opacity, normals, .. } = self.maps;
+        let pixels = if self.encoding == Encoding::Raw { 0 } else { 3 };
+        let opacity = if has_trust && !opacity { 4 } else { 0 };
+        let depth = if normals && !depth { 4 } else { 0 };
+        self.rig_pixels() * (pixels + opacity + depth)
+    }
+
     fn rig_pixels(&self) -> u64 {
         self.cameras.iter().map(|camera| camera.camera.pixels() as u64).sum()
     }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
-use super::open::{rig_extent, training_coverage};
+use super::open::{frame_bytes, rig_extent, training_coverage};
 use super::recording::traffic_lines;
 use super::requests::Moment;
 use crate::blocking::run_blocking;
@@ -110,8 +110,9 @@ impl Session {
     ) -> Result<Self, SessionError> {
         let Snapshot { settings, version, state, origin } = from;
         let extent = rig_extent(settings.layout.cameras());
-        let reservation =
-            Engine::reserve(version.resident.clone(), extent, version.profile).await?;
+        let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        let resident = version.resident.clone();
+        let reservation = Engine::reserve(resident, extent, version.profile, frame).await?;
         let (settings, version, state) = (settings.clone(), version.clone(), state.clone());
         let mut session = Self::assembled(engine, name, settings, reservation, version, state);
         session.origin.clone_from(origin);
@@ -206,7 +207,9 @@ impl Session {
             true => Some(training_coverage(&driven.version, "outputs.trust").await?),
             false => None,
         };
-        let reservation = Engine::reserve(driven.version.clone(), extent, driven.profile).await?;
+        let frame = frame_bytes(&engine, &settings.layout, coverage.is_some());
+        let resident = driven.version.clone();
+        let reservation = Engine::reserve(resident, extent, driven.profile, frame).await?;
         let version = PinnedVersion::new(driven.version.clone(), driven.profile, coverage);
         let state = EpisodeState::at_start(driven.episode.clone());
         let mut session =

@@ -95,6 +95,11 @@ impl Session {
         self.reservation.bytes()
     }
 
+    /// The same by what it is for.
+    pub fn reservation(&self) -> &Reservation {
+        &self.reservation
+    }
+
     /// How it is rendered: the version's profile with the overrides from opening.
     pub fn profile(&self) -> &RenderProfile {
         &self.version.profile

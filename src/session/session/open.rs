@@ -10,7 +10,7 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
 use wildcity_scene::{Manifest, Trajectory};
-use wildcity_twin::residency::{Reservation, Resident, RigExtent, Urgency};
+use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urgency};
 
 use super::Session;
 use crate::blocking::run_blocking;
@@ -165,7 +165,8 @@ impl Session {
         };
 
         // The memory for the worst frame anywhere in the twin.
-        let reservation = Engine::reserve(resident.clone(), extent, profile).await?;
+        let frame = frame_bytes(&engine, &layout, coverage.is_some());
+        let reservation = Engine::reserve(resident.clone(), extent, profile, frame).await?;
 
         let episode = start
             .episode(options.seed, options.dynamics, dt_us)
@@ -407,6 +408,17 @@ pub(super) fn rig_extent(cameras: &[RigCamera]) -> RigExtent {
         focal_px: viewpoints.iter().fold(0.0, |most, one| one.focal_px.max(most)),
         radius_m: viewpoints.iter().fold(0.0, |most, one| one.position_m.length().max(most)),
     }
+}
+
+/// What the frames of a session take beside their scenes.
+pub(super) fn frame_bytes(
+    engine: &Engine,
+    layout: &ObservationLayout,
+    has_trust: bool,
+) -> FrameBytes {
+    let views = View::of_rig(layout.cameras(), Pose::IDENTITY);
+    let FrameBytes { stages, .. } = engine.frame_bytes(&views);
+    FrameBytes { stages: stages + layout.rendered_bytes(has_trust), images: layout.answers_bytes() }
 }
 
 /// The drive that the start names, else the twin's first.

@@ -10,7 +10,7 @@ use std::sync::{Arc, Weak};
 use parking_lot::Mutex;
 
 use super::ResidencyError;
-use super::budget::Claim;
+use super::budget::{Claim, FrameBytes};
 use super::resident::Shared;
 use crate::store::Catalog;
 use wildcity_scene::actor::ActorAsset;
@@ -98,7 +98,8 @@ fn add(
 ) -> Result<Arc<ResidentActor>, ResidencyError> {
     let bytes = asset.bytes();
     let name = asset.description.name.clone();
-    let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes };
+    let frame = FrameBytes::default();
+    let claim = Claim { twin: name, version: hash.to_owned(), bytes, total_bytes: bytes, frame };
     shared.budget.lock().reserve(&claim).map_err(ResidencyError::of_actor)?;
     shared.pager.with_table(|table| table.add_outside_bytes(bytes));
     let shared = shared.clone();

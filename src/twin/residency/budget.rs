@@ -11,11 +11,31 @@ use super::ResidencyError;
 /// Bytes that are reserved for the worst frames of sessions, by version.
 ///
 /// Sessions on one version share what they draw, so together they never need more than the whole
-/// version takes.
-#[derive(Debug)]
+/// version takes. Their frames are rendered in turn, so that of what frames hold between the stages only the
+/// largest counts; each has images of its own.
+#[derive(Clone, Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
     versions: BTreeMap<String, VersionClaims>,
+    /// Number of claims by [`FrameBytes::stages`].
+    stages: BTreeMap<u64, u64>,
+    images_bytes: u64,
+}
+
+/// What the frames of a session take beside their scenes, in bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameBytes {
+    /// What a frame holds while it is rendered. All sessions share it.
+    pub stages: u64,
+    /// The images that a session holds.
+    pub images: u64,
+}
+
+impl FrameBytes {
+    /// Both.
+    pub fn sum(&self) -> u64 {
+        self.stages.saturating_add(self.images)
+    }
 }
 
 /// The claims of all sessions on one version.
@@ -33,15 +53,18 @@ pub(super) struct Claim {
     pub(super) twin: String,
     /// The version's hash.
     pub(super) version: String,
-    /// Bytes that the frame needs at once.
+    /// Bytes that the scene of the frame needs at once.
     pub(super) bytes: u64,
+    /// What the frame takes beside its scene.
+    pub(super) frame: FrameBytes,
     /// Bytes that all levels of detail of the whole version take.
     pub(super) total_bytes: u64,
 }
 
 impl Budget {
     pub(super) fn new(limit_bytes: u64) -> Self {
-        Self { limit_bytes, versions: BTreeMap::new() }
+        let versions = BTreeMap::new();
+        Self { limit_bytes, versions, stages: BTreeMap::new(), images_bytes: 0 }
     }
 
     /// Reserves memory.
@@ -57,13 +80,19 @@ impl Budget {
             sum_bytes: before.sum_bytes.saturating_add(claim.bytes),
             ..before
         };
-        let needed_bytes = after.bytes() - before.bytes();
+        let images_bytes = self.images_bytes.saturating_add(claim.frame.images);
+        let of_frame = claim.frame.stages.max(self.stages_bytes())
+            + images_bytes.min(limits::IMAGE_BYTES)
+            - self.frame_bytes();
+        let needed_bytes = (after.bytes() - before.bytes()).saturating_add(of_frame);
         if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
             let twin = claim.twin.clone();
             let limit_bytes = self.limit_bytes;
             return Err(ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes });
         }
         self.versions.insert(claim.version.clone(), after);
+        *self.stages.entry(claim.frame.stages).or_default() += 1;
+        self.images_bytes += claim.frame.images;
         Ok(())
     }
 
@@ -73,9 +102,9 @@ impl Budget {
     /// # Errors
     /// As [`Budget::reserve`].
     pub(super) fn exchange(&mut self, old: &Claim, new: &Claim) -> Result<(), ResidencyError> {
-        let before = self.versions.clone();
+        let before = self.clone();
         self.release(old);
-        self.reserve(new).inspect_err(|_| self.versions = before)
+        self.reserve(new).inspect_err(|_| *self = before)
     }
 
     /// Returns what [`Budget::reserve`] reserved.
@@ -87,11 +116,27 @@ impl Budget {
                 self.versions.remove(&claim.version);
             }
         }
+        if let Some(claims) = self.stages.get_mut(&claim.frame.stages) {
+            *claims -= 1;
+            if *claims == 0 {
+                self.stages.remove(&claim.frame.stages);
+            }
+        }
+        self.images_bytes -= claim.frame.images;
     }
 
     /// Bytes that are reserved.
     pub(super) fn reserved_bytes(&self) -> u64 {
-        self.versions.values().map(VersionClaims::bytes).sum()
+        self.versions.values().map(VersionClaims::bytes).sum::<u64>() + self.frame_bytes()
+    }
+
+    /// Bytes of these that frames take beside their scenes.
+    pub(super) fn frame_bytes(&self) -> u64 {
+        self.stages_bytes() + self.images_bytes.min(limits::IMAGE_BYTES)
+    }
+
+    fn stages_bytes(&self) -> u64 {
+        self.stages.last_key_value().map_or(0, |(&bytes, _)| bytes)
     }
 }
 

@@ -76,6 +76,11 @@ impl Cache {
         &self.catalog
     }
 
+    /// Bytes that twins may take, and the frames that show them.
+    pub fn limit_bytes(&self) -> u64 {
+        self.shared.pager.memory().1
+    }
+
     /// Opens one version of a twin, or the latest. Reads its table unless the version is open
     /// already; blocks meanwhile.
     ///

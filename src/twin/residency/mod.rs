@@ -75,7 +75,7 @@ mod table;
 mod worst_case;
 
 pub use actors::ResidentActor;
-pub use budget::default_memory_bytes;
+pub use budget::{FrameBytes, default_memory_bytes};
 pub use cache::Cache;
 pub use demand::{SectionRef, Viewpoint};
 pub use error::ResidencyError;

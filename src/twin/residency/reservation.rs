@@ -6,7 +6,7 @@ use parking_lot::Mutex;
 
 use wildcity_scene::RenderProfile;
 
-use super::budget::Claim;
+use super::budget::{Budget, Claim, FrameBytes};
 use super::demand::{SectionRef, Viewpoint};
 use super::requests::Urgency;
 use super::{ResidencyError, Resident, RigExtent};
@@ -41,10 +41,12 @@ impl Resident {
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers.
     pub fn reserve(self: &Arc<Self>, extent: RigExtent) -> Result<Reservation, ResidencyError> {
-        self.reserve_with(extent, &self.version.manifest.profile)
+        let profile = &self.version.manifest.profile;
+        self.reserve_with(extent, profile, FrameBytes::default())
     }
 
-    /// As [`Resident::reserve`], for frames that are drawn with another profile than the version's.
+    /// As [`Resident::reserve`], for frames that are drawn with another profile than the version's, and with what they
+    /// take beside their scenes.
     ///
     /// # Errors
     /// As [`Resident::reserve`].
@@ -52,26 +54,27 @@ impl Resident {
         self: &Arc<Self>,
         extent: RigExtent,
         profile: &RenderProfile,
+        frame: FrameBytes,
     ) -> Result<Reservation, ResidencyError> {
-        Reservation::new(self.clone(), self.worst_case_bytes_with(extent, profile))
+        Reservation::new(self.clone(), self.worst_case_bytes_with(extent, profile), frame)
     }
 }
 
 impl Reservation {
-    fn new(resident: Arc<Resident>, bytes: u64) -> Result<Self, ResidencyError> {
-        let claim = claim(&resident, bytes);
-        resident.shared.budget.lock().reserve(&claim)?;
+    fn new(resident: Arc<Resident>, bytes: u64, frame: FrameBytes) -> Result<Self, ResidencyError> {
+        let claim = claim(&resident, bytes, frame);
+        change_budget(&resident, |budget| budget.reserve(&claim))?;
         Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
     }
 
-    /// Reserves `bytes` for another version in place of this one, in one step: there need not be
-    /// room for both. Prefetching of the old version ends.
+    /// Reserves `bytes` for scenes of another version in place of this one, in one step: there need not be
+    /// room for both. Prefetching of the old version ends. What frames take beside their scenes stays reserved.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers; nothing has changed then.
     pub fn exchange(&mut self, resident: Arc<Resident>, bytes: u64) -> Result<(), ResidencyError> {
-        let claim = claim(&resident, bytes);
-        resident.shared.budget.lock().exchange(&self.claim, &claim)?;
+        let claim = claim(&resident, bytes, self.claim.frame);
+        change_budget(&resident, |budget| budget.exchange(&self.claim, &claim))?;
         self.prefetcher.end();
         self.claim = claim;
         self.prefetcher = Arc::new(Prefetcher::new(resident));
@@ -85,7 +88,17 @@ impl Reservation {
 
     /// The reserved memory, in bytes.
     pub fn bytes(&self) -> u64 {
+        self.claim.bytes.saturating_add(self.claim.frame.sum())
+    }
+
+    /// The part of it that is for scenes, in bytes.
+    pub fn scene_bytes(&self) -> u64 {
         self.claim.bytes
+    }
+
+    /// The part of it that frames take beside their scenes.
+    pub fn frame(&self) -> FrameBytes {
+        self.claim.frame
     }
 
     /// The session's prefetcher.
@@ -97,7 +110,7 @@ impl Reservation {
 impl Drop for Reservation {
     fn drop(&mut self) {
         self.prefetcher.end();
-        self.resident().shared.budget.lock().release(&self.claim);
+        change_budget(self.resident(), |budget| budget.release(&self.claim));
     }
 }
 
@@ -156,11 +169,21 @@ impl Drop for Prefetcher {
     }
 }
 
-fn claim(resident: &Resident, bytes: u64) -> Claim {
+/// Changes the budget. What frames may take is taken from the sections at once.
+fn change_budget<R>(resident: &Resident, change: impl FnOnce(&mut Budget) -> R) -> R {
+    let mut budget = resident.shared.budget.lock();
+    let changed = change(&mut budget);
+    let bytes = budget.frame_bytes();
+    resident.shared.pager.with_table(|table| table.set_frame_bytes(bytes));
+    changed
+}
+
+fn claim(resident: &Resident, bytes: u64, frame: FrameBytes) -> Claim {
     Claim {
         twin: resident.version.manifest.twin.clone(),
         version: resident.version.hash.clone(),
         bytes,
+        frame,
         total_bytes: resident.total_bytes(),
     }
 }

@@ -28,6 +28,8 @@ pub(super) struct SectionTable {
     held_sections: u64,
     /// Bytes of the limit that are used for other things than sections: assets of actors.
     outside_bytes: u64,
+    /// Bytes of the limit that are kept free for frames.
+    frame_bytes: u64,
     ids: HashMap<Key, SlotId>,
     slots: Vec<Slot>,
     vacant: Vec<SlotId>,
@@ -76,6 +78,7 @@ impl SectionTable {
             held_bytes: 0,
             held_sections: 0,
             outside_bytes: 0,
+            frame_bytes: 0,
             ids: HashMap::new(),
             slots: Vec::new(),
             vacant: Vec::new(),
@@ -174,7 +177,7 @@ impl SectionTable {
     /// changes.
     pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
-        let wanted_bytes = self.held_bytes() + bytes;
+        let wanted_bytes = self.held_bytes() + self.frame_bytes + bytes;
         let mut victims = Vec::new();
         let mut gained_bytes = 0;
         let mut next = self.oldest;
@@ -229,9 +232,22 @@ impl SectionTable {
         self.limit_bytes
     }
 
-    /// Bytes of memory that sections may use: what assets leave of the limit.
+    /// Bytes of memory that sections may use: what assets and frames leave of the limit.
     pub(super) fn limit_of_sections_bytes(&self) -> u64 {
-        self.limit_bytes.saturating_sub(self.outside_bytes)
+        self.limit_bytes.saturating_sub(self.outside_bytes + self.frame_bytes)
+    }
+
+    /// Keeps so many bytes free for frames: sections that no frame draws or waits for are evicted.
+    pub(super) fn set_frame_bytes(&mut self, bytes: u64) {
+        self.frame_bytes = bytes;
+        let mut next = self.oldest;
+        while self.held_bytes() + self.frame_bytes > self.limit_bytes && next != NONE {
+            let newer = self.slots[next as usize].newer;
+            if self.may_evict(next, Requester::Prefetch(u64::MAX)) {
+                self.evict(next);
+            }
+            next = newer;
+        }
     }
 
     /// An asset was loaded, which takes memory from the sections. They are evicted with the next load.

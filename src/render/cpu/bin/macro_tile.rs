@@ -16,6 +16,9 @@ const MACRO_TILE_TILES: usize = 32;
 /// Most splats that are copied: 6 MB. With more, copies would not stay in the caches.
 const MAX_COPIES: usize = 1 << 17;
 
+/// Most bytes of copies.
+pub(in crate::cpu) const COPIES_BYTES: u64 = (MAX_COPIES * size_of::<Splat>()) as u64;
+
 /// Most pairs and instances whose memory a thread keeps for the next macro tile: 12 MB.
 const MAX_KEPT: usize = 1 << 18;
 
@@ -91,6 +94,12 @@ impl MacroTile {
         ends.copy_from_slice(&next[..MACRO_TILE_TILES]);
     }
 
+    /// Whether no splat touches it.
+    #[inline(always)]
+    pub(in crate::cpu) fn is_empty(&self) -> bool {
+        self.pairs.is_empty()
+    }
+
     /// Copies the splats, unless there are too many.
     #[inline(always)]
     pub(in crate::cpu) fn copy_splats(&mut self, projected: &Projected) {
@@ -121,6 +130,15 @@ impl MacroTile {
     #[inline(always)]
     pub(in crate::cpu) fn copies(&self) -> Option<&[Splat]> {
         (self.copies.len() == self.pairs.len()).then_some(&self.copies)
+    }
+
+    /// Bytes of memory.
+    pub(in crate::cpu) fn held_bytes(&self) -> usize {
+        let Self { pairs, copies, instances, keys, other, .. } = self;
+        pairs.capacity() * size_of::<Pair>()
+            + copies.capacity() * size_of::<Splat>()
+            + instances.capacity() * size_of::<u32>()
+            + (keys.capacity() + other.capacity()) * size_of::<u64>()
     }
 
     /// Frees the memory of an unusually full macro tile.

@@ -22,14 +22,33 @@ use fearless_simd::{Level, dispatch};
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
+use super::part::{Overflow, PartError};
 use super::project::{Projected, Unit};
 use crate::constants::MAX_INSTANCES;
-use crate::layout::Cutoffs;
+use crate::layout::{Cutoffs, Splat};
 use crate::{RenderError, View};
 
 pub(super) use grid::Grid;
-pub(super) use macro_tile::MacroTile;
+pub(super) use macro_tile::{COPIES_BYTES, MacroTile};
 use segment::{Pair, Segment};
+
+/// Most bytes of pairs and instances: each pair once in its segment, and while its macro tile is drawn with two keys and
+/// again in a list of them.
+fn bytes_of(pairs: u64, instances: u64) -> u64 {
+    let of_pair = 2 * size_of::<Pair>() + 2 * size_of::<u64>();
+    pairs * of_pair as u64 + instances * size_of::<u32>() as u64
+}
+
+/// Checks the number of (splat, tile) pairs.
+pub(super) fn check_instances(instances: u64) -> Result<(), RenderError> {
+    match instances > MAX_INSTANCES {
+        true => {
+            let what = "(Gaussian, tile) pairs";
+            Err(RenderError::TooMany { what, limit: MAX_INSTANCES })
+        }
+        false => Ok(()),
+    }
+}
 
 /// Splats of a segment, at least, unless its view has fewer: enough to outweigh its counters of a view's macro tiles.
 const SEGMENT: usize = 1 << 14;
@@ -44,6 +63,8 @@ pub(super) struct Bins {
     used_segments: usize,
     /// Number of (splat, tile) pairs.
     instances: u64,
+    /// Number of (splat, macro tile) pairs.
+    pairs: u64,
     /// Pairs of a segment, each with the number of its macro tile. Not in use.
     scratches: Mutex<Vec<Vec<(u32, Pair)>>>,
 }
@@ -52,24 +73,30 @@ impl Bins {
     /// Stage bin: finds the macro tiles that each splat touches.
     ///
     /// # Errors
-    /// More than [`MAX_INSTANCES`] (splat, tile) pairs.
+    /// More than [`MAX_INSTANCES`] (splat, tile) pairs; or [`Overflow`], if what the part of the frame holds from now on
+    /// takes more than `most_bytes`.
     pub(super) fn bin(
         &mut self,
         level: Level,
         projected: &Projected,
         views: &[View],
         cutoffs: &Cutoffs,
-    ) -> Result<(), RenderError> {
+        most_bytes: u64,
+    ) -> Result<(), PartError> {
+        let of_splats = (projected.places() * size_of::<Splat>()) as u64;
+        let most_bytes = most_bytes.saturating_sub(of_splats);
         self.grids.clear();
         self.grids.extend(views.iter().map(Grid::new));
         self.cut(projected.units());
         let total = AtomicU64::new(0);
+        let pairs = AtomicU64::new(0);
         let grids = &self.grids;
         let scratches = &self.scratches;
         let segments = self.segments[..self.used_segments].par_iter_mut().with_max_len(1);
         segments.for_each(|segment| {
             // Beyond the limit the frame fails whatever the rest holds, so the rest is skipped.
-            if total.load(Relaxed) > MAX_INSTANCES {
+            let is_over = bytes_of(pairs.load(Relaxed), total.load(Relaxed)) > most_bytes;
+            if is_over || total.load(Relaxed) > MAX_INSTANCES {
                 return;
             }
             let mut found = scratches.lock().pop().unwrap_or_default();
@@ -78,15 +105,32 @@ impl Bins {
             let counts = segment.counts.iter();
             let instances: u64 = counts.map(|counts| u64::from(counts.instances)).sum();
             total.fetch_add(instances, Relaxed);
+            pairs.fetch_add(found.len() as u64, Relaxed);
             segment.group(&found);
             scratches.lock().push(found);
         });
         self.instances = total.into_inner();
-        if self.instances > MAX_INSTANCES {
-            let what = "(Gaussian, tile) pairs";
-            return Err(RenderError::TooMany { what, limit: MAX_INSTANCES });
+        self.pairs = pairs.into_inner();
+        if bytes_of(self.pairs, self.instances) > most_bytes {
+            return Err(Overflow.into());
         }
+        check_instances(self.instances)?;
         Ok(())
+    }
+
+    /// Frees what segments keep of earlier frames if it is more than `most_bytes`: each may have been long in another
+    /// frame.
+    pub(super) fn trim(&mut self, most_bytes: u64) {
+        let bytes: usize = self.segments.iter().map(Segment::held_bytes).sum();
+        if bytes as u64 > most_bytes {
+            self.segments.clear();
+            self.used_segments = 0;
+        }
+    }
+
+    /// Bytes that a part of the frame holds until it is drawn, at most.
+    pub(super) fn held_bytes(&self, projected: &Projected) -> u64 {
+        (projected.places() * size_of::<Splat>()) as u64 + bytes_of(self.pairs, self.instances)
     }
 
     /// Stage sort of one macro tile: puts its splats in order of depth, and lists them by tile.

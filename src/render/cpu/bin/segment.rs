@@ -173,6 +173,11 @@ impl Segment {
         }
     }
 
+    /// Bytes of memory.
+    pub(super) fn held_bytes(&self) -> usize {
+        self.pairs.capacity() * size_of::<Pair>() + self.counts.capacity() * size_of::<Counts>()
+    }
+
     /// The pairs of a macro tile.
     pub(super) fn of(&self, number: usize) -> &[Pair] {
         let end_before = number.checked_sub(1).map_or(0, |before| self.counts[before].pairs);

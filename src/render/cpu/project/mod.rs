@@ -28,8 +28,10 @@ mod splat_block;
 mod unscented;
 
 use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use fearless_simd::{Level, dispatch, prelude::*};
+use glam::DVec3;
 use parking_lot::Mutex;
 use prefetch_index::prefetch_index;
 use rayon::prelude::*;
@@ -37,6 +39,8 @@ use rayon::prelude::*;
 use self::light::Light;
 use self::unscented::UnscentedChunkView;
 use super::lens::LensProjection;
+use super::part::Overflow;
+use super::slabs::{Slab, SlabOfJob};
 use crate::actor_views::ActorViews;
 use crate::layout::{ChunkShadow, ChunkView, Cutoffs, Frustum, Splat};
 use crate::unscented::UnscentedView;
@@ -90,7 +94,7 @@ struct NonPinholeView<'a> {
 }
 
 /// What one thread computes at a time: becomes one [`Unit`].
-struct Job<'a> {
+pub(super) struct Job<'a> {
     view: usize,
     chunk: &'a Chunk,
     clusters: Range<usize>,
@@ -105,6 +109,33 @@ impl Job<'_> {
     fn gaussians(&self) -> (usize, usize) {
         (std::ptr::from_ref(self.chunk).addr(), self.clusters.start)
     }
+
+    /// The clusters that the view may see: the number of each in the chunk, and
+    /// bounds of the depths of their centres, in metres.
+    pub(super) fn visible_clusters(&self) -> impl Iterator<Item = (usize, [f64; 2])> {
+        self.clusters.clone().filter_map(|number| {
+            let cluster = &self.chunk.clusters()[number];
+            let is_seen = self.projection.may_see(self.chunk, cluster);
+            is_seen.then(|| (number, self.projection.depths_m(cluster)))
+        })
+    }
+}
+
+/// Runs `work` with the jobs of a frame: one for each unit that a view may see, in order of (view, global id).
+pub(super) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_>]) -> R) -> R {
+    // What is the same for all chunks of a view or of an actor.
+    let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
+        frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
+    let actor_views = ActorViews::new(frame);
+    let from_actors = non_pinhole_from_actors(frame, &actor_views, &non_pinhole);
+    let shadows = ChunkShadow::by_chunk(frame.scene);
+    let mut jobs = Vec::new();
+    for (index, non_pinhole) in non_pinhole.iter().enumerate() {
+        add_twin(index, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
+        let from_actors = from_actors.get(index).map_or(&[][..], Vec::as_slice);
+        add_actors(index, frame, actor_views.of(index), from_actors, &mut jobs);
+    }
+    work(&jobs)
 }
 
 /// What the jobs of one chunk in one view share.
@@ -126,33 +157,41 @@ enum ChunkProjection<'a> {
 }
 
 impl Projected {
-    /// Projects every Gaussian of the scene into every view.
-    pub(super) fn project(&mut self, level: Level, frame: &Frame<'_>, cutoffs: &Cutoffs) {
+    /// Projects the Gaussians of all jobs, or those splats of them that are in a slab.
+    ///
+    /// # Errors
+    /// [`Overflow`]: there are more than `most_places` places for splats. Nothing is projected then.
+    pub(super) fn project(
+        &mut self,
+        level: Level,
+        jobs: &[Job<'_>],
+        cutoffs: &Cutoffs,
+        slab: Option<&Slab<'_>>,
+        most_places: usize,
+    ) -> Result<(), Overflow> {
         let Self { pages, units, free } = self;
         free.get_mut().append(pages);
-
-        // Prepare what is the same for all chunks of a view or of an actor, then one job per visible unit.
-        let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
-            frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
-        let actor_views = ActorViews::new(frame);
-        let from_actors = non_pinhole_from_actors(frame, &actor_views, &non_pinhole);
-        let shadows = ChunkShadow::by_chunk(frame.scene);
-        let mut jobs = Vec::new();
-        for (index, non_pinhole) in non_pinhole.iter().enumerate() {
-            add_twin(index, frame, non_pinhole.as_ref(), &shadows, &mut jobs);
-            let from_actors = from_actors.get(index).map_or(&[][..], Vec::as_slice);
-            add_actors(index, frame, actor_views.of(index), from_actors, &mut jobs);
-        }
+        units.clear();
 
         // In parallel: each job fills pages of its own. Views that see the same Gaussians follow each other, so that
         // these are read from memory once.
-        let mut order: Vec<usize> = (0..jobs.len()).collect();
+        let mut order: Vec<usize> = match slab {
+            None => (0..jobs.len()).collect(),
+            Some(slab) => slab.jobs().collect(),
+        };
         order.sort_by_key(|&index| jobs[index].gaussians());
+        let used_pages = AtomicUsize::new(0);
+        let most_pages = most_places >> PAGE_BITS;
         let filled: Vec<(usize, Vec<Page>)> = order
             .par_iter()
             .map_init(Vec::new, |splats, &index| {
                 splats.clear();
-                dispatch!(level, simd => project_unit(simd, &jobs[index], cutoffs, splats));
+                if used_pages.load(Relaxed) > most_pages {
+                    return (0, Vec::new());
+                }
+                let slab = slab.map(|slab| slab.of_job(index));
+                dispatch!(level, simd => project_unit(simd, &jobs[index], cutoffs, slab, splats));
+                used_pages.fetch_add(splats.len().div_ceil(PAGE), Relaxed);
                 (splats.len(), copy_to_pages(splats, free))
             })
             .collect();
@@ -162,12 +201,16 @@ impl Projected {
         }
 
         // In the order of the jobs: list the pages.
-        units.clear();
         for (job, (len, mut filled)) in jobs.iter().zip(by_job) {
             let Job { view, instance, .. } = *job;
             units.push(Unit { view, len, first_page: pages.len(), instance });
             pages.append(&mut filled);
         }
+        if used_pages.into_inner() > most_pages {
+            units.clear();
+            return Err(Overflow);
+        }
+        Ok(())
     }
 
     /// Number of splats.
@@ -260,6 +303,24 @@ impl<'a> ChunkProjection<'a> {
             Self::Pinhole { frustum, .. } => frustum.may_see(min_m, max_m, sigma_m),
             Self::Unscented(view) => view.may_see(chunk.origin_m(), min_m, max_m, sigma_m),
         }
+    }
+
+    /// Bounds of the depths of all centres in a cluster, in metres. They allow for rounding errors of 1e-5.
+    fn depths_m(&self, cluster: &Cluster) -> [f64; 2] {
+        let Cluster { min_m, max_m, .. } = *cluster;
+        let center_m = (0.5 * (min_m + max_m)).as_dvec3();
+        let half_m = (0.5 * (max_m - min_m)).as_dvec3();
+        let [depth_m, reach_m] = match self {
+            Self::Pinhole {
+                chunk_view: ChunkView { forward: [x, y, z, offset_m], .. }, ..
+            } => {
+                let forward = DVec3::new(*x, *y, *z);
+                [forward.dot(center_m) + offset_m, forward.abs().dot(half_m)]
+            }
+            Self::Unscented(view) => view.depth_m(center_m, half_m.length()),
+        };
+        let slack_m = 1e-5 * (depth_m.abs() + reach_m + center_m.length()) + 1e-6;
+        [depth_m - reach_m - slack_m, depth_m + reach_m + slack_m]
     }
 }
 
@@ -371,14 +432,25 @@ fn prefetch(columns: &[Lanes]) {
     }
 }
 
-/// Projects the visible clusters of a job, one block of 16 Gaussians after the other.
+/// Projects the visible clusters of a job, one block of 16 Gaussians after the other; of a slab only its splats.
 #[inline(always)]
-fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut Vec<Splat>) {
+fn project_unit<S: Simd>(
+    simd: S,
+    job: &Job<'_>,
+    cutoffs: &Cutoffs,
+    slab: Option<SlabOfJob<'_>>,
+    splats: &mut Vec<Splat>,
+) {
     let blocks = job.chunk.len().div_ceil(LANES);
     for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
-        if !job.projection.may_see(job.chunk, cluster) {
+        let may_see = match &slab {
+            None => job.projection.may_see(job.chunk, cluster),
+            Some(slab) => slab.touches(k),
+        };
+        if !may_see {
             continue;
         }
+        let before = splats.len();
         let light = job.light.on(cluster);
         let first = k * CLUSTER / LANES;
         for block in first..(first + CLUSTER / LANES).min(blocks) {
@@ -398,6 +470,9 @@ fn project_unit<S: Simd>(simd: S, job: &Job<'_>, cutoffs: &Cutoffs, splats: &mut
                 light.apply(simd, columns, &mut projected);
                 projected.append_visible(splats);
             }
+        }
+        if let Some(slab) = &slab {
+            slab.keep(cutoffs, splats, before);
         }
     }
 }

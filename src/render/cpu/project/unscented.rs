@@ -19,7 +19,7 @@ use crate::cpu::lanes::Vec3x16;
 use crate::cpu::lens::{ExpandedAxes, ExposedPixels, LensProjection, Remainder};
 use crate::expansion::ExpansionBound;
 use crate::layout::{Cutoffs, Filtered, PixelFilter};
-use crate::unscented::{Footprint, UnscentedView};
+use crate::unscented::{CullBound, Footprint, UnscentedView};
 use wildcity_scene::chunk::{LANES, Lanes, column};
 use wildcity_scene::{Chunk, RenderProfile};
 
@@ -77,6 +77,22 @@ impl<'a> UnscentedChunkView<'a> {
     #[inline(always)]
     pub(super) fn may_see(&self, origin_m: DVec3, min_m: Vec3, max_m: Vec3, sigma_m: f32) -> bool {
         self.unscented.may_see(origin_m, min_m, max_m, sigma_m)
+    }
+
+    /// A depth, and how far the depths of all centres in a ball can be from it while the camera moves, in metres. The
+    /// ball is relative to the chunk's origin.
+    pub(super) fn depth_m(&self, center_m: DVec3, radius_m: f64) -> [f64; 2] {
+        let CullBound { translation_m, rotation_rad, .. } = *self.unscented.cull_bound();
+        let at_end_m = self
+            .camera_from_chunk
+            .map(|[x, y, z, offset_m]| DVec3::new(x, y, z).dot(center_m) + offset_m);
+        let distance_m = DVec3::from_array(at_end_m).length();
+        let reach_m = radius_m + translation_m;
+        match self.depth_is_distance {
+            true => [distance_m, reach_m],
+            // A rotation moves a point by at most its angle times the distance.
+            false => [at_end_m[2], reach_m + rotation_rad * (distance_m + reach_m)],
+        }
     }
 }
 

@@ -1,0 +1,249 @@
+//! Draws a frame within the memory that it may have between its stages: all views at once, or one half of them after
+//! the other, or one view slab by slab. The images do not depend on it.
+
+use fearless_simd::Level;
+
+use super::part::{FramePart, PartError};
+use super::project::{self, Job};
+use super::slabs::{Cut, DepthClusters, Slab};
+use super::unfinished::{Continued, UnfinishedTiles};
+use super::{Scratch, StageTimer, bin, rasterize};
+use crate::layout::Cutoffs;
+use crate::stage::Stage;
+use crate::{Frame, FrameStats, OnViewDone, RenderError, Target, View, limits};
+
+/// A frame that is being drawn.
+pub(super) struct Drawing<'a> {
+    pub(super) level: Level,
+    pub(super) cutoffs: &'a Cutoffs,
+    /// Most bytes between the stages.
+    pub(super) most_bytes: u64,
+    pub(super) scratch: &'a mut Scratch,
+    pub(super) finished: OnViewDone<'a>,
+    pub(super) stats: FrameStats,
+}
+
+/// The most that is held while such views are drawn with `most_bytes` between the stages: these, the sums of one view
+/// that is drawn in slabs, and what each thread copies of a macro tile.
+pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
+    let sums = views.iter().map(UnfinishedTiles::bytes).max().unwrap_or(0);
+    most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
+}
+
+/// The stages project and bin of a part of a frame.
+pub(super) struct Stages<'a> {
+    pub(super) level: Level,
+    pub(super) frame: &'a Frame<'a>,
+    pub(super) cutoffs: &'a Cutoffs,
+    /// Most bytes that they may leave.
+    pub(super) most_bytes: u64,
+}
+
+impl Stages<'_> {
+    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part of `scratch`, so what an earlier
+    /// frame left there, even one that panicked, does not matter.
+    pub(super) fn run(
+        &self,
+        scratch: &mut Scratch,
+        jobs: &[Job<'_>],
+        slab: Option<&Slab<'_>>,
+        last: Stage,
+        stats: &mut FrameStats,
+    ) -> Result<(), PartError> {
+        let Self { level, frame, cutoffs, most_bytes } = *self;
+        let Scratch { projected, bins, .. } = scratch;
+        let mut timer = StageTimer::start();
+        // Each splat has one pair at least, nearly always.
+        let most_places = most_bytes / limits::LEAST_SPLAT_BYTES;
+        let most_places = usize::try_from(most_places).unwrap_or(usize::MAX);
+        let done = projected.project(level, jobs, cutoffs, slab, most_places);
+        timer.finish("project", stats);
+        done?;
+        if last >= Stage::Bin {
+            let done = bins.bin(level, projected, frame.views, cutoffs, most_bytes);
+            timer.finish("bin", stats);
+            done?;
+            stats.instances += bins.instances();
+        }
+        stats.visible_pairs += projected.len() as u64;
+        Ok(())
+    }
+}
+
+impl Drawing<'_> {
+    /// Draws a part of the frame.
+    pub(super) fn draw(
+        &mut self,
+        part: FramePart<'_>,
+        targets: &mut [Target<'_>],
+    ) -> Result<(), RenderError> {
+        let most_bytes = self.most_bytes_of(&part);
+        let most_splats = usize::try_from(most_bytes / limits::SPLAT_BYTES).unwrap_or(usize::MAX);
+        if part.max_splats(most_splats) <= most_splats {
+            match self.draw_at_once(part, targets, most_bytes) {
+                Ok(()) => return Ok(()),
+                Err(PartError::Render(error)) => return Err(error),
+                // Only the stages can tell how many macro tiles the splats touch.
+                Err(PartError::Overflow) => {}
+            }
+        }
+        if part.frame.views.len() == 1 {
+            return self.draw_slabs(part, targets, most_bytes);
+        }
+        let [first, second] = part.halves();
+        let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
+        self.draw(first, of_first)?;
+        self.draw(second, of_second)
+    }
+
+    /// A single view may have as much as its sums would take if it were drawn in slabs.
+    fn most_bytes_of(&self, part: &FramePart<'_>) -> u64 {
+        match part.frame.views {
+            [view] => self.most_bytes.max(UnfinishedTiles::bytes(view)),
+            _ => self.most_bytes,
+        }
+    }
+
+    fn draw_at_once(
+        &mut self,
+        part: FramePart<'_>,
+        targets: &mut [Target<'_>],
+        most_bytes: u64,
+    ) -> Result<(), PartError> {
+        let Self { level, cutoffs, .. } = *self;
+        let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes };
+        project::with_jobs(&part.frame, |jobs| {
+            stages.run(self.scratch, jobs, None, Stage::Bin, &mut self.stats)
+        })?;
+        self.rasterize(part, targets, None);
+        Ok(())
+    }
+
+    /// Draws one view slab by slab.
+    fn draw_slabs(
+        &mut self,
+        part: FramePart<'_>,
+        targets: &mut [Target<'_>],
+        most_bytes: u64,
+    ) -> Result<(), RenderError> {
+        let [view] = part.frame.views else { return Ok(()) };
+        let tiles = UnfinishedTiles::new(view);
+        project::with_jobs(&part.frame, |jobs| {
+            let mut timer = StageTimer::start();
+            let clusters = DepthClusters::new(jobs, self.cutoffs);
+            timer.finish("project", &mut self.stats);
+            let mut slabs = Slabs::new(&clusters, most_bytes);
+            let mut instances = 0;
+            while let Some(cut) = slabs.next() {
+                // What cannot be cut any more is one job at one depth.
+                let is_whole = cut.halves().is_none();
+                let most_bytes = if is_whole { u64::MAX } else { most_bytes };
+                let Self { level, cutoffs, .. } = *self;
+                let stages = Stages { level, frame: &part.frame, cutoffs, most_bytes };
+                let slab = Slab { cut: &cut, clusters: &clusters };
+                let run = stages.run(self.scratch, jobs, Some(&slab), Stage::Bin, &mut self.stats);
+                match run {
+                    Err(PartError::Overflow) => {
+                        slabs.halve(&cut);
+                        continue;
+                    }
+                    Err(PartError::Render(error)) => return Err(error),
+                    Ok(()) => {}
+                }
+                let Scratch { projected, bins, .. } = &*self.scratch;
+                instances += bins.instances();
+                bin::check_instances(instances)?;
+                slabs.drew(bins.held_bytes(projected));
+                let continued = Continued { tiles: &tiles, is_last: slabs.is_done() };
+                self.rasterize(part, targets, Some(continued));
+            }
+            Ok(())
+        })
+    }
+
+    fn rasterize(
+        &mut self,
+        part: FramePart<'_>,
+        targets: &mut [Target<'_>],
+        continued: Option<Continued<'_>>,
+    ) {
+        let FramePart { frame, backgrounds, first_view } = part;
+        let Scratch { projected, bins, rasterizer } = &mut *self.scratch;
+        let cutoffs = self.cutoffs;
+        let sums_bytes = continued.map_or(0, |slab| slab.tiles.held_bytes());
+        let held_bytes = bins.held_bytes(projected) + sums_bytes;
+        self.stats.held_bytes = self.stats.held_bytes.max(held_bytes);
+        let mut timer = StageTimer::start();
+        let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
+        let finished =
+            |view: usize, target: &Target<'_>| (self.finished)(first_view + view, target);
+        let work =
+            rasterize::rasterize(self.level, input, continued, rasterizer, targets, &finished);
+        self.stats.evaluations += work.evaluations;
+        let stages = [("sort", work.sort_ns), ("rasterize", work.rasterize_ns)];
+        timer.finish_both(stages, &mut self.stats);
+    }
+}
+
+/// The slabs of a view that are still to be drawn.
+struct Slabs<'a> {
+    clusters: &'a DepthClusters,
+    most_bytes: u64,
+    /// Halves of slabs that had too many splats, the nearest last.
+    halves: Vec<Cut>,
+    /// Where the slab after those begins.
+    next_key: u32,
+    /// What a Gaussian is expected to take, and the estimated number of Gaussians in the last slab.
+    bytes_each: f64,
+    gaussians: f64,
+}
+
+impl<'a> Slabs<'a> {
+    fn new(clusters: &'a DepthClusters, most_bytes: u64) -> Self {
+        Self {
+            clusters,
+            most_bytes,
+            halves: Vec::new(),
+            next_key: clusters.keys().start,
+            bytes_each: limits::SPLAT_BYTES as f64,
+            gaussians: 0.0,
+        }
+    }
+
+    fn is_done(&self) -> bool {
+        self.halves.is_empty() && self.next_key >= self.clusters.keys().end
+    }
+
+    /// The nearest slab that is not drawn.
+    fn next(&mut self) -> Option<Cut> {
+        if let Some(cut) = self.halves.pop() {
+            return Some(cut);
+        }
+        if self.is_done() {
+            return None;
+        }
+        // An eighth is left for what the estimate misses.
+        let gaussians = 0.875 * self.most_bytes as f64 / self.bytes_each;
+        let (cut, estimated) = self.clusters.next(self.next_key, gaussians);
+        self.next_key = cut.keys.end;
+        self.gaussians = estimated;
+        Some(cut)
+    }
+
+    /// The last slab takes so many bytes.
+    fn drew(&mut self, bytes: u64) {
+        // A small slab tells little of the next one.
+        if self.halves.is_empty() && self.gaussians >= 4096.0 {
+            self.bytes_each =
+                (bytes as f64 / self.gaussians).max(limits::SPLAT_BYTES as f64 / 16.0);
+        }
+    }
+
+    /// The last slab had too many splats.
+    fn halve(&mut self, cut: &Cut) {
+        self.gaussians *= 0.5;
+        if let Some([near, far]) = cut.halves() {
+            self.halves.extend([far, near]);
+        }
+    }
+}
