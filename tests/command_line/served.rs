@@ -70,9 +70,19 @@ impl Served {
 
     /// Resident memory, in bytes.
     pub(crate) fn rss(&self) -> u64 {
+        self.status("VmRSS:") << 10
+    }
+
+    /// Number of threads.
+    pub(crate) fn threads(&self) -> u64 {
+        self.status("Threads:")
+    }
+
+    /// A number that the system knows of the process.
+    fn status(&self, name: &str) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
+        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse().unwrap()
     }
 
     pub(crate) async fn whole_session(&self, steps: u32) {
