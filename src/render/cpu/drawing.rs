@@ -3,7 +3,8 @@
 
 use fearless_simd::Level;
 
-use super::part::{FramePart, PartError};
+use super::overflow::PartError;
+use super::part::FramePart;
 use super::project::{self, Job};
 use super::slabs::{Cut, DepthClusters, Slab};
 use super::unfinished::{Continued, UnfinishedTiles};
@@ -130,7 +131,8 @@ impl Drawing<'_> {
         let tiles = UnfinishedTiles::new(view);
         project::with_jobs(&part.frame, |jobs| {
             let mut timer = StageTimer::start();
-            let clusters = DepthClusters::new(jobs, self.cutoffs);
+            let clusters =
+                DepthClusters::new(jobs.len(), |job| jobs[job].visible_clusters(), self.cutoffs);
             timer.finish("project", &mut self.stats);
             let mut slabs = Slabs::new(&clusters, most_bytes);
             let mut instances = 0;

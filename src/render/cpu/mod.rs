@@ -13,6 +13,7 @@ mod export;
 mod lanes;
 mod lens;
 mod math;
+mod overflow;
 mod part;
 mod project;
 mod rasterize;
@@ -33,7 +34,8 @@ use crate::limits;
 
 use self::background::Background;
 use self::drawing::{Drawing, Stages};
-use self::part::{FramePart, PartError};
+use self::overflow::PartError;
+use self::part::FramePart;
 use super::layout::Cutoffs;
 use super::stage::{Stage, StageOutputs};
 use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};

@@ -5,33 +5,8 @@ use rayon::prelude::*;
 use super::background::Background;
 use crate::layout::Frustum;
 use crate::unscented::UnscentedView;
-use crate::{Frame, RenderError, View};
+use crate::{Frame, View};
 use wildcity_scene::chunk::{CLUSTER, Cluster};
-
-/// A part of a frame needs more memory than it may have between its stages.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Overflow;
-
-/// Why a part of a frame was not drawn.
-#[derive(Debug)]
-pub(super) enum PartError {
-    /// It is to be drawn in smaller parts.
-    Overflow,
-    /// The frame fails.
-    Render(RenderError),
-}
-
-impl From<Overflow> for PartError {
-    fn from(_: Overflow) -> Self {
-        Self::Overflow
-    }
-}
-
-impl From<RenderError> for PartError {
-    fn from(error: RenderError) -> Self {
-        Self::Render(error)
-    }
-}
 
 /// Some of a frame's views, which are rendered together.
 #[derive(Clone, Copy)]

@@ -13,7 +13,6 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::project::Job;
 use crate::layout::{Cutoffs, Splat};
 use wildcity_scene::chunk::CLUSTER;
 
@@ -69,19 +68,21 @@ pub(super) struct SlabOfJob<'a> {
 }
 
 impl DepthClusters {
-    /// The clusters of all jobs of one view.
-    pub(super) fn new(jobs: &[Job<'_>], cutoffs: &Cutoffs) -> Self {
+    /// The clusters of all jobs of one view: of each job the number of each cluster that the view may see, and bounds of
+    /// the depths of its centres, in metres.
+    pub(super) fn new<C: Iterator<Item = (usize, [f64; 2])>>(
+        jobs: usize,
+        visible_clusters: impl Fn(usize) -> C + Sync,
+        cutoffs: &Cutoffs,
+    ) -> Self {
         let key = |depth_m: f64| cutoffs.sort_key(0, (depth_m as f32).max(cutoffs.near_m));
-        let of_job = |job: &Job<'_>| -> Vec<DepthCluster> {
-            let clusters = job.visible_clusters();
-            let cluster = |(number, [least_m, most_m]): (usize, [f64; 2])| DepthCluster {
-                number: number as u32,
-                first_key: key(least_m),
-                last_key: key(most_m),
-            };
-            clusters.map(cluster).collect()
+        let cluster = |(number, [least_m, most_m]): (usize, [f64; 2])| DepthCluster {
+            number: number as u32,
+            first_key: key(least_m),
+            last_key: key(most_m),
         };
-        let by_job: Vec<Vec<DepthCluster>> = jobs.par_iter().map(of_job).collect();
+        let of_job = |job| visible_clusters(job).map(cluster).collect();
+        let by_job: Vec<Vec<DepthCluster>> = (0..jobs).into_par_iter().map(of_job).collect();
         let ends = by_job.iter().scan(0, |end, clusters| {
             *end += clusters.len();
             Some(*end)

@@ -22,7 +22,7 @@ use fearless_simd::{Level, dispatch};
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
-use super::part::{Overflow, PartError};
+use super::overflow::{Overflow, PartError};
 use super::project::{Projected, Unit};
 use crate::constants::MAX_INSTANCES;
 use crate::layout::{Cutoffs, Splat};

@@ -39,7 +39,7 @@ use rayon::prelude::*;
 use self::light::Light;
 use self::unscented::UnscentedChunkView;
 use super::lens::LensProjection;
-use super::part::Overflow;
+use super::overflow::Overflow;
 use super::slabs::{Slab, SlabOfJob};
 use crate::actor_views::ActorViews;
 use crate::layout::{ChunkShadow, ChunkView, Cutoffs, Frustum, Splat};
