@@ -23,6 +23,9 @@ use crate::pin::pin;
 use crate::scenario::assets::{FrameDetail, Placement};
 use crate::viewpoint::viewpoints;
 
+/// Bytes of a pixel of a still: the pixels, and a copy that is encoded.
+const STILL_PIXEL_BYTES: u64 = 6;
+
 /// One image to render.
 #[derive(Clone, Debug)]
 pub struct Still {
@@ -172,10 +175,6 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
     image.map(|image| image.file)
 }
 
-/// The focal length of the finest view, and how far the views are from their middle.
-/// Bytes of a pixel of a still: the pixels, and a copy that is encoded.
-const STILL_PIXEL_BYTES: u64 = 6;
-
 /// What a frame of stills takes beside its scene. Of more than [`MAX_VIEWS`] views several frames are made.
 fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     let frames = views.chunks(MAX_VIEWS).map(|views| {
@@ -185,6 +184,7 @@ fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     frames.max_by_key(FrameBytes::sum).unwrap_or_default()
 }
 
+/// The focal length of the finest view, and how far the views are from their middle.
 fn extent(views: &[View]) -> RigExtent {
     let viewpoints = viewpoints(views);
     let count = viewpoints.len().max(1) as f64;

@@ -88,8 +88,8 @@ impl Drawing<'_> {
                 Err(PartError::Overflow) => {}
             }
         }
-        if part.frame.views.len() == 1 {
-            return self.draw_slabs(part, targets, most_bytes);
+        if let [view] = part.frame.views {
+            return self.draw_slabs(part, view, targets, most_bytes);
         }
         let [first, second] = part.halves();
         let (of_first, of_second) = targets.split_at_mut(first.frame.views.len());
@@ -120,14 +120,14 @@ impl Drawing<'_> {
         Ok(())
     }
 
-    /// Draws one view slab by slab.
+    /// Draws the only view of a part slab by slab.
     fn draw_slabs(
         &mut self,
         part: FramePart<'_>,
+        view: &View,
         targets: &mut [Target<'_>],
         most_bytes: u64,
     ) -> Result<(), RenderError> {
-        let [view] = part.frame.views else { return Ok(()) };
         let tiles = UnfinishedTiles::new(view);
         project::with_jobs(&part.frame, |jobs| {
             let mut timer = StageTimer::start();
