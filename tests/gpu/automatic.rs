@@ -4,16 +4,12 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use wildcity_render::automatic::{SelfTestError, self_test};
-use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_render::gpu::shaders::Shaders;
 use wildcity_render::reference::Reference;
 use wildcity_render::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target};
 
 use crate::gpu::{gpu, gpu_with};
-
-fn cpu() -> Cpu {
-    Cpu::new(1, Simd::Best).unwrap()
-}
+use crate::images::cpu;
 
 /// The reference, which keeps its images: linear colour and opacity.
 #[derive(Default)]
