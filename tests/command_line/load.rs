@@ -53,7 +53,7 @@ async fn two_laps(steps: u64) {
     agent.hello().await;
     let dynamics = json!({ "model": "dynamic", "speed": 5.0 });
     agent.open(json!({ "dynamics": dynamics, "outputs": { "encoding": "raw" } })).await;
-    let (mut laps, mut early) = (Vec::new(), None);
+    let (mut laps, mut early_bytes) = (Vec::new(), None);
     for _ in 0..2 {
         agent.look(json!({ "type": "reset" })).await;
         let mut lap = blake3::Hasher::new();
@@ -67,22 +67,16 @@ async fn two_laps(steps: u64) {
             lap.update(seen.frame_hash().as_bytes());
             lap.update(seen.meta["ego"].to_string().as_bytes());
             if step == steps / 2 {
-                early.get_or_insert_with(|| (served.rss(), served.threads()));
+                early_bytes.get_or_insert_with(|| served.rss_without_files());
             }
         }
         laps.push(lap.finalize());
     }
     assert_eq!(laps[0], laps[1], "what is driven twice is the same");
-    let ((early, early_threads), late) = (early.unwrap(), served.rss());
-    let more_threads = served.threads().saturating_sub(early_threads);
-    eprintln!(
-        "2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end, \
-         {more_threads} more threads"
-    );
-    // A leak of 70 B per step would be detected over 10,000 steps. A thread that a busy machine makes the server start
-    // has memory of its own.
-    let most = early + ((1 + 2 * more_threads) << 20);
-    assert!(late < most, "{early} bytes grew to {late}");
+    let (early, late) = (early_bytes.unwrap(), served.rss_without_files());
+    eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
+    // A leak of 70 B per step would be detected over 10,000 steps.
+    assert!(late < early + (1 << 20), "{early} bytes grew to {late}");
 }
 
 #[tokio::test]

@@ -70,19 +70,21 @@ impl Served {
 
     /// Resident memory, in bytes.
     pub(crate) fn rss(&self) -> u64 {
-        self.status("VmRSS:") << 10
+        self.resident(&["VmRSS:"])
     }
 
-    /// Number of threads.
-    pub(crate) fn threads(&self) -> u64 {
-        self.status("Threads:")
+    /// The same without pages of files: the system drops those of the program and reads them again.
+    pub(crate) fn rss_without_files(&self) -> u64 {
+        self.resident(&["RssAnon:", "RssShmem:"])
     }
 
-    /// A number that the system knows of the process.
-    fn status(&self, name: &str) -> u64 {
+    fn resident(&self, kinds: &[&str]) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let line = status.lines().find(|line| line.starts_with(name)).unwrap();
-        line.split_whitespace().nth(1).unwrap().parse().unwrap()
+        let bytes = |kind: &&str| {
+            let line = status.lines().find(|line| line.starts_with(*kind)).unwrap();
+            line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
+        };
+        kinds.iter().map(bytes).sum()
     }
 
     pub(crate) async fn whole_session(&self, steps: u32) {
