@@ -70,21 +70,9 @@ impl Served {
 
     /// Resident memory, in bytes.
     pub(crate) fn rss(&self) -> u64 {
-        self.resident(&["VmRSS:"])
-    }
-
-    /// The same without pages of files: the system drops those of the program and reads them again.
-    pub(crate) fn rss_without_files(&self) -> u64 {
-        self.resident(&["RssAnon:", "RssShmem:"])
-    }
-
-    fn resident(&self, kinds: &[&str]) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
-        let bytes = |kind: &&str| {
-            let line = status.lines().find(|line| line.starts_with(*kind)).unwrap();
-            line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
-        };
-        kinds.iter().map(bytes).sum()
+        let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
+        line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() << 10
     }
 
     pub(crate) async fn whole_session(&self, steps: u32) {

@@ -4,7 +4,7 @@ use wildcity_episode::{self as episode, ActorsLine, EventLine, scenario_line};
 use wildcity_scene::Rig;
 
 use super::Session;
-use crate::blocking::{run_blocking, run_in_place};
+use crate::blocking::run_blocking;
 use crate::episode::{Episode, Outcome};
 use crate::error::SessionError;
 use crate::observe::builder::finish::RenderedObservation;
@@ -31,12 +31,10 @@ impl Session {
         let shown = traffic.or(self.state.traffic.as_ref().filter(|_| is_first));
         let mut lines = shown.map_or(Vec::new(), |shown| traffic_lines(shown, &frame, is_first));
         lines.push(Line::Frame(frame));
-        match &self.recorder {
+        match self.recorder.clone() {
             Some(recorder) => {
-                if self.version_switched {
-                    lines.insert(0, self.version_line());
-                }
-                append(recorder, &lines)?;
+                let version = self.version_switched.then(|| self.version_line());
+                append(recorder, version.into_iter().chain(lines).collect()).await?;
             }
             None => {
                 let origin = self.origin.clone();
@@ -178,7 +176,7 @@ impl Session {
         }
         lines.push(Line::End(summary));
         let record = recorder.path().to_owned();
-        if let Err(error) = append(&recorder, &lines) {
+        if let Err(error) = append(recorder, lines).await {
             tracing::warn!(session = self.name, "the episode's summary was not recorded: {error}");
         }
         // A record without an end is exported as well: it is as whole as it will be.
@@ -235,8 +233,8 @@ fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<Recorded
     (recorded != RecordedSettings::default_of(cameras, settings.dt_us)).then_some(recorded)
 }
 
-fn append(recorder: &Recorder, lines: &[Line]) -> Result<(), SessionError> {
-    Ok(run_in_place(|| logged(recorder.append(lines)))?)
+async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError> {
+    Ok(run_blocking(move || logged(recorder.append(&lines))).await??)
 }
 
 /// Logs a failure: it concerns the operator, and the client may not tell him.
