@@ -9,8 +9,8 @@ use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// Files that describe a SOG; the first is that of a streamed one.
-const METAS: [&str; 2] = ["lod-meta.json", "meta.json"];
+use wildcity_twin::ingest::SOG_DESCRIPTIONS;
+
 /// Endings of the files that a SOG consists of.
 const ENDINGS: [&str; 2] = ["json", "webp"];
 /// Size from which an entry needs the fields of zip64, in bytes.
@@ -34,19 +34,21 @@ impl PackedFolder {
 /// # Errors
 /// The folder has no SOG, or cannot be read; the archive cannot be written.
 pub(super) fn pack(path: &Path, is_only: bool) -> anyhow::Result<Option<PackedFolder>> {
-    let is_meta = METAS.iter().any(|meta| path.file_name().is_some_and(|name| name == *meta));
+    let is_description = path
+        .file_name()
+        .is_some_and(|name| SOG_DESCRIPTIONS.iter().any(|description| name == *description));
     let folder = match path {
         path if path.is_dir() => path.to_owned(),
-        path if is_only && is_meta && path.is_file() => {
+        path if is_only && is_description && path.is_file() => {
             path.parent().filter(|folder| *folder != "").unwrap_or(Path::new(".")).to_owned()
         }
         _ => return Ok(None),
     };
     anyhow::ensure!(
-        METAS.iter().any(|meta| folder.join(meta).is_file()),
+        SOG_DESCRIPTIONS.iter().any(|description| folder.join(description).is_file()),
         "{} is a folder without {}: give a scene file, and the files that it names",
         folder.display(),
-        METAS.join(" or ")
+        SOG_DESCRIPTIONS.join(" or ")
     );
     let packed = write(&folder).with_context(|| format!("cannot pack {}", folder.display()))?;
     Ok(Some(packed))

@@ -266,8 +266,8 @@ pub trait Backend: Send + Sync {
     fn limit_frame_bytes(&self, _bytes: u64) {}
 
     /// The most that it holds in the machine's memory between the stages of a frame of these views, whatever the scene,
-    /// in bytes.
-    fn frame_bytes(&self, _views: &[View]) -> u64 {
+    /// in bytes. If `is_large`, this includes a small frame that it renders beside this one.
+    fn frame_bytes(&self, _views: &[View], _is_large: bool) -> u64 {
         0
     }
 

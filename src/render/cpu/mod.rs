@@ -7,7 +7,9 @@
 
 mod appearance;
 mod background;
+mod batch;
 mod bin;
+mod blend;
 mod drawing;
 mod export;
 mod lanes;
@@ -221,8 +223,10 @@ impl Backend for Cpu {
         self.lane_bytes.store(accepted_bytes, Relaxed);
     }
 
-    fn frame_bytes(&self, views: &[View]) -> u64 {
-        drawing::most_held_bytes(self.lane_bytes.load(Relaxed), views, self.threads())
+    fn frame_bytes(&self, views: &[View], is_large: bool) -> u64 {
+        let bytes = drawing::most_held_bytes(self.lane_bytes.load(Relaxed), views, self.threads());
+        let side_bytes = if is_large { bytes / SIDE_SHARE } else { 0 };
+        bytes + side_bytes
     }
 
     fn render(

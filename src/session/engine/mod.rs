@@ -310,13 +310,9 @@ impl Engine {
 
     /// What a frame of some views takes beside its scene and its images.
     pub(crate) fn frame_bytes(&self, views: &[View]) -> FrameBytes {
-        let backend = self.queue.backend();
-        let stages = backend.frame_bytes(views);
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        // Beside a large frame another one is rendered, which may have a quarter of its memory.
-        let has_other = backend.renders_beside() && pixels > limits::LARGE_PIXELS;
-        let beside = if has_other { stages / 4 } else { 0 };
-        FrameBytes { stages: stages + beside, images: 0 }
+        let stages = self.queue.backend().frame_bytes(views, pixels > limits::LARGE_PIXELS);
+        FrameBytes { stages, images: 0 }
     }
 
     /// Memory that the worst frame of a rig needs, in bytes.

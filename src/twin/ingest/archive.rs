@@ -20,7 +20,7 @@ pub(super) fn read(bytes: Vec<u8>, budget: UnpackBudget) -> Result<Gaussians, In
         let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
         return nurec::read(&payload, archive.budget());
     }
-    let Some(name) = archive.find(|name| ["lod-meta.json", "meta.json"].contains(&name)) else {
+    let Some(name) = archive.find(|name| sog::DESCRIPTIONS.contains(&name)) else {
         let reason = match archive.find(|name| name == "data.pkl") {
             Some(_) => "it is a checkpoint of PyTorch: convert it to safetensors with \
                         python -m wildcity.convert"

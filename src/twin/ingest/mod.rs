@@ -49,6 +49,7 @@ pub use objects::TrackedObject;
 pub use progress::Progress;
 pub use read_limits::{ReadLimits, StopFlag};
 pub use scene_files::ListedFiles;
+pub use sog::DESCRIPTIONS as SOG_DESCRIPTIONS;
 pub use tracked::read_tracked;
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 

@@ -23,6 +23,9 @@ use meta::{Meta, Tables};
 
 const FORMAT: &str = "SOG";
 
+/// Files that describe a SOG: that of a streamed scene first, which has the other one in its folders as well.
+pub const DESCRIPTIONS: [&str; 2] = [streamed::NAME, "meta.json"];
+
 /// Reads a scene, given its meta.json or lod-meta.json and the folder of that file, which is empty
 /// or ends in `/`.
 pub(super) fn read(

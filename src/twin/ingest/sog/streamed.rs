@@ -14,7 +14,7 @@ use wildcity_scene::Gaussians;
 
 use super::{bad, read_one};
 
-const NAME: &str = "lod-meta.json";
+pub(super) const NAME: &str = "lod-meta.json";
 
 /// The keys of lod-meta.json that are used; others are skipped.
 #[derive(Deserialize)]
