@@ -1,0 +1,115 @@
+#!/usr/bin/env python3
+"""Runs the test executables that cargo has built, and other commands, two at a time.
+
+    cargo test --no-run --message-format=json-render-diagnostics >MESSAGES
+    .ci/run_tests.py MESSAGES [NAME FOLDER COMMAND]...
+
+One after the other, as `cargo test` runs them, they leave a quarter of two cores unused: some wait for disks, sockets and
+time limits while others compute. Each runs in the folder of its package, as under cargo. What one prints appears when it
+has ended. All run, whatever fails.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+# These measure times, and run before the others, one after the other.
+ALONE = ["suite", "session"]
+# These take longest, and begin first. One that computes stands before one that waits.
+LONG = ["gpu", "command_line", "Python client", "stress", "store", "viewer", "render"]
+AT_ONCE = 2
+
+
+class Job(NamedTuple):
+    name: str
+    folder: str
+    command: list[str]
+
+
+def tests(messages: Path) -> list[Job]:
+    """The test executables of all packages, unit tests among them."""
+    jobs = []
+    for line in messages.read_text().splitlines():
+        message = json.loads(line)
+        if message.get("reason") == "compiler-artifact" and message["executable"] and message["profile"]["test"]:
+            folder = os.path.dirname(message["manifest_path"])
+            kind = message["target"]["kind"][0]
+            name = message["target"]["name"] if kind == "test" else f"{message['target']['name']} ({kind})"
+            jobs.append(Job(name, folder, [message["executable"]]))
+    return jobs
+
+
+def run(job: Job) -> tuple[bool, float]:
+    began = time.monotonic()
+    with tempfile.TemporaryFile() as output:
+        environment = {**os.environ, "CARGO_MANIFEST_DIR": job.folder}
+        status = subprocess.run(
+            job.command, cwd=job.folder, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
+        ).returncode
+        took_s = time.monotonic() - began
+        output.seek(0)
+        said = output.read().decode(errors="replace")
+    with PRINTS:
+        print(f"\n== {job.name}: {took_s:.0f} s, exit status {status}\n{said}", flush=True)
+    return status == 0, took_s
+
+
+PRINTS = threading.Lock()
+
+
+def main() -> None:
+    messages, *others = sys.argv[1:]
+    jobs = tests(Path(messages))
+    if not jobs:
+        sys.exit(f"{messages} names no test executable")
+    jobs += [Job(name, folder, ["bash", "-c", command]) for name, folder, command in zip(*[iter(others)] * 3, strict=True)]
+    names = [job.name for job in jobs]
+    if unknown := [name for name in ALONE + LONG if name not in names and name not in ("Python client", "viewer")]:
+        sys.exit(f".ci/run_tests.py: no test is called {', '.join(unknown)}")
+
+    failed = []
+    took: dict[str, float] = {}
+
+    def finish(job: Job) -> None:
+        passed, took[job.name] = run(job)
+        if not passed:
+            failed.append(job.name)
+
+    for job in jobs:
+        if job.name in ALONE:
+            finish(job)
+    waiting = [job for job in jobs if job.name not in ALONE]
+    waiting.sort(key=lambda job: LONG.index(job.name) if job.name in LONG else len(LONG))
+    queue = iter(waiting)
+    takes = threading.Lock()
+
+    def work() -> None:
+        while True:
+            with takes:
+                job = next(queue, None)
+            if job is None:
+                return
+            finish(job)
+
+    threads = [threading.Thread(target=work) for _ in range(AT_ONCE)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    print("\n== times of tests")
+    for name, took_s in sorted(took.items(), key=lambda item: -item[1]):
+        if took_s >= 1.0:
+            print(f"{took_s:6.0f} s  {name}")
+    print(f"{len(took) - len(failed)} of {len(took)} passed")
+    if failed:
+        sys.exit(f"failed: {', '.join(failed)}")
+
+
+main()
