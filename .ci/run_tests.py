@@ -77,9 +77,10 @@ def main() -> None:
     took: dict[str, float] = {}
 
     def finish(job: Job) -> None:
+        failed.append(job.name)
         passed, took[job.name] = run(job)
-        if not passed:
-            failed.append(job.name)
+        if passed:
+            failed.remove(job.name)
 
     for job in jobs:
         if job.name in ALONE:
@@ -107,9 +108,10 @@ def main() -> None:
     for name, took_s in sorted(took.items(), key=lambda item: -item[1]):
         if took_s >= 1.0:
             print(f"{took_s:6.0f} s  {name}")
-    print(f"{len(took) - len(failed)} of {len(took)} passed")
-    if failed:
-        sys.exit(f"failed: {', '.join(failed)}")
+    print(f"{len(took) - len(failed)} of {len(jobs)} passed")
+    if failed or len(took) != len(jobs):
+        not_run = [job.name for job in jobs if job.name not in took and job.name not in failed]
+        sys.exit(f"failed: {', '.join(failed) or 'none'}; not run: {', '.join(not_run) or 'none'}")
 
 
 main()

@@ -81,12 +81,18 @@ fn write(folder: &Path) -> anyhow::Result<PackedFolder> {
 fn collect(folder: &Path, prefix: &str, names: &mut Vec<String>) -> anyhow::Result<()> {
     for entry in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
         let entry = entry?;
-        let Ok(name) = entry.file_name().into_string() else { continue };
         let path = entry.path();
         let is_part = ENDINGS.iter().any(|ending| path.extension().is_some_and(|e| e == *ending));
-        if entry.file_type()?.is_dir() {
+        let is_folder = entry.file_type()?.is_dir();
+        if !is_part && !is_folder {
+            continue;
+        }
+        let name = entry.file_name().into_string();
+        let name =
+            name.map_err(|_| anyhow::anyhow!("the name of {} is not UTF-8", path.display()))?;
+        if is_folder {
             collect(&path, &format!("{prefix}{name}/"), names)?;
-        } else if is_part && path.is_file() {
+        } else if path.is_file() {
             names.push(format!("{prefix}{name}"));
         }
     }

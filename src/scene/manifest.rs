@@ -172,19 +172,20 @@ impl Manifest {
     /// From the axes and the unit with which the capture was imported to the twin's, if the twin was aligned since.
     ///
     /// A version without [`Manifest::twin_from_capture`] was never aligned, or by a program that wrote alignments only
-    /// as options `align=` of the provenance.
+    /// as options `align=` of the provenance. A push of such a program removed them: its version knows no alignment.
     ///
     /// # Errors
-    /// An option of the provenance cannot be read.
+    /// An option of the provenance cannot be read, or all of them together are more than an [`Alignment`] may be.
     pub fn alignment(&self) -> Result<Option<Alignment>, AlignmentError> {
         if self.twin_from_capture.is_some() {
             return Ok(self.twin_from_capture);
         }
         let mut options = self.provenance.options.iter().filter_map(|o| o.strip_prefix("align="));
-        options.try_fold(None, |first: Option<Alignment>, text| {
+        let all = options.try_fold(None, |first: Option<Alignment>, text| {
             let next: Alignment = text.parse()?;
             Ok(Some(first.map_or(next, |first| next.after(&first))))
-        })
+        })?;
+        all.map(|all| all.check().map(|()| all)).transpose()
     }
 
     /// Number of Gaussians in all chunks at full detail.

@@ -177,11 +177,13 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
 
 /// What a frame of stills takes beside its scene. Of more than [`MAX_VIEWS`] views several frames are made.
 fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
-    let frames = views.chunks(MAX_VIEWS).map(|views| {
+    views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        FrameBytes { images: STILL_PIXEL_BYTES * pixels, ..engine.frame_bytes(views) }
-    });
-    frames.max_by_key(FrameBytes::sum).unwrap_or_default()
+        FrameBytes {
+            stages: most.stages.max(engine.frame_bytes(views).stages),
+            images: most.images.max(STILL_PIXEL_BYTES * pixels),
+        }
+    })
 }
 
 /// The focal length of the finest view, and how far the views are from their middle.

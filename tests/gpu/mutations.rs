@@ -3,6 +3,7 @@
 
 use glam::DVec3;
 use wildcity_render::View;
+use wildcity_render::gpu::shaders::Shaders;
 use wildcity_scene::Gaussians;
 
 use crate::images::view_along;
@@ -112,16 +113,14 @@ pub(crate) const MUTATIONS: &[Mutation] = &[
     mutation("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0", RASTERIZE),
 ];
 
-/// Faults of lenses and rolling shutters: a text of `project_unscented`, and its replacement.
+/// Faults of lenses and rolling shutters: an expression of `project_unscented`, and another one of its type; or a
+/// statement, which is left out.
 pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("0.07902598 * square", "0.0 * square"),
     ("select(0.0, 0.25 * HALF_TURN, steep)", "0.0"),
     ("off_axis < end * inside.z", "off_axis < 0.5 * end * inside.z"),
     ("azimuth * (end + (1.0 + end * end) * beyond_rad)", "azimuth * (end + end * beyond_rad)"),
-    (
-        "let across = 2.0 * slope.x * slope.y * factor.y",
-        "let across = slope.x * slope.y * factor.y",
-    ),
+    ("2.0 * slope.x * slope.y * factor.y", "slope.x * slope.y * factor.y"),
     ("p.yx * (r2 + 2.0 * slope * slope)", "p * (r2 + 2.0 * slope * slope)"),
     ("(s.xz + s.yw * r2) * r2", "(s.xy + s.zw * r2) * r2"),
     (
@@ -129,38 +128,64 @@ pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
         "lenses[view_index].center_px + plane * linear(view_index)",
     ),
     ("max(x - end, 0.0)", "0.0"),
-    ("if at.x > y {", "if at.x < y {"),
-    ("end + (y - top)", "end - (y - top)"),
-    ("if wanted != given {", "if wanted == given {"),
+    ("at.x > y", "at.x < y"),
+    (
+        "end + (y - top) / lenses[view_index].end_slope",
+        "end - (y - top) / lenses[view_index].end_slope",
+    ),
+    ("wanted != given", "wanted == given"),
     ("saturate((z - 0.05) / 0.1) * sum", "sum"),
     ("sines * sine(by, 0.5).xy", "sines"),
     ("plane.x * at_px.x + plane.y * at_px.y", "plane.x * at_px.y + plane.y * at_px.x"),
     ("2.0 * sines.y * sines.y", "sines.y * sines.y"),
-    ("let fraction = remaining_exposure(view_index, point.at_px);", "let fraction = guess;"),
-    ("middle = (1.0 / ROOT_3)", "middle = 0.0"),
-    ("+ center.fraction * lenses[lens].moved_world_m", ""),
-    ("<= lenses[lens].widest_rad", "<= 0.5 * lenses[lens].widest_rad"),
+    ("remaining_exposure(view_index, point.at_px)", "guess"),
+    ("(1.0 / ROOT_3)", "0.0"),
+    ("center.fraction * lenses[lens].moved_world_m", "vec3f(0.0)"),
+    ("off_axis_rad <= lenses[lens].widest_rad", "off_axis_rad <= 0.5 * lenses[lens].widest_rad"),
     (
         "moved_m.z + rotation_shift(index_of_lens(view), at_end_m + moved_m, fraction).z",
         "moved_m.z",
     ),
     ("sum.x + (sum.y + exact_m.y)", "sum.x"),
     ("2.0 * moved.x * (offset.y + moved.y - view.depth_low[axis])", "0.0"),
-    ("/ max(2.0 * root, 1e-30)", "* 0.0"),
-    ("for (var k = 0u; k < i; k++)", "for (var k = 0u; k < 1u; k++)"),
-    (
-        "let turn = mat2x2f(azimuth, vec2f(-azimuth.y, azimuth.x));",
-        "let turn = mat2x2f(azimuth, azimuth);",
-    ),
+    ("(((sum - square.x) - square.y) + lost) / max(2.0 * root, 1e-30)", "0.0"),
+    ("k < i", "k < 1u"),
+    ("vec2f(-azimuth.y, azimuth.x)", "azimuth"),
     (
         "vec4f(alpha, beta, radius.z, (alpha * cosine - beta) * per_sine)",
         "vec4f(beta, beta, 0.0, 0.0)",
     ),
-    ("let column_x = vec3f(by_x,", "let column_x = vec3f(1.1 * by_x,"),
+    (
+        "vec3f(by_x, -dot(inside.xy, by_x) * per_z)",
+        "vec3f(1.1 * by_x, -dot(inside.xy, by_x) * per_z)",
+    ),
     ("expansion.plane *= jacobian(view_index, slope);", ""),
     ("abc += moment * shutter.rolls * shutter.motion;", ""),
     ("expanded.shift_px += bend;", ""),
 ];
+
+/// The shaders with all of [`LENS_MUTATIONS`], of which a frame chooses one by its profile's `far`:
+/// [`far_of_lens_mutation`]. Software Vulkan takes seconds to compile `project_unscented`, so it is compiled once.
+pub(crate) fn shaders_with_lens_mutations() -> Shaders {
+    let mut shaders = Shaders::default();
+    let mut replace = |original: &str, replacement: &str| {
+        let replaced = shaders.clone().with_mutation("project_unscented", original, replacement);
+        shaders = replaced.unwrap_or_else(|| panic!("the shader has no text {original:?}"));
+    };
+    for (number, (original, other)) in LENS_MUTATIONS.iter().enumerate() {
+        let is_chosen = format!("frame.far_m == {:?}", far_of_lens_mutation(number));
+        match original.ends_with(';') {
+            true => replace(original, &format!("if !({is_chosen}) {{ {original} }}")),
+            false => replace(original, &format!("select({original}, {other}, {is_chosen})")),
+        }
+    }
+    shaders
+}
+
+/// The `far` of a profile that chooses a mutation, in metres. It lies beyond the scene, so that it changes nothing else.
+pub(crate) fn far_of_lens_mutation(number: usize) -> f32 {
+    50_000.0 + number as f32
+}
 
 /// A street of SH degree 3 with large translucent Gaussians, some over more macro tiles than one thread
 /// emits.

@@ -213,7 +213,7 @@ async fn a_frame_that_cannot_be_used_is_named() {
     reply.refused(400, "invalid_request");
     assert_eq!(reply.body["field"], "frame", "{reply:?}");
 
-    // Aligned twice by a factor of 1,000: what fits the bounds of a twin in the capture need not fit here.
+    // Aligned by a factor of 1,000: what fits the bounds of a twin in the capture need not fit here.
     push(&server, "street", &in_cell([0, 0], 40, 1), |_| {}).await;
     let small = json!({"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 1000}});
     edit(&server, "street", &small).await;

@@ -5,7 +5,8 @@ use std::f64::consts::FRAC_PI_2;
 use glam::{DQuat, DVec3};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
-use wildcity_twin::store::{Catalog, CommitKind, Edit, StoreError, Version};
+use wildcity_scene::manifest::Provenance;
+use wildcity_twin::store::{Catalog, CommitKind, Edit, NewVersion, StoreError, Version};
 
 use crate::places::{cells_alone, change, commit};
 use crate::scene_files::gaussians;
@@ -68,8 +69,31 @@ fn an_alignment_of_the_provenance_counts() {
     let p = DVec3::new(3.0, 4.0, -5.0);
     let wanted = one.point_m(two.point_m(one.point_m(p)));
     assert!(all.point_m(p).distance(wanted) < 1e-12, "{all}");
-    old.manifest.provenance.options[1] = "align=1,2".to_owned();
-    assert!(old.manifest.alignment().is_err());
+    let small = Alignment { metres_per_unit: 1e-4, ..Alignment::IDENTITY };
+    for (unreadable, other) in [("align=1,2".to_owned(), two), (format!("align={small}"), small)] {
+        old.manifest.provenance.options[1..]
+            .clone_from_slice(&[unreadable, format!("align={other}")]);
+        assert!(old.manifest.alignment().is_err(), "{:?}", old.manifest.provenance.options);
+    }
+}
+
+/// A twin that was aligned before manifests had the alignment, and pushes of different cells at once: the first one
+/// writes the alignment to the manifest, which is no alignment by others.
+#[test]
+fn changes_beside_each_other_keep_an_alignment_of_the_provenance() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let one = turn(DVec3::X, 2.0);
+    let mut provenance = Provenance::of("test".into());
+    provenance.options = vec![format!("align={one}")];
+    let new = NewVersion::of("street", &gaussians(300, 0, 10.0, 1), provenance);
+    let old = catalog.commit(new, &mut |_, _| {}).unwrap();
+    assert_eq!(old.manifest.twin_from_capture, None);
+    let [first, second] = [[0, 0], [5, 5]].map(|cell| change(&catalog, cell, 2));
+    first.change(1, cells_alone()).unwrap();
+    assert_eq!(catalog.diff("street", 1, 2).unwrap().settings, [""; 0]);
+    let latest = second.change(1, cells_alone()).unwrap();
+    assert_eq!((latest.number, latest.manifest.twin_from_capture), (3, Some(one)));
 }
 
 /// A push that was made before others aligned the twin would lie in the old axes, in whichever cells.

@@ -172,15 +172,15 @@ impl Drawing<'_> {
         let FramePart { frame, backgrounds, first_view } = part;
         let Scratch { projected, bins, rasterizer } = &mut *self.scratch;
         let cutoffs = self.cutoffs;
-        let sums_bytes = continued.map_or(0, |slab| slab.tiles.held_bytes());
-        let held_bytes = bins.held_bytes(projected) + sums_bytes;
-        self.stats.held_bytes = self.stats.held_bytes.max(held_bytes);
         let mut timer = StageTimer::start();
         let input = rasterize::Input { projected, bins, views: frame.views, backgrounds, cutoffs };
         let finished =
             |view: usize, target: &Target<'_>| (self.finished)(first_view + view, target);
         let work =
             rasterize::rasterize(self.level, input, continued, rasterizer, targets, &finished);
+        let sums_bytes = continued.map_or(0, |slab| slab.tiles.held_bytes());
+        let held_bytes = bins.held_bytes(projected) + sums_bytes;
+        self.stats.held_bytes = self.stats.held_bytes.max(held_bytes);
         self.stats.evaluations += work.evaluations;
         let stages = [("sort", work.sort_ns), ("rasterize", work.rasterize_ns)];
         timer.finish_both(stages, &mut self.stats);

@@ -179,6 +179,9 @@ fn draw_macro_tile<S: Simd>(
     let mut evaluations = 0;
     // Of earlier slabs.
     let has_sums = unfinished.as_ref().is_some_and(|tiles| !tiles.is_empty());
+    if let (false, false, Some(tiles)) = (is_last, has_sums, &mut unfinished) {
+        tiles.reserve_exact(drawing.grid.tiles_of(number).count());
+    }
     for (index, (within, [column, row])) in drawing.grid.tiles_of(number).enumerate() {
         let at_px = [column * TILE_PX, row * TILE_PX];
         let mut sums = TileSums::default();

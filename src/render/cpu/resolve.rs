@@ -35,7 +35,7 @@ pub(super) struct TileSums {
     pub(super) depth_m: [[f32; LANES]; BLOCKS],
     /// Share of the background that shows.
     pub(super) transmittance: [[f32; LANES]; BLOCKS],
-    /// Transmittance that continues to fall after a pixel has stopped (see `rasterize::blend`).
+    /// Transmittance that continues to fall after a pixel has stopped (see `blend::blend`).
     pub(super) running: [[f32; LANES]; BLOCKS],
 }
 

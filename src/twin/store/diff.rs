@@ -83,7 +83,7 @@ impl Diff {
             ("sky", before.sky != after.sky),
             ("views", before.views != after.views),
             ("geo", before.geo != after.geo),
-            (Self::ALIGNMENT, before.twin_from_capture != after.twin_from_capture),
+            (Self::ALIGNMENT, before.alignment().ok() != after.alignment().ok()),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
         Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }

@@ -94,7 +94,7 @@ impl Bins {
         let scratches = &self.scratches;
         let segments = self.segments[..self.used_segments].par_iter_mut().with_max_len(1);
         segments.for_each(|segment| {
-            // Beyond the limit the frame fails whatever the rest holds, so the rest is skipped.
+            // Beyond either limit the rest is skipped: the part is drawn in smaller ones, or the frame fails.
             let is_over = bytes_of(pairs.load(Relaxed), total.load(Relaxed)) > most_bytes;
             if is_over || total.load(Relaxed) > MAX_INSTANCES {
                 return;
@@ -121,8 +121,11 @@ impl Bins {
     /// Frees what segments keep of earlier frames if it is more than `most_bytes`: each may have been long in another
     /// frame.
     pub(super) fn trim(&mut self, most_bytes: u64) {
-        let bytes: usize = self.segments.iter().map(Segment::held_bytes).sum();
-        if bytes as u64 > most_bytes {
+        let of_segments: usize = self.segments.iter().map(Segment::held_bytes).sum();
+        let scratches = self.scratches.get_mut();
+        let pairs: usize = scratches.iter().map(Vec::capacity).sum();
+        if (of_segments + pairs * size_of::<(u32, Pair)>()) as u64 > most_bytes {
+            scratches.clear();
             self.segments.clear();
             self.used_segments = 0;
         }
