@@ -86,7 +86,8 @@ fn changes_beside_each_other_keep_an_alignment_of_the_provenance() {
     let one = turn(DVec3::X, 2.0);
     let mut provenance = Provenance::of("test".into());
     provenance.options = vec![format!("align={one}")];
-    let new = NewVersion::of("street", &gaussians(300, 0, 10.0, 1), provenance);
+    let scene = gaussians(300, 0, 10.0, 1);
+    let new = NewVersion::of("street", &scene, provenance);
     let old = catalog.commit(new, &mut |_, _| {}).unwrap();
     assert_eq!(old.manifest.twin_from_capture, None);
     let [first, second] = [[0, 0], [5, 5]].map(|cell| change(&catalog, cell, 2));
