@@ -171,18 +171,9 @@ impl LensProjection {
         self.shutter.as_ref()
     }
 
-    /// Projects points of the camera's frame, through the windshield if there is one. A call of its own: inlined into its
-    /// four callers, it took the compiler as long as all else in this package.
+    /// Projects points of the camera's frame, through the windshield if there is one.
     #[inline(always)]
     fn project_static<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> LensPixels<S> {
-        simd.vectorize(
-            #[inline(always)]
-            || self.project_static_inlined(simd, point_m),
-        )
-    }
-
-    #[inline(always)]
-    fn project_static_inlined<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> LensPixels<S> {
         let Some(windshield) = &self.windshield else { return self.project_lens(simd, point_m) };
         let Refracted { direction, margin } = windshield.inside(simd, point_m);
         let pixels = self.project_lens(simd, direction);

@@ -86,7 +86,8 @@ impl LensProjection {
     }
 
     /// Projects points near others that are exposed at `moment`, given in the camera's frame then. As
-    /// [`Self::project`].
+    /// [`Self::project`]. A call of its own: few Gaussians need it, and within the caller it takes the compiler a fifth
+    /// of this package's time.
     #[inline(always)]
     pub(in crate::cpu) fn project_near<S: Simd>(
         &self,
@@ -95,10 +96,13 @@ impl LensProjection {
         moment: &Moment<S>,
         wanted: mask32x16<S>,
     ) -> LensPixels<S> {
-        match &self.shutter {
-            None => self.project_static(simd, then_m),
-            Some(shutter) => self.search(simd, shutter, then_m, moment, wanted).pixels,
-        }
+        simd.vectorize(
+            #[inline(always)]
+            || match &self.shutter {
+                None => self.project_static(simd, then_m),
+                Some(shutter) => self.search(simd, shutter, then_m, moment, wanted).pixels,
+            },
+        )
     }
 
     #[inline(always)]
