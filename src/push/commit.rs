@@ -63,7 +63,7 @@ pub(crate) fn commit(
                 provenance,
             };
             commit.set_views(old.and_then(|old| old.views.clone()));
-            commit.replace(base.map(|base| base.number), settings)?
+            commit.replace(request.base, settings)?
         }
     };
     Ok(version)
