@@ -180,7 +180,7 @@ fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
         FrameBytes {
-            stages: most.stages.max(engine.frame_bytes(views).stages),
+            stages: most.stages.max(engine.stage_bytes(views)),
             images: most.images.max(STILL_PIXEL_BYTES * pixels),
         }
     })

@@ -8,8 +8,8 @@ use super::resolve::{HalvedBy, TileSums};
 use crate::layout::Cutoffs;
 use wildcity_scene::chunk::LANES;
 
-/// Blends the splats with a bit in `touching` over one block, from front to back. Returns whether all pixels
-/// of the block have stopped, and how many splats were blended.
+/// Blends the splats that touch a block over it, from front to back. Returns whether all pixels of the block have
+/// stopped, and how many splats were blended.
 ///
 /// Each splat has `alpha = min(cap, 2^(log2(opacity) - u² - v²))`, and adds `alpha T` of its colour; then the
 /// transmittance T is multiplied by `1 - alpha` (Kerbl et al. 2023, eq. 3). A pixel stops before the splat
@@ -23,7 +23,6 @@ use wildcity_scene::chunk::LANES;
 pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     simd: S,
     batch: &Batch,
-    mut touching: u64,
     block: usize,
     cutoffs: &Cutoffs,
     sums: &mut TileSums,
@@ -44,6 +43,7 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     let mut depth = load(&sums.depth_m[block]);
     let mut transmittance = load(&sums.transmittance[block]);
     let mut running = load(&sums.running[block]);
+    let mut touching = batch.touching[block];
     let mut count = 0;
     let mut stopped = false;
     while touching != 0 {

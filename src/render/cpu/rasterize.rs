@@ -259,48 +259,24 @@ fn rasterize_tile<S: Simd>(
             }
         }
         for block in 0..BLOCKS {
-            let touching = batch.touching[block];
-            if touching == 0 || live >> block & 1 == 0 {
+            if batch.touching[block] == 0 || live >> block & 1 == 0 {
                 continue;
             }
             let TileOutput { sums, halved_by, wants, .. } = &mut *output;
+            let cutoffs = input.cutoffs;
             let (stopped, count) = match *wants {
-                Wants { depth: false, instances: false } => blend::<S, false, false>(
-                    simd,
-                    batch,
-                    touching,
-                    block,
-                    input.cutoffs,
-                    sums,
-                    halved_by,
-                ),
-                Wants { depth: true, instances: false } => blend::<S, true, false>(
-                    simd,
-                    batch,
-                    touching,
-                    block,
-                    input.cutoffs,
-                    sums,
-                    halved_by,
-                ),
-                Wants { depth: false, instances: true } => blend::<S, false, true>(
-                    simd,
-                    batch,
-                    touching,
-                    block,
-                    input.cutoffs,
-                    sums,
-                    halved_by,
-                ),
-                Wants { depth: true, instances: true } => blend::<S, true, true>(
-                    simd,
-                    batch,
-                    touching,
-                    block,
-                    input.cutoffs,
-                    sums,
-                    halved_by,
-                ),
+                Wants { depth: false, instances: false } => {
+                    blend::<S, false, false>(simd, batch, block, cutoffs, sums, halved_by)
+                }
+                Wants { depth: true, instances: false } => {
+                    blend::<S, true, false>(simd, batch, block, cutoffs, sums, halved_by)
+                }
+                Wants { depth: false, instances: true } => {
+                    blend::<S, false, true>(simd, batch, block, cutoffs, sums, halved_by)
+                }
+                Wants { depth: true, instances: true } => {
+                    blend::<S, true, true>(simd, batch, block, cutoffs, sums, halved_by)
+                }
             };
             live &= !(u16::from(stopped) << block);
             evaluations += count as u64 * LANES as u64;

@@ -308,11 +308,10 @@ impl Engine {
         Ok(run_blocking(move || resident.reserve_with(extent, &profile, frame)).await??)
     }
 
-    /// What a frame of some views takes beside its scene and its images.
-    pub(crate) fn frame_bytes(&self, views: &[View]) -> FrameBytes {
+    /// What a frame of some views takes beside its scene and its images, in bytes.
+    pub(crate) fn stage_bytes(&self, views: &[View]) -> u64 {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        let stages = self.queue.backend().frame_bytes(views, pixels > limits::LARGE_PIXELS);
-        FrameBytes { stages, images: 0 }
+        self.queue.backend().frame_bytes(views, pixels > limits::LARGE_PIXELS)
     }
 
     /// Memory that the worst frame of a rig needs, in bytes.

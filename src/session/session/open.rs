@@ -417,7 +417,7 @@ pub(super) fn frame_bytes(
     has_trust: bool,
 ) -> FrameBytes {
     let views = View::of_rig(layout.cameras(), Pose::IDENTITY);
-    let FrameBytes { stages, .. } = engine.frame_bytes(&views);
+    let stages = engine.stage_bytes(&views);
     FrameBytes { stages: stages + layout.rendered_bytes(has_trust), images: layout.answers_bytes() }
 }
 
