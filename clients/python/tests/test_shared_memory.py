@@ -131,17 +131,23 @@ def test_several_sessions_share_the_memory_of_their_connection(connect: Connect,
     client = connect(server.url, shared_memory=True, copy=False)
     plain = connect(server.url)
     small = Outputs(cameras=("rear",), encoding="raw")
-    for one in (client, plain):
-        for name in ("left", "right"):
-            one.open("corridor", session=f"{name}-{id(one)}", rig=PAIR, outputs=small)
+    sessions = [
+        one.open("corridor", session=f"{name}-{transport}", rig=PAIR, outputs=small)
+        for one, transport in ((client, "shared"), (plain, "plain"))
+        for name in ("left", "right")
+    ]
     for k in range(5):
         steps = {"left": Pose((k, 0.0, 0.0)), "right": Pose((k, 1.0, 0.0))}
-        seen, sent = (one.step_many({f"{n}-{id(one)}": p for n, p in steps.items()}) for one in (client, plain))
+        seen = client.step_many({f"{name}-shared": pose for name, pose in steps.items()})
+        sent = plain.step_many({f"{name}-plain": pose for name, pose in steps.items()})
         for name in steps:
-            here, there = seen[f"{name}-{id(client)}"], sent[f"{name}-{id(plain)}"]
+            here, there = seen[f"{name}-shared"], sent[f"{name}-plain"]
             assert np.array_equal(here.images["rear"], there.images["rear"])
             assert here.metadata.frame_hash == there.metadata.frame_hash
     del here, there, seen, sent
+    # The server keeps the sessions of a closed connection, and the next test opens the same names.
+    for session in sessions:
+        session.close()
     client.close()
 
 
