@@ -46,11 +46,12 @@ impl Placement {
     }
 }
 
-/// The change of a version's axes and unit since its files were imported.
+/// The change of a version's axes and unit since its capture was imported.
 pub(super) fn of_version(catalog: &Catalog, version: &Version) -> anyhow::Result<Alignment> {
     let about = || format!("twin {} version {}", version.manifest.twin, version.number);
-    check_lineage(catalog, version).with_context(about)?;
-    of_provenance(&version.manifest.provenance).with_context(about)
+    let import = import_of(catalog, version).with_context(about)?;
+    let aligned = version.manifest.alignment().with_context(about)?;
+    import.placed(aligned).with_context(about)
 }
 
 /// The change of axes and unit of `--axes` and `--scale`.
@@ -62,55 +63,74 @@ pub(super) fn imported(axes: &str, scale: f64) -> anyhow::Result<Alignment> {
     })
 }
 
-/// Checks that a version says how all of it was made. A push of some cells replaces the provenance of its base by that of
-/// the pushed files, which are in the twin's axes already.
-fn check_lineage(catalog: &Catalog, version: &Version) -> anyhow::Result<()> {
+/// The options of an import that say where its capture is.
+#[derive(Debug, PartialEq)]
+struct Import {
+    axes: String,
+    scale: f64,
+}
+
+/// The import that a version was made from by pushes and edits.
+///
+/// # Errors
+/// An older version cannot be read; a push of its files had other axes or another scale, so that there are two captures;
+/// or a push lost the alignment of the version before, as pushes did before versions recorded it.
+fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
     let twin = &version.manifest.twin;
     let log = catalog.versions(twin)?;
     let parent_of = |number| log.iter().find(|entry| entry.number == number)?.parent;
-    let mut options = version.manifest.provenance.options.clone();
+    let import = Import::of(&version.manifest.provenance)?;
     let mut number = version.number;
+    let mut is_aligned = version.manifest.alignment()?.is_some();
     while let Some(parent) = parent_of(number).filter(|parent| *parent < number) {
         let before = catalog.version(twin, Some(parent)).with_context(|| {
             format!(
                 "it was made from version {parent}, which cannot be read: give --axes and --scale"
             )
         })?;
-        let before = before.manifest.provenance.options;
+        let was_aligned = before.manifest.alignment()?.is_some();
         anyhow::ensure!(
-            options.starts_with(&before),
-            "version {number} was pushed, and does not say how version {parent} was imported and aligned: name an older \
-             version, or give --axes and --scale"
+            is_aligned || !was_aligned,
+            "version {number} was pushed, and does not say how version {parent} was aligned: name an older version, or \
+             give --axes and --scale"
         );
-        options = before;
+        anyhow::ensure!(
+            import == Import::of(&before.manifest.provenance)?,
+            "version {number} was pushed with other axes or another scale than version {parent}: name an older version, \
+             or give --axes and --scale"
+        );
         number = parent;
+        is_aligned = was_aligned;
     }
-    Ok(())
+    Ok(import)
 }
 
-/// Follows the options with which a version was made: axes and scale of the import, then each alignment.
-fn of_provenance(provenance: &Provenance) -> anyhow::Result<Alignment> {
-    let values = |key: &str| -> Vec<&str> {
-        provenance.options.iter().filter_map(|option| option.strip_prefix(key)).collect()
-    };
-    let one = |key: &str, default: &'static str| -> anyhow::Result<String> {
-        let mut found = values(key);
-        found.dedup();
-        match found[..] {
-            [] => Ok(default.to_owned()),
-            [value] => Ok(value.to_owned()),
-            _ => anyhow::bail!(
-                "its files were imported with different {key}: give --axes and --scale"
-            ),
-        }
-    };
-    let scale = one("scale=", "1")?;
-    let scale = scale.parse().with_context(|| format!("scale={scale}"))?;
-    let mut alignment = imported(&one("axes=", "identity")?, scale)?;
-    for text in values("align=") {
-        alignment = text.parse::<Alignment>()?.after(&alignment);
+impl Import {
+    /// From the axes of the capture to those of a twin that was aligned since.
+    fn placed(&self, aligned: Option<Alignment>) -> anyhow::Result<Alignment> {
+        let capture = imported(&self.axes, self.scale)?;
+        Ok(aligned.map_or(capture, |aligned| aligned.after(&capture)))
     }
-    Ok(alignment)
+
+    /// What a version says of the files that it was made from.
+    fn of(provenance: &Provenance) -> anyhow::Result<Self> {
+        let one = |key: &str, default: &'static str| -> anyhow::Result<String> {
+            let options = &provenance.options;
+            let mut found: Vec<&str> =
+                options.iter().filter_map(|option| option.strip_prefix(key)).collect();
+            found.dedup();
+            match found[..] {
+                [] => Ok(default.to_owned()),
+                [value] => Ok(value.to_owned()),
+                _ => anyhow::bail!(
+                    "its files were imported with different {key}: give --axes and --scale"
+                ),
+            }
+        };
+        let scale = one("scale=", "1")?;
+        let scale = scale.parse().with_context(|| format!("scale={scale}"))?;
+        Ok(Self { axes: one("axes=", "identity")?, scale })
+    }
 }
 
 #[cfg(test)]
@@ -125,8 +145,9 @@ mod tests {
 
     #[test]
     fn a_capture_goes_where_its_twin_went() {
-        let made = provenance(&["axes=y-down-z-forward", "scale=2", "align=0,0,3,1,0,0,0,0.5"]);
-        let alignment = of_provenance(&made).unwrap();
+        let made = Import::of(&provenance(&["axes=y-down-z-forward", "scale=2", "note=one"]));
+        let aligned = "0,0,3,1,0,0,0,0.5".parse().unwrap();
+        let alignment = made.unwrap().placed(Some(aligned)).unwrap();
         // 1 down is -2 m up; 3 more, and half of it.
         let at = alignment.point_m(DVec3::new(1.0, 1.0, 4.0));
         assert!((at - DVec3::new(1.0, 4.0, 0.5)).length() < 1e-12, "{at}");
@@ -134,10 +155,11 @@ mod tests {
 
     #[test]
     fn mirrors_and_different_files_are_refused() {
-        let mirrored = of_provenance(&provenance(&["axes=y-up-z-forward"])).unwrap_err();
+        let mirrored = Import::of(&provenance(&["axes=y-up-z-forward"])).unwrap();
+        let mirrored = mirrored.placed(None).unwrap_err();
         assert!(mirrored.to_string().contains("mirror"), "{mirrored}");
         let several = ["axes=identity", "scale=1", "axes=y-down-z-forward", "scale=1"];
-        let several = of_provenance(&provenance(&several)).unwrap_err();
+        let several = Import::of(&provenance(&several)).unwrap_err();
         assert!(several.to_string().contains("--axes and --scale"), "{several}");
     }
 }

@@ -251,7 +251,7 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
             "the capture's; turned, moved and scaled as the twin was"
         }
         (Some(PushFrame::Capture), false) => {
-            "the capture's, which is the twin's: this version knows no alignment"
+            "the capture's, which is the twin's: this version records no alignment"
         }
         (Some(PushFrame::Twin), false) | (None, _) => "",
     };

@@ -22,6 +22,8 @@ pub(crate) struct NewContent<'a> {
 
 /// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push
 /// of all cells replaces the twin, but keeps rig, trajectories, sky, place on the earth and alignment of the base.
+/// A push
+/// replaces nothing that others changed since its base, which is the latest version if the request names none.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,
@@ -41,13 +43,15 @@ pub(crate) fn commit(
     commit.put(content.gaussians, only, progress)?;
 
     let mut provenance = provenance(content.hashes, content.options.to_vec(), request.levels);
-    provenance.options.extend(request.note.as_ref().map(|note| format!("note={note}")));
+    if let Some(note) = &request.note {
+        provenance.set_note(note);
+    }
     let old_profile = old.map(|old| old.profile).unwrap_or_default();
     let profile = profile_with(old_profile, &request.profile).map_err(StoreError::from)?;
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
             let profile = (!request.profile.is_empty()).then_some(profile);
-            let change = VersionChange { profile, ..VersionChange::none(provenance) };
+            let change = VersionChange { profile, ..VersionChange::of(provenance) };
             commit.change(base.number, change)?
         }
         _ => {
@@ -63,7 +67,10 @@ pub(crate) fn commit(
                 provenance,
             };
             commit.set_views(old.and_then(|old| old.views.clone()));
-            commit.replace(request.base, settings)?
+            match base {
+                Some(base) => commit.replace(Some(base.number), settings)?,
+                None => commit.create(settings)?,
+            }
         }
     };
     Ok(version)

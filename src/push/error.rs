@@ -144,6 +144,7 @@ fn is_refused_content(error: &StoreError) -> bool {
         | StoreError::ManifestSize { .. }
         | StoreError::ViewSize { .. }
         | StoreError::ActorExists { .. }
+        | StoreError::TwinExists { .. }
         | StoreError::Overlap { .. } => true,
         StoreError::Io { .. }
         | StoreError::Name { .. }

@@ -29,7 +29,7 @@ impl Frame {
     }
 }
 
-/// The change from the capture's frame to that of a version; none if the version knows no alignment.
+/// The change from the capture's frame to that of a version; none if the version records no alignment.
 pub(crate) fn twin_from_capture(base: &Version) -> Result<Option<Alignment>, PushError> {
     Ok(base.manifest.alignment().map_err(StoreError::from)?)
 }

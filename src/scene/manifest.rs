@@ -152,6 +152,9 @@ pub struct Provenance {
     pub options: Vec<String>,
 }
 
+/// Start of the option with the note of a push.
+const NOTE: &str = "note=";
+
 impl Provenance {
     /// The provenance of an import of `source` by this build, without options.
     pub fn of(source: String) -> Self {
@@ -159,9 +162,21 @@ impl Provenance {
         Self { source, builder, options: Vec::new() }
     }
 
+    /// The provenance of a version that is edited from one with this provenance. The note described the push, not the edit.
+    pub fn of_edit(&self) -> Self {
+        let mut edited = self.clone();
+        edited.options.retain(|option| !option.starts_with(NOTE));
+        edited
+    }
+
+    /// Adds the description of the push that it comes from.
+    pub fn set_note(&mut self, note: &str) {
+        self.options.push(format!("{NOTE}{note}"));
+    }
+
     /// The description of the push that it comes from, if the push had one.
     pub fn note(&self) -> Option<&str> {
-        self.options.iter().find_map(|option| option.strip_prefix("note="))
+        self.options.iter().find_map(|option| option.strip_prefix(NOTE))
     }
 }
 
@@ -172,7 +187,7 @@ impl Manifest {
     /// From the axes and the unit with which the capture was imported to the twin's, if the twin was aligned since.
     ///
     /// A version without [`Manifest::twin_from_capture`] was never aligned, or by a program that wrote alignments only
-    /// as options `align=` of the provenance. A push of such a program removed them: its version knows no alignment.
+    /// as options `align=` of the provenance. A push of such a program removed them: its version records no alignment.
     ///
     /// # Errors
     /// An option of the provenance cannot be read, or all of them together are more than an [`Alignment`] may be.

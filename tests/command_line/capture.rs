@@ -201,24 +201,41 @@ fn a_capture_becomes_a_street_that_can_be_driven() {
     assert_eq!(third.manifest.rig.unwrap().name, "capture");
     assert!(done(at, &["twin", "fsck", "street"]).ends_with("all sound\n"));
 
-    // 5. A version that was pushed does not say how the rest of it was imported.
-    let options = StorageOptions { record: second.manifest.record, levels: true };
-    let push = catalog.begin("street", CommitKind::Push, options).unwrap();
-    push.change(3, VersionChange::none(Provenance::of("block7.ply".into()))).unwrap();
-    let route = |twin| ["route", "from-colmap", "model", "--twin", twin, "--out", "four"];
-    let told = refused(at, &route("street"));
-    assert!(told.contains("version 4 was pushed") && told.contains("give --axes"), "{told}");
-    assert!(!at.join("four").exists());
-    done(at, &route("street@3"));
+    // 5. A push of files in the axes of the import has the same capture, and one of other files has another.
+    let push = |base, provenance| {
+        let options = StorageOptions { record: second.manifest.record, levels: true };
+        let push = catalog.begin("street", CommitKind::Push, options).unwrap();
+        push.change(base, VersionChange::of(provenance)).unwrap()
+    };
+    let mut trained = Provenance::of("block7.ply".into());
+    trained.options = ["axes=identity", "scale=1"].map(str::to_owned).to_vec();
+    trained.set_note("epoch 30");
+    push(3, trained);
+    let mut other = Provenance::of("block8.ply".into());
+    other.options.push("axes=y-down-z-forward".to_owned());
+    push(4, other);
+    let route = |twin, out| ["route", "from-colmap", "model", "--twin", twin, "--out", out];
+    let told = refused(at, &route("street", "five"));
+    assert!(told.contains("version 5 was pushed") && told.contains("give --axes"), "{told}");
+    assert!(!at.join("five").exists());
+    let [of_third, of_fourth] = [("street@3", "six"), ("street@4", "seven")].map(|(twin, out)| {
+        done(at, &route(twin, out));
+        read::<Trajectory>(&at.join(out).join("capture.json"))
+    });
+    assert_eq!(of_third, of_fourth);
 
     // 6. A preset is a rig, and the log says which versions are edits.
     let preset = done(at, &["twin", "drive", "street", "--rig", "vehicle6"]);
-    assert!(preset.contains("version 5: recorded drives: capture; rig: vehicle6"), "{preset}");
+    assert!(preset.contains("version 6: recorded drives: capture; rig: vehicle6"), "{preset}");
     let none = refused(at, &["twin", "drive", "street", "--rig", "vehicle7"]);
     assert!(none.contains("\"vehicle7\" is neither a file nor a preset"), "{none}");
     let log = done(at, &["twin", "log", "street"]);
     let how: Vec<&str> = log.lines().map(|line| line[30..46].trim()).collect();
-    assert_eq!(how, ["import", "edit of 1", "edit of 2", "push of 3", "edit of 4"], "{log}");
+    assert_eq!(
+        how,
+        ["import", "edit of 1", "edit of 2", "push of 3", "push of 4", "edit of 5"],
+        "{log}"
+    );
 }
 
 #[test]

@@ -509,5 +509,5 @@ fn open(medium: &dyn Medium, clock: &Arc<SimClock>) -> Result<Catalog, String> {
 
 fn cells_alone() -> VersionChange {
     let provenance = provenance();
-    VersionChange::none(provenance)
+    VersionChange::of(provenance)
 }

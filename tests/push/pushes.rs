@@ -10,12 +10,13 @@ use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushState};
 use wildcity_protocol::error::Code;
 use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_scene::Gaussians;
+use wildcity_scene::align::Alignment;
 use wildcity_server::Limits;
-use wildcity_twin::store::Catalog;
+use wildcity_twin::store::{Catalog, CommitKind, Edit};
 
 use crate::http::{client, get, in_cell, post, push, push_of, send, write};
 use crate::scene_files::gaussians;
-use crate::support::TestServer;
+use crate::support::{TEST_TIMEOUT, TestServer};
 
 #[tokio::test]
 async fn a_push_replaces_the_cells_that_it_touches() {
@@ -202,6 +203,47 @@ async fn cells_that_changed_since_the_base_are_not_overwritten() {
     });
     assert_eq!(all.await.version, Some(4));
     assert_eq!(get(&server, "/v1/twins/test").await.body["gaussians"], 7);
+}
+
+/// A push of all cells is of the version that it was checked against, also if it names none.
+#[tokio::test]
+async fn all_cells_replace_nothing_that_changed_while_they_were_checked() {
+    let server = TestServer::start().await;
+    let client = client(&server);
+    let dir = tempfile::tempdir().unwrap();
+    let path = write(dir.path(), "whole.ply", &in_cell([2, 2], 7, 1));
+    let upload = client.upload(&path, &mut |_, _| {}).await.unwrap();
+    let cells = Some(CellSelection::All(AllCells::All));
+    let whole = NewPush { cells, ..push_of(&[&upload.id]) };
+    // The preview of a push renders eight frames. During these, another program writes a version.
+    server.painter.slow_ms.store(500, Ordering::SeqCst);
+    let begun = client.push("test", &whole).await.unwrap();
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    let twice = Alignment { metres_per_unit: 2.0, ..Alignment::IDENTITY };
+    let (trajectories, kind) = (Vec::new(), CommitKind::Import);
+    let edit = Edit { alignment: twice, trajectories, rig: None, kind };
+    let path = format!("/v1/twins/test/pushes/{}", begun.id);
+    let has_cells = async {
+        while get(&server, &path).await.body["report"]["cells"].as_array().is_none_or(Vec::is_empty)
+        {
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    };
+    tokio::time::timeout(TEST_TIMEOUT, has_cells).await.expect("the push is checked");
+    let base = catalog.version("test", None).unwrap();
+    catalog.edit(&base, edit, &mut |_, _| {}).unwrap();
+    let refused = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
+    let error = refused.error.expect("the other version changed what this one replaces");
+    assert_eq!((refused.state, error.code), (PushState::Refused, Code::Conflict), "{error:?}");
+    let latest = catalog.version("test", None).unwrap();
+    assert_eq!((latest.number, latest.manifest.twin_from_capture), (2, Some(twice)));
+
+    server.painter.slow_ms.store(0, Ordering::SeqCst);
+    let again = NewPush { id: Some("again".to_owned()), ..whole };
+    let again = client.push("test", &again).await.unwrap();
+    let again = client.wait_for_push(again, &mut |_| {}).await.unwrap();
+    assert_eq!((again.state, again.version), (PushState::Ready, Some(3)), "{again:?}");
+    assert_eq!(catalog.version("test", None).unwrap().manifest.twin_from_capture, Some(twice));
 }
 
 #[tokio::test]

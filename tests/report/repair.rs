@@ -121,7 +121,7 @@ fn record(catalog: &Catalog, truth: &Arc<Resident>) {
     }
     let views = commit.put_views(&views).unwrap();
     commit.set_views(Some(views));
-    let change = VersionChange::none(base.manifest.provenance.clone());
+    let change = VersionChange::edit();
     commit.change(base.number, change).unwrap();
 }
 

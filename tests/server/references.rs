@@ -276,7 +276,7 @@ fn add_views_of(
     }
     let views = commit.put_views(&views).unwrap();
     commit.set_views(Some(views));
-    let change = VersionChange::none(base.manifest.provenance.clone());
+    let change = VersionChange::edit();
     commit.change(base.number, change).unwrap();
 }
 

@@ -127,5 +127,11 @@ fn alignments_that_are_too_much_together_are_refused() {
     let second = edit(&catalog, &first, small).unwrap();
     let error = edit(&catalog, &second, small).unwrap_err();
     assert!(matches!(error, StoreError::Alignment(_)), "{error}");
+    // Together a move of 2e8 old units, which could not be read again.
+    let mut far = Alignment::IDENTITY;
+    far.new_from_old.position_m.z = 2e4;
+    let error = edit(&catalog, &second, far).unwrap_err();
+    assert!(matches!(error, StoreError::Alignment(_)), "{error}");
     assert_eq!(catalog.latest("street").unwrap(), 2);
+    catalog.version("street", None).unwrap();
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use wildcity_scene::geo::{GeoAnchor, ProjectedOrigin};
+use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{Gaussians, Manifest, RecordFormat, RenderProfile, Trajectory};
 use wildcity_twin::store::{
     Catalog, CellDiff, CellSize, Commit, CommitKind, NewVersion, StorageOptions, StoreError,
@@ -30,11 +31,13 @@ static EMPTY: Gaussians = Gaussians {
     sh: Vec::new(),
 };
 
+fn from(source: &str) -> Provenance {
+    Provenance { source: source.to_owned(), ..settings().provenance }
+}
+
 /// A change of cells alone, with `source` as its provenance.
 fn change(source: &str) -> VersionChange {
-    let mut provenance = settings().provenance;
-    provenance.source = source.to_owned();
-    VersionChange::none(provenance)
+    VersionChange::of(from(source))
 }
 
 /// 200 Gaussians of SH degree 0 around the middle of a cell, 20 m wide.
@@ -118,7 +121,7 @@ fn a_dropped_commit_leaves_nothing_and_does_not_affect_others() {
     drop(one);
     let mut provenance = settings().provenance;
     provenance.source = "two".into();
-    let second = two.change(1, VersionChange { provenance, ..change("") }).unwrap();
+    let second = two.change(1, VersionChange::of(provenance)).unwrap();
     assert_eq!(second.number, 2);
     let objects = ["the chunk", "the table", "the manifest", "the record"].len();
     assert_eq!(files(dir.path()).len(), before.len() + objects);
@@ -143,7 +146,7 @@ fn a_change_keeps_every_other_cell() {
     for (at, seed) in [([0, 0], 1), ([1, 0], 2), ([2, 0], 1), ([5, -2], 2)] {
         put(&mut whole, &cell(at, seed));
     }
-    let provenance = change("push").provenance;
+    let provenance = from("push");
     assert_eq!(
         whole.replace(None, VersionSettings { provenance, ..settings() }).unwrap().hash,
         second.hash
@@ -155,6 +158,41 @@ fn a_change_keeps_every_other_cell() {
     let third = changed(&catalog, &[], 0).change(2, change).unwrap();
     assert_eq!(third.manifest.profile, profile);
     assert_eq!(third.manifest.chunks, second.manifest.chunks);
+}
+
+/// A twin that others made meanwhile is not replaced by a commit that would make it.
+#[test]
+fn a_new_twin_replaces_none() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let [mut early, mut late] =
+        [(); 2].map(|()| catalog.begin("street", CommitKind::Push, EXACT).unwrap());
+    put(&mut early, &cell([0, 0], 1));
+    put(&mut late, &cell([1, 0], 2));
+    let first = early.create(settings()).unwrap();
+    let error = late.create(settings()).unwrap_err();
+    assert!(matches!(&error, StoreError::TwinExists { latest: 1, .. }), "{error}");
+    assert_eq!(catalog.version("street", None).unwrap(), first);
+}
+
+/// The note of a push is not that of an edit, and an edit that changes nothing is no version.
+#[test]
+fn an_edit_has_no_note() {
+    let dir = tempfile::tempdir().unwrap();
+    let (catalog, _) = three(&dir);
+    let mut pushed = from("block");
+    pushed.set_note("epoch 30");
+    let pushed = VersionChange::of(pushed);
+    let second = changed(&catalog, &[[0, 0]], 2).change(1, pushed).unwrap();
+    assert_eq!(second.manifest.provenance.note(), Some("epoch 30"));
+    let edited = || VersionChange::edit();
+    assert_eq!(changed(&catalog, &[], 0).change(2, edited()).unwrap(), second);
+    let mut profile = RenderProfile::default();
+    profile.set("near=0.3").unwrap();
+    let other = VersionChange { profile: Some(profile), ..edited() };
+    let third = changed(&catalog, &[], 0).change(2, other).unwrap();
+    assert_eq!((third.number, third.manifest.provenance.note()), (3, None));
+    assert_eq!(third.manifest.provenance.source, second.manifest.provenance.source);
 }
 
 /// The place on the earth is set, kept and removed; without one the manifest is as it was.

@@ -91,7 +91,7 @@ async fn record_images(
     }
     let views = commit.put_views(&views)?;
     commit.set_views(Some(views));
-    commit.change(base.number, VersionChange::none(base.manifest.provenance.clone()))?;
+    commit.change(base.number, VersionChange::edit())?;
     Ok(())
 }
 

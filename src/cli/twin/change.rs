@@ -14,7 +14,7 @@ pub(super) fn commit(
     let catalog = twins.catalog()?;
     let base = catalog.version(&twin.name, twin.number)?;
     // The Gaussians stay, and so does what the version says of their origin.
-    let mut change = VersionChange::none(base.manifest.provenance.clone());
+    let mut change = VersionChange::edit();
     edit(&mut change);
     let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
     let commit = catalog.begin(&twin.name, CommitKind::Import, storage)?;

@@ -1,11 +1,9 @@
 //! `wildcity twin log`.
 
-use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 use crate::cli::time::utc;
-use wildcity_scene::manifest::Provenance;
 use wildcity_twin::store::{CommitKind, LogEntry, StoreError};
 
 /// Show all versions of a twin, oldest first: when and how each was made, from which version, and the note of its push.
@@ -30,14 +28,18 @@ impl Log {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
         let catalog = self.twins.catalog()?;
-        let mut provenances: BTreeMap<u64, Provenance> = BTreeMap::new();
         for entry in catalog.versions(&self.twin)? {
-            match catalog.provenance(&self.twin, &entry) {
-                Ok(provenance) => drop(provenances.insert(entry.number, provenance)),
-                Err(StoreError::GarbageCollected { .. }) => {}
-                Err(error) => writeln!(io::stderr(), "version {}: no note: {error}", entry.number)?,
-            }
-            let note = own_note(&provenances, &entry);
+            // A new file has no parent: an import of a version is an edit of it, such as an alignment. Builds from before
+            // notes were shown gave it the note of its base.
+            let is_edit = entry.kind == CommitKind::Import && entry.parent.is_some();
+            let note = match catalog.provenance(&self.twin, &entry) {
+                Ok(provenance) => provenance.note().filter(|_| !is_edit).map(str::to_owned),
+                Err(StoreError::GarbageCollected { .. }) => None,
+                Err(error) => {
+                    writeln!(io::stderr(), "version {}: no note: {error}", entry.number)?;
+                    None
+                }
+            };
             let LogEntry { number, hash, created_us, commit, parent, kind } = entry;
             if self.json {
                 let line = serde_json::json!({
@@ -47,9 +49,7 @@ impl Log {
                 writeln!(out, "{line}")?;
             } else {
                 let from = parent.map_or(String::new(), |parent| format!(" of {parent}"));
-                // A new file has no parent: an import of a version is an edit of it, such as an alignment.
-                let edited = kind == CommitKind::Import && parent.is_some();
-                let how = if edited { format!("edit{from}") } else { format!("{kind}{from}") };
+                let how = if is_edit { format!("edit{from}") } else { format!("{kind}{from}") };
                 let when = utc(created_us);
                 // A note may have lines; a version has one.
                 let note = note.map(|note| format!("  {}", note.replace(char::is_control, " ")));
@@ -59,14 +59,4 @@ impl Log {
         }
         Ok(())
     }
-}
-
-/// The note of a version, if it is its own: an edit has the provenance of its base, with the base's note.
-fn own_note<'a>(provenances: &'a BTreeMap<u64, Provenance>, entry: &LogEntry) -> Option<&'a str> {
-    let provenance = provenances.get(&entry.number)?;
-    let note = provenance.note()?;
-    let base = entry.parent.and_then(|parent| provenances.get(&parent));
-    let is_inherited = entry.kind != CommitKind::Rollback
-        && base.is_some_and(|base| base.source == provenance.source && base.note() == Some(note));
-    (!is_inherited).then_some(note)
 }

@@ -124,7 +124,7 @@ impl Views {
                 commit.set_views(Some(views));
             }
         }
-        let change = VersionChange::none(manifest.provenance.clone());
+        let change = VersionChange::edit();
         let version = commit.change(base.number, change)?;
         let what =
             version.manifest.views.as_ref().map_or("no recorded images".to_owned(), |views| {

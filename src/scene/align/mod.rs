@@ -9,7 +9,7 @@ use std::str::FromStr;
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::Pose;
+use crate::geometry::{Pose, PoseError};
 use crate::trajectory::Keyframe;
 use crate::{Gaussians, Trajectory};
 
@@ -50,6 +50,9 @@ pub enum AlignmentError {
     /// The three points lie on one line.
     #[error("the three points of the ground lie on one line: choose points that span a triangle")]
     OnLine,
+    /// The rotation and the move are out of range.
+    #[error("the move of the alignment, in the old unit: {0}")]
+    Pose(PoseError),
     /// Not eight numbers.
     #[error("{0:?} is not an alignment: expected eight numbers, separated by commas")]
     Text(String),
@@ -85,11 +88,14 @@ impl Alignment {
         Ok(Self { metres_per_unit, ..self })
     }
 
-    /// Checks an alignment from untrusted input; its pose was checked when it was read.
+    /// Checks that an alignment, for example one after another, can be stored and read again.
     ///
     /// # Errors
-    /// [`AlignmentError::Scale`].
+    /// [`AlignmentError::Scale`], [`AlignmentError::Pose`].
     pub fn check(&self) -> Result<(), AlignmentError> {
+        let Pose { position_m, .. } = self.new_from_old;
+        let pose = Pose::checked(position_m.to_array(), self.new_from_old.q_wxyz());
+        pose.map_err(AlignmentError::Pose)?;
         self.scaled(self.metres_per_unit).map(|_| ())
     }
 

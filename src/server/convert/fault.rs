@@ -332,7 +332,9 @@ fn of_store(error: &StoreError) -> WireFault {
         StoreError::NoVersion { .. } | StoreError::GarbageCollected { .. } => {
             at(Code::UnknownVersion, "version")
         }
-        StoreError::Overlap { .. } | StoreError::Conflict { .. } => plain(Code::Conflict),
+        StoreError::Overlap { .. }
+        | StoreError::TwinExists { .. }
+        | StoreError::Conflict { .. } => plain(Code::Conflict),
         StoreError::Gaussians(IngestError::File(_)) => at(Code::TwinDamaged, "twin"),
         StoreError::Gaussians(_)
         | StoreError::Clamped { .. }

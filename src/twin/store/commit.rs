@@ -139,7 +139,7 @@ impl Commit {
     /// has the same content, it is returned, and no new one is made.
     ///
     /// With a `base`, nothing is replaced that other commits changed since that version. Without
-    /// one, the latest version is replaced, whatever it contains.
+    /// one, the latest version is replaced, whatever it contains, if there is any.
     ///
     /// # Errors
     /// [`StoreError::Overlap`] if others changed since `base` what this would replace; or what
@@ -161,6 +161,22 @@ impl Commit {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
                 commit.check_overlap(base, &latest, &manifest)?;
             }
+            commit.put_manifest(manifest)
+        })
+    }
+
+    /// Publishes exactly what was put as the first version of a new twin, all or nothing.
+    ///
+    /// # Errors
+    /// [`StoreError::TwinExists`] if others made a twin of this name meanwhile; otherwise as [`Commit::replace`].
+    pub fn create(self, settings: VersionSettings) -> Result<Version, StoreError> {
+        settings.check()?;
+        self.check_clamped()?;
+        self.publish(None, |commit, latest| {
+            if let Some(latest) = latest {
+                return Err(StoreError::TwinExists { name: commit.name.clone(), latest });
+            }
+            let manifest = commit.new_manifest(settings.clone())?;
             commit.put_manifest(manifest)
         })
     }
@@ -269,6 +285,7 @@ impl Commit {
         self.check_field("sh_degree", self.sh_degree, manifest.sh_degree)?;
         self.check_field("record", Some(self.storage.record), manifest.record)?;
         let VersionChange { profile, rig, trajectories, sky, geo, provenance } = change.clone();
+        let edited = provenance.is_none().then(|| manifest.clone());
         if let Some(sky) = sky {
             manifest.sky = sky.map(|sky| sky.put(&mut *self.staging)).transpose()?;
         }
@@ -279,11 +296,16 @@ impl Commit {
         manifest.geo = geo.unwrap_or(manifest.geo);
         // Before the provenance is replaced, which may be the only place that has it.
         manifest.twin_from_capture = manifest.alignment()?;
-        manifest.provenance = provenance;
         let own = manifest.chunks.into_iter().map(|chunk| ([chunk.cell[1], chunk.cell[0]], chunk));
         let mut chunks: BTreeMap<_, _> = own.collect();
         chunks.extend(self.chunks.clone());
         manifest.chunks = chunks.into_values().collect();
+        match provenance {
+            Some(provenance) => manifest.provenance = provenance,
+            // An edit that changes nothing makes no version, so it keeps the note.
+            None if edited.as_ref() == Some(&manifest) => {}
+            None => manifest.provenance = manifest.provenance.of_edit(),
+        }
         Ok(manifest)
     }
 

@@ -104,9 +104,9 @@ impl Catalog {
         let storage = StorageOptions { record: manifest.record, levels };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
-        let mut provenance = manifest.provenance.clone();
+        let mut provenance = manifest.provenance.of_edit();
         provenance.options.push(option);
-        let version = commit.change(base.number, VersionChange::none(provenance))?;
+        let version = commit.change(base.number, VersionChange::of(provenance))?;
         Ok(Cut { version, gaussians: cut })
     }
 

@@ -83,7 +83,7 @@ impl Diff {
             ("sky", before.sky != after.sky),
             ("views", before.views != after.views),
             ("geo", before.geo != after.geo),
-            (Self::ALIGNMENT, before.alignment().ok() != after.alignment().ok()),
+            (Self::ALIGNMENT, before.alignment() != after.alignment()),
         ];
         let settings = differs.into_iter().filter_map(|(field, differs)| differs.then_some(field));
         Self { kept: all - cells.len() as u64, cells, settings: settings.collect() }

@@ -45,11 +45,9 @@ impl Catalog {
     ) -> Result<Version, StoreError> {
         let Edit { alignment, trajectories: new, rig, kind } = edit;
         let manifest = &base.manifest;
-        let mut provenance = manifest.provenance.clone();
         let is_aligned = alignment != Alignment::IDENTITY;
         let mut trajectories = manifest.trajectories.clone();
         if is_aligned {
-            provenance.options.push(format!("align={alignment}"));
             trajectories = trajectories.iter().map(|drive| alignment.drive(drive)).collect();
         }
         let is_kept = |drive: &Trajectory| new.iter().all(|other| other.name != drive.name);
@@ -60,10 +58,12 @@ impl Catalog {
         let mut commit = self.begin(&manifest.twin, kind, storage)?;
         if !is_aligned {
             let trajectories = Some(trajectories);
-            let change = VersionChange { trajectories, rig, ..VersionChange::none(provenance) };
+            let change = VersionChange { trajectories, rig, ..VersionChange::edit() };
             return commit.change(base.number, change);
         }
 
+        let mut provenance = manifest.provenance.of_edit();
+        provenance.options.push(format!("align={alignment}"));
         let before = manifest.alignment()?;
         let twin_from_capture = before.map_or(alignment, |before| alignment.after(&before));
         twin_from_capture.check()?;

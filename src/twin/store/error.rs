@@ -188,6 +188,16 @@ pub enum StoreError {
         /// The value of the twin.
         needed: String,
     },
+    /// Others made the twin that a commit would make.
+    #[error(
+        "twin {name:?} exists since a moment ago, at version {latest}: make the change from that version"
+    )]
+    TwinExists {
+        /// The twin.
+        name: String,
+        /// Its latest version.
+        latest: u64,
+    },
     /// Other commits changed the same cells or settings since the base of a change.
     #[error(
         "twin {name:?} changed since version {base}, in the same place: version {latest} has other \
@@ -203,7 +213,8 @@ pub enum StoreError {
         latest: u64,
         /// Grid cells (x, y) that both changed, in order of (y, x).
         cells: Vec<[i32; 2]>,
-        /// What both changed of `profile`, `sh_degree`, `record`, `rig`, `trajectories`, and `sky`.
+        /// What both changed of [`Diff::settings`](super::Diff::settings). `alignment` is there also if others alone
+        /// changed it.
         settings: Vec<&'static str>,
     },
     /// A side file (a lease, or the state of garbage collection) is too large to be read again.

@@ -43,8 +43,8 @@ pub struct VersionChange {
     pub sky: Option<Option<NewSky>>,
     /// Where the world lies on the earth; `Some(None)` removes it.
     pub geo: Option<Option<GeoAnchor>>,
-    /// Where the new version comes from.
-    pub provenance: Provenance,
+    /// Where the new version comes from; `None` for an edit, which comes from where its base does, and has no note.
+    pub provenance: Option<Provenance>,
 }
 
 impl VersionSettings {
@@ -59,8 +59,20 @@ impl VersionSettings {
 
 impl VersionChange {
     /// Keeps everything of the base version.
-    pub fn none(provenance: Provenance) -> Self {
-        Self { profile: None, rig: None, trajectories: None, sky: None, geo: None, provenance }
+    pub fn edit() -> Self {
+        Self {
+            profile: None,
+            rig: None,
+            trajectories: None,
+            sky: None,
+            geo: None,
+            provenance: None,
+        }
+    }
+
+    /// Keeps everything of the base version but its provenance.
+    pub fn of(provenance: Provenance) -> Self {
+        Self { provenance: Some(provenance), ..Self::edit() }
     }
 
     /// Checks everything but the sky, which needs the profile of the base.
