@@ -1,18 +1,20 @@
 //! A scene of many files as one archive. A push has at most 256 files, and a streamed SOG has nine for each block.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::{self, BufWriter};
+use std::io::{self, BufWriter, Read as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
+use serde::Deserialize;
 use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use wildcity_twin::ingest::SOG_DESCRIPTIONS;
 
-/// Endings of the files that a SOG consists of.
-const ENDINGS: [&str; 2] = ["json", "webp"];
+/// Most bytes of a description: those of a scene of 100,000 blocks take 10 MB.
+const DESCRIPTION_BYTES: u64 = 64 << 20;
 /// Size from which an entry needs the fields of zip64, in bytes.
 const LARGE_BYTES: u64 = u32::MAX as u64;
 
@@ -28,36 +30,55 @@ impl PackedFolder {
     }
 }
 
+/// The keys of a SOG's description that name files, relative to its folder.
+#[derive(Deserialize)]
+struct Description {
+    /// Other descriptions: the blocks of a streamed scene.
+    #[serde(default)]
+    filenames: Vec<String>,
+    environment: Option<String>,
+    means: Option<Images>,
+    scales: Option<Images>,
+    quats: Option<Images>,
+    sh0: Option<Images>,
+    #[serde(rename = "shN")]
+    sh_n: Option<Images>,
+}
+
+#[derive(Deserialize)]
+struct Images {
+    files: Vec<String>,
+}
+
 /// Packs the SOG in a folder, if `path` is a folder, or the only file of a push and describes a SOG. None for any other
 /// file. The same files give the same bytes, so that an upload continues where it stopped.
 ///
 /// # Errors
-/// The folder has no SOG, or cannot be read; the archive cannot be written.
+/// The folder has no SOG, or a description in it cannot be read; the archive cannot be written.
 pub(super) fn pack(path: &Path, is_only: bool) -> anyhow::Result<Option<PackedFolder>> {
-    let is_description = path
-        .file_name()
-        .is_some_and(|name| SOG_DESCRIPTIONS.iter().any(|description| name == *description));
-    let folder = match path {
-        path if path.is_dir() => path.to_owned(),
-        path if is_only && is_description && path.is_file() => {
-            path.parent().filter(|folder| *folder != "").unwrap_or(Path::new(".")).to_owned()
-        }
-        _ => return Ok(None),
+    let described = path.file_name().and_then(|name| SOG_DESCRIPTIONS.iter().find(|d| name == **d));
+    let (folder, description) = if path.is_dir() {
+        let found = SOG_DESCRIPTIONS.iter().find(|name| path.join(name).is_file());
+        let found = found.with_context(|| {
+            let names = SOG_DESCRIPTIONS.join(" or ");
+            let folder = path.display();
+            format!(
+                "{folder} is a folder without {names}: give a scene file, and the files that it names"
+            )
+        })?;
+        (path, *found)
+    } else if let Some(name) = described.filter(|_| is_only && path.is_file()) {
+        let folder = path.parent().filter(|folder| *folder != "").unwrap_or(Path::new("."));
+        (folder, *name)
+    } else {
+        return Ok(None);
     };
-    anyhow::ensure!(
-        SOG_DESCRIPTIONS.iter().any(|description| folder.join(description).is_file()),
-        "{} is a folder without {}: give a scene file, and the files that it names",
-        folder.display(),
-        SOG_DESCRIPTIONS.join(" or ")
-    );
-    let packed = write(&folder).with_context(|| format!("cannot pack {}", folder.display()))?;
-    Ok(Some(packed))
+    let packed = write(folder, description);
+    Ok(Some(packed.with_context(|| format!("cannot pack {}", folder.display()))?))
 }
 
-fn write(folder: &Path) -> anyhow::Result<PackedFolder> {
-    let mut names = Vec::new();
-    collect(folder, "", &mut names)?;
-    names.sort_unstable();
+fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {
+    let names = named_files(folder, description)?;
     let dir = tempfile::tempdir()?;
     // The name of the folder, also if it is given as `.`.
     let whole = fs::canonicalize(folder)?;
@@ -77,24 +98,47 @@ fn write(folder: &Path) -> anyhow::Result<PackedFolder> {
     Ok(PackedFolder { path, _dir: dir })
 }
 
-/// The names of the files below a folder, with `/`. Links to folders are not followed.
-fn collect(folder: &Path, prefix: &str, names: &mut Vec<String>) -> anyhow::Result<()> {
-    for entry in fs::read_dir(folder).with_context(|| folder.display().to_string())? {
-        let entry = entry?;
-        let path = entry.path();
-        let is_part = ENDINGS.iter().any(|ending| path.extension().is_some_and(|e| e == *ending));
-        let is_folder = entry.file_type()?.is_dir();
-        if !is_part && !is_folder {
-            continue;
+/// The description and the files that it names, and those that these name, relative to the folder. What is named and does
+/// not exist is left out: a server needs the finest blocks alone, and says what it misses.
+fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<String>> {
+    let root = fs::canonicalize(folder)?;
+    let mut names = BTreeSet::from([description.to_owned()]);
+    let mut unread = vec![description.to_owned()];
+    while let Some(name) = unread.pop() {
+        let mut json = Vec::new();
+        let file = File::open(folder.join(&name)).with_context(|| name.clone())?;
+        file.take(DESCRIPTION_BYTES + 1).read_to_end(&mut json).with_context(|| name.clone())?;
+        anyhow::ensure!(
+            json.len() as u64 <= DESCRIPTION_BYTES,
+            "{name} has more than {DESCRIPTION_BYTES} bytes"
+        );
+        let parsed = serde_json::from_slice(&json).with_context(|| name.clone())?;
+        let Description { filenames, environment, means, scales, quats, sh0, sh_n } = parsed;
+        let beside = name.rfind('/').map_or("", |slash| &name[..=slash]);
+        let mut add = |named: &str| -> anyhow::Result<Option<String>> {
+            let path = format!("{beside}{named}");
+            let file = folder.join(&path);
+            // A link may lead out of the folder, where a name may not.
+            let is_inside =
+                is_below(named) && (!file.is_file() || fs::canonicalize(&file)?.starts_with(&root));
+            anyhow::ensure!(is_inside, "{name} names {named:?}, which is not below its folder");
+            let is_new = file.is_file() && names.insert(path.clone());
+            Ok(is_new.then_some(path))
+        };
+        for named in filenames.iter().chain(&environment) {
+            unread.extend(add(named)?);
         }
-        let name = entry.file_name().into_string();
-        let name =
-            name.map_err(|_| anyhow::anyhow!("the name of {} is not UTF-8", path.display()))?;
-        if is_folder {
-            collect(&path, &format!("{prefix}{name}/"), names)?;
-        } else if path.is_file() {
-            names.push(format!("{prefix}{name}"));
+        for images in [means, scales, quats, sh0, sh_n].into_iter().flatten() {
+            for named in &images.files {
+                add(named)?;
+            }
         }
     }
-    Ok(())
+    Ok(names)
+}
+
+/// Whether a name leads to a file below the folder that it is relative to.
+fn is_below(name: &str) -> bool {
+    let has_no_way_up = name.split('/').all(|step| !["", ".", ".."].contains(&step));
+    has_no_way_up && !name.contains(['\\', '\0'])
 }

@@ -87,7 +87,7 @@ async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
     let (_, inspected) = wildcity(&["inspect", "test", "--twins", &twins]);
     assert!(inspected.contains("alignment   2.000000 m per unit of the capture"), "{inspected}");
     assert!(inspected.contains("objects     1 chunk,"), "{inspected}");
-    // An edit has the note of its base in its provenance, which is not its own.
+    // The note of a push is not that of a later edit.
     let (ok, log) = wildcity(&["twin", "log", "test", "--twins", &twins]);
     let notes: Vec<&str> = log.lines().map(|line| line[46..].trim_start()[64..].trim()).collect();
     assert!(ok, "{log}");
@@ -119,7 +119,6 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
         fs::create_dir_all(path.parent().unwrap()).unwrap();
         fs::write(path, bytes).unwrap();
     }
-    fs::write(folder.join("video.mp4"), "not a part").unwrap();
     let hash = |text: &str| text.lines().last().unwrap().to_owned();
     let mut pushed = Vec::new();
     for given in [folder.clone(), folder.join("lod-meta.json")] {
@@ -127,8 +126,29 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
         let (ok, said) = wildcity(&["push", given, "--twin", "sog", "--server", &url]);
         assert!(ok && said.contains("street.zip: 50 Gaussians"), "{said}");
         pushed.push(hash(&said));
+        for other in ["photo.webp", "notes.json", "0/video.mp4"] {
+            fs::write(folder.join(other), "not named").unwrap();
+        }
     }
-    assert_eq!(pushed[0], pushed[1], "the same archive");
+    assert_eq!(pushed[0], pushed[1], "the same archive: what is not named is no part");
+    // One block alone.
+    let block = folder.join("0/meta.json");
+    let (ok, said) =
+        wildcity(&["push", block.to_str().unwrap(), "--twin", "block", "--server", &url]);
+    assert!(ok && said.contains("0.zip: 45 Gaussians"), "{said}");
+    let outside = dir.path().join("outside");
+    fs::write(&outside, "secret").unwrap();
+    std::os::unix::fs::symlink(&outside, folder.join("link.json")).unwrap();
+    for (damaged, reason) in [
+        (r#"{"filenames": ["link.json"]}"#, "which is not below its folder"),
+        (r#"{"filenames": ["../street/0/meta.json"]}"#, "which is not below its folder"),
+        (r#"{"filenames": ["/etc/meta.json"]}"#, "which is not below its folder"),
+        ("{", "lod-meta.json"),
+    ] {
+        fs::write(folder.join("lod-meta.json"), damaged).unwrap();
+        let (ok, said) = wildcity(&["push", folder.to_str().unwrap(), "--twin", "sog"]);
+        assert!(!ok && said.contains("cannot pack") && said.contains(reason), "{said}");
+    }
     fs::remove_file(folder.join("lod-meta.json")).unwrap();
     let (ok, said) = wildcity(&["push", folder.to_str().unwrap(), "--twin", "sog"]);
     assert!(!ok && said.contains("is a folder without lod-meta.json or meta.json"), "{said}");

@@ -152,8 +152,15 @@ def test_a_push_in_the_frame_of_the_capture_is_the_golden_one(monkeypatch: pytes
 def test_the_folder_of_a_sog_is_one_archive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = tmp_path / "street"
     (folder / "0").mkdir(parents=True)
-    for name in ("lod-meta.json", "0/meta.json", "0/means_l.webp", "video.mp4"):
-        (folder / name).write_text(name)
+    means = {"files": ["means_l.webp", "means_u.webp"]}
+    files = {
+        "lod-meta.json": json.dumps({"filenames": ["0/meta.json", "coarse/meta.json"], "environment": None}),
+        "0/meta.json": json.dumps({"means": means}),
+    }
+    for name in ("0/means_l.webp", "0/not_named.webp", "notes.json", "video.mp4"):
+        files[name] = name
+    for name, text in files.items():
+        (folder / name).write_text(text)
     names: list[list[str]] = []
     archives: list[bytes] = []
 
@@ -172,9 +179,23 @@ def test_the_folder_of_a_sog_is_one_archive(monkeypatch: pytest.MonkeyPatch, tmp
         os.utime(folder / "0" / "meta.json", (0, len(names)))
         assert upload_all(client, [path], "identity", 1.0, lambda _: None) == wanted
     assert names == [["0/means_l.webp", "0/meta.json", "lod-meta.json"]] * 2 and archives[0] == archives[1]
+    (tmp_path / "outside").write_text("secret")
+    (folder / "link.json").symlink_to(tmp_path / "outside")
+    for damaged, reason in (
+        ('{"filenames": ["link.json"]}', "not below its folder"),
+        ('{"filenames": ["../street/0/meta.json"]}', "not below its folder"),
+        ('{"filenames": [1]}', "names of files are texts"),
+        ('{"means": 1}', "no description"),
+        ("{", "no description"),
+    ):
+        (folder / "lod-meta.json").write_text(damaged)
+        with pytest.raises(ValueError, match=reason):
+            upload_all(client, [folder], "identity", 1.0, lambda _: None)
     (folder / "lod-meta.json").unlink()
     with pytest.raises(ValueError, match=r"is a folder without lod-meta\.json or meta\.json"):
         upload_all(client, [folder], "identity", 1.0, lambda _: None)
+    with pytest.raises(FileNotFoundError, match=r"lod-meta\.json"):
+        upload_all(client, [folder / "lod-meta.json"], "identity", 1.0, lambda _: None)
 
 
 def test_refusals_raise_typed_errors(server: str, tmp_path: Path) -> None:

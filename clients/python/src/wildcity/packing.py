@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import json
+import os
 import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+DESCRIPTION_BYTES = 64 << 20
+"""Most bytes of a description: those of a scene of 100,000 blocks take 10 MB."""
 
 METAS = ("lod-meta.json", "meta.json")
 """Files that describe a SOG; the first is that of a streamed one."""
@@ -18,20 +25,23 @@ def packed(path: Path, is_only: bool) -> Iterator[Path]:
     """An archive of the SOG in a folder, if `path` is a folder, or the only file of a push and describes a SOG;
     otherwise the path itself. The same files give the same bytes, so that an upload continues where it stopped.
 
-    Raises `ValueError` if the folder has no SOG.
+    Raises `ValueError` if the folder has no SOG, or a description in it cannot be understood.
     """
     if not path.is_dir() and not (is_only and path.name in METAS):
         yield path
         return
-    folder = path if path.is_dir() else path.parent
-    if not any((folder / meta).is_file() for meta in METAS):
-        metas = " or ".join(METAS)
-        raise ValueError(f"{folder} is a folder without {metas}: give a scene file, and the files that it names")
-    names = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if _is_part(file))
+    folder, metas = (path, METAS) if path.is_dir() else (path.parent, (path.name,))
+    meta = next((meta for meta in metas if (folder / meta).is_file()), None)
+    if meta is None and not path.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    if meta is None:
+        known = " or ".join(METAS)
+        raise ValueError(f"{folder} is a folder without {known}: give a scene file, and the files that it names")
+    names = _named_files(folder, meta)
     with tempfile.TemporaryDirectory() as temporary:
         archive = Path(temporary) / f"{folder.resolve().name}.zip"
         with zipfile.ZipFile(archive, "w") as written:
-            for name in names:
+            for name in sorted(names):
                 # Without a time of the file system. The images are compressed already.
                 entry = zipfile.ZipInfo(name)
                 entry.file_size = (folder / name).stat().st_size
@@ -40,5 +50,45 @@ def packed(path: Path, is_only: bool) -> Iterator[Path]:
         yield archive
 
 
-def _is_part(path: Path) -> bool:
-    return path.suffix in (".json", ".webp") and path.is_file()
+def _named_files(folder: Path, meta: str) -> set[str]:
+    """The description and the files that it names, and those that these name, relative to the folder.
+
+    What is named and does not exist is left out: a server needs the finest blocks alone, and says what it misses.
+    """
+    names = {meta}
+    unread = [meta]
+    while unread:
+        name = unread.pop()
+        if (folder / name).stat().st_size > DESCRIPTION_BYTES:
+            raise ValueError(f"{folder / name} has more than {DESCRIPTION_BYTES} bytes")
+        try:
+            blocks, images = _files_of(json.loads((folder / name).read_bytes()))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise ValueError(f"{folder / name} is no description of a SOG: {error}") from error
+        beside = name[: name.rfind("/") + 1]
+        for named in blocks + images:
+            path = beside + named
+            # A link may lead out of the folder, where a name may not.
+            if not _is_below(named) or not (folder / path).resolve().is_relative_to(folder.resolve()):
+                raise ValueError(f"{folder / name} names {named!r}, which is not below its folder")
+            if path not in names and (folder / path).is_file():
+                names.add(path)
+                if named in blocks:
+                    unread.append(path)
+    return names
+
+
+def _files_of(description: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """Names of the blocks of a streamed scene, and of images."""
+    environment = description.get("environment")
+    blocks = [*description.get("filenames", []), *([environment] if environment else [])]
+    parts = [description.get(part) for part in ("means", "scales", "quats", "sh0", "shN")]
+    images = [name for part in parts if part for name in part["files"]]
+    if not all(isinstance(name, str) for name in blocks + images):
+        raise TypeError("names of files are texts")
+    return blocks, images
+
+
+def _is_below(name: str) -> bool:
+    """Whether a name leads to a file below the folder that it is relative to."""
+    return all(step not in ("", ".", "..") for step in name.split("/")) and not any(c in name for c in "\\\0")
