@@ -266,8 +266,13 @@ pub trait Backend: Send + Sync {
     fn limit_frame_bytes(&self, _bytes: u64) {}
 
     /// The most that it holds in the machine's memory between the stages of a frame of these views, whatever the scene,
-    /// in bytes. If `is_large`, this includes a small frame that it renders beside this one.
-    fn frame_bytes(&self, _views: &[View], _is_large: bool) -> u64 {
+    /// in bytes.
+    fn frame_bytes(&self, _views: &[View]) -> u64 {
+        0
+    }
+
+    /// As [`Backend::frame_bytes`], of a small frame that is rendered while a large one is.
+    fn bytes_beside(&self, _views: &[View]) -> u64 {
         0
     }
 

@@ -1,5 +1,7 @@
 //! Limits and defaults of this package, with the arithmetic behind each.
 
+use std::time::Duration;
+
 /// Most render threads: above any machine's cores, below what exhausts a machine's processes.
 pub const RENDER_THREADS: usize = 1024;
 
@@ -7,6 +9,10 @@ pub const RENDER_THREADS: usize = 1024;
 /// soon as the first is done. Encoding six JPEGs takes longer than a fast GPU needs to draw the images. Each
 /// frame holds its images, 27 MB for six full cameras.
 pub const GPU_FRAMES: usize = 3;
+
+/// How long a backend that is dropped waits for devices that have failed: dropping one takes some 10 ms, unless its
+/// driver hangs.
+pub const DISCARD: Duration = Duration::from_secs(2);
 
 /// Number of frames, among those that did not fit a GPU at once, whose regions are remembered: a few kB in all,
 /// for more rigs than are used at the same time.
@@ -24,7 +30,7 @@ pub const SPLAT_BYTES: u64 = 128;
 pub const LEAST_SPLAT_BYTES: u64 = 92;
 
 /// Most bytes that the cpu backend holds between the stages of a large frame: 4 million Gaussians of visible clusters,
-/// as many as six full-size views of a street of 700,000 have. Small frames beside it take a quarter as much.
+/// as many as six full-size views of a street of 700,000 have. A small frame beside it is given a quarter.
 pub const LANE_BYTES: u64 = 512 << 20;
 
 /// The least that it is given: 32,000 Gaussians, so that each slab is worth the time to find it.

@@ -80,9 +80,12 @@ impl Stills {
     pub async fn covers(&self, views: &[View]) -> Result<bool, SessionError> {
         let resident = self.reservation.resident().clone();
         let needed = Engine::worst_case_bytes(resident, extent(views), self.profile).await?;
-        let FrameBytes { stages, images } = frame_bytes(&self.engine, views);
+        let FrameBytes { stages, beside, is_large, images } = frame_bytes(&self.engine, views);
         let frame = self.reservation.frame();
-        let frame_fits = stages <= frame.stages && images <= frame.images;
+        let frame_fits = stages <= frame.stages
+            && beside <= frame.beside
+            && (frame.is_large || !is_large)
+            && images <= frame.images;
         Ok(frame_fits && needed <= self.reservation.scene_bytes())
     }
 
@@ -179,9 +182,12 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
 fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
+        let frame = engine.frame_bytes(views, 0, STILL_PIXEL_BYTES * pixels);
         FrameBytes {
-            stages: most.stages.max(engine.stage_bytes(views)),
-            images: most.images.max(STILL_PIXEL_BYTES * pixels),
+            stages: most.stages.max(frame.stages),
+            beside: most.beside.max(frame.beside),
+            is_large: most.is_large || frame.is_large,
+            images: most.images.max(frame.images),
         }
     })
 }

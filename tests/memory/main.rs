@@ -82,7 +82,7 @@ fn import_takes_twice_the_file_and_serving_120_bytes_a_gaussian() {
         draw(&views);
     }
     let taken = status_bytes("self", "VmHWM").unwrap() - before;
-    let allowed = backend.frame_bytes(&views, false) + CONSTANT_BYTES;
+    let allowed = backend.frame_bytes(&views) + CONSTANT_BYTES;
     assert!(taken <= allowed, "frames: {taken} bytes, {allowed} allowed");
     assert!(taken > 16 << 20, "frames: {taken} bytes cannot be all");
 }

@@ -415,7 +415,7 @@ async fn assets_count_against_the_memory_of_twins() {
     let third = open(&bench_, "b", options.clone()).await;
     let with = stats(&bench_.engine).reserved_bytes;
     let scene_bytes = first.reservation().scene_bytes();
-    let FrameBytes { stages, images } = first.reservation().frame();
+    let FrameBytes { stages, images, .. } = first.reservation().frame();
     let whole = first.resident().total_bytes();
     assert_eq!(reserved_bytes, scene_bytes.min(whole) + stages + images);
     let sessions = (3 * scene_bytes).min(whole) + stages + 3 * images;

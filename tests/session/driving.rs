@@ -295,9 +295,9 @@ async fn a_session_reserves_what_its_frames_hold() {
         let session = bench.session("a", None).await.unwrap();
         let frame = session.reservation().frame();
         let views = views(demo().at(0.0));
-        assert!(frame.stages >= backend.frame_bytes(&views, false), "{frame:?}");
+        assert!(frame.stages >= backend.frame_bytes(&views), "{frame:?}");
         assert!(frame.images > 0 && frame.stages > limit_bytes / 8, "{frame:?}");
-        assert!(frame.sum() + session.reservation().scene_bytes() == session.reserved_bytes());
+        assert!(frame.alone() + session.reservation().scene_bytes() == session.reserved_bytes());
         assert_eq!(session.reserved_bytes(), bench.engine.residency().reserved_bytes);
         reserved.push(frame.stages);
     }

@@ -223,10 +223,13 @@ impl Backend for Cpu {
         self.lane_bytes.store(accepted_bytes, Relaxed);
     }
 
-    fn frame_bytes(&self, views: &[View], is_large: bool) -> u64 {
-        let bytes = drawing::most_held_bytes(self.lane_bytes.load(Relaxed), views, self.threads());
-        let side_bytes = if is_large { bytes / SIDE_SHARE } else { 0 };
-        bytes + side_bytes
+    fn frame_bytes(&self, views: &[View]) -> u64 {
+        drawing::most_held_bytes(self.lane_bytes.load(Relaxed), views, self.threads())
+    }
+
+    fn bytes_beside(&self, views: &[View]) -> u64 {
+        let most_bytes = self.lane_bytes.load(Relaxed) / SIDE_SHARE;
+        drawing::most_held_bytes(most_bytes, views, self.threads())
     }
 
     fn render(

@@ -308,10 +308,14 @@ impl Engine {
         Ok(run_blocking(move || resident.reserve_with(extent, &profile, frame)).await??)
     }
 
-    /// What a frame of some views takes beside its scene and its images, in bytes.
-    pub(crate) fn stage_bytes(&self, views: &[View]) -> u64 {
+    /// What a frame of some views takes beside its scene, if it renders `rendered` bytes of images and its session holds
+    /// `images` bytes of them.
+    pub(crate) fn frame_bytes(&self, views: &[View], rendered: u64, images: u64) -> FrameBytes {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
-        self.queue.backend().frame_bytes(views, pixels > limits::LARGE_PIXELS)
+        let is_large = pixels > limits::LARGE_PIXELS;
+        let backend = self.queue.backend();
+        let beside = if is_large { 0 } else { backend.bytes_beside(views) + rendered };
+        FrameBytes { stages: backend.frame_bytes(views) + rendered, beside, is_large, images }
     }
 
     /// Memory that the worst frame of a rig needs, in bytes.

@@ -417,8 +417,7 @@ pub(super) fn frame_bytes(
     has_trust: bool,
 ) -> FrameBytes {
     let views = View::of_rig(layout.cameras(), Pose::IDENTITY);
-    let stages = engine.stage_bytes(&views);
-    FrameBytes { stages: stages + layout.rendered_bytes(has_trust), images: layout.answers_bytes() }
+    engine.frame_bytes(&views, layout.rendered_bytes(has_trust), layout.answers_bytes())
 }
 
 /// The drive that the start names, else the twin's first.

@@ -11,14 +11,18 @@ use super::ResidencyError;
 /// Bytes that are reserved for the worst frames of sessions, by version.
 ///
 /// Sessions on one version share what they draw, so together they never need more than the whole
-/// version takes. Their frames are rendered in turn, so that of what frames hold between the stages only the
-/// largest counts; each has images of its own.
+/// version takes. Their frames are rendered in turn, but for a small one beside a large one, so that of what frames hold
+/// between the stages only the largest counts, and the largest of those beside; each has images of its own.
 #[derive(Clone, Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
     versions: BTreeMap<String, VersionClaims>,
     /// Number of claims by [`FrameBytes::stages`].
     stages: BTreeMap<u64, u64>,
+    /// Number of claims by [`FrameBytes::beside`].
+    beside: BTreeMap<u64, u64>,
+    /// Number of claims of large frames.
+    large: u64,
     images_bytes: u64,
 }
 
@@ -27,13 +31,17 @@ pub(super) struct Budget {
 pub struct FrameBytes {
     /// What a frame holds while it is rendered. All sessions share it.
     pub stages: u64,
+    /// What a small frame holds if it is rendered while a large one is; 0 for large frames, which never are.
+    pub beside: u64,
+    /// Whether it is a large frame, which small ones are rendered beside.
+    pub is_large: bool,
     /// The images that a session holds.
     pub images: u64,
 }
 
 impl FrameBytes {
-    /// Both.
-    pub fn sum(&self) -> u64 {
+    /// What a session's frames take if no other session draws.
+    pub fn alone(&self) -> u64 {
         self.stages.saturating_add(self.images)
     }
 }
@@ -64,7 +72,8 @@ pub(super) struct Claim {
 impl Budget {
     pub(super) fn new(limit_bytes: u64) -> Self {
         let versions = BTreeMap::new();
-        Self { limit_bytes, versions, stages: BTreeMap::new(), images_bytes: 0 }
+        let (stages, beside) = (BTreeMap::new(), BTreeMap::new());
+        Self { limit_bytes, versions, stages, beside, large: 0, images_bytes: 0 }
     }
 
     /// Reserves memory.
@@ -73,27 +82,28 @@ impl Budget {
     /// [`ResidencyError::NoRoom`] with the numbers.
     pub(super) fn reserve(&mut self, claim: &Claim) -> Result<(), ResidencyError> {
         let held_bytes = self.reserved_bytes();
-        let unused = VersionClaims { sessions: 0, sum_bytes: 0, total_bytes: claim.total_bytes };
-        let before = self.versions.get(&claim.version).copied().unwrap_or(unused);
-        let after = VersionClaims {
-            sessions: before.sessions + 1,
-            sum_bytes: before.sum_bytes.saturating_add(claim.bytes),
-            ..before
-        };
-        let images_bytes = self.images_bytes.saturating_add(claim.frame.images);
-        let of_frame = claim.frame.stages.max(self.stages_bytes())
-            + images_bytes.min(limits::IMAGE_BYTES)
-            - self.frame_bytes();
-        let needed_bytes = (after.bytes() - before.bytes()).saturating_add(of_frame);
+        let mut after = self.clone();
+        after.add(claim);
+        let needed_bytes = after.reserved_bytes() - held_bytes;
         if needed_bytes > self.limit_bytes.saturating_sub(held_bytes) {
             let twin = claim.twin.clone();
             let limit_bytes = self.limit_bytes;
             return Err(ResidencyError::NoRoom { twin, needed_bytes, held_bytes, limit_bytes });
         }
-        self.versions.insert(claim.version.clone(), after);
-        *self.stages.entry(claim.frame.stages).or_default() += 1;
-        self.images_bytes += claim.frame.images;
+        *self = after;
         Ok(())
+    }
+
+    fn add(&mut self, claim: &Claim) {
+        let unused = VersionClaims { sessions: 0, sum_bytes: 0, total_bytes: claim.total_bytes };
+        let version = self.versions.entry(claim.version.clone()).or_insert(unused);
+        version.sessions += 1;
+        version.sum_bytes = version.sum_bytes.saturating_add(claim.bytes);
+        let FrameBytes { stages, beside, is_large, images } = claim.frame;
+        *self.stages.entry(stages).or_default() += 1;
+        *self.beside.entry(beside).or_default() += 1;
+        self.large += u64::from(is_large);
+        self.images_bytes = self.images_bytes.saturating_add(images);
     }
 
     /// Reserves memory in place of an earlier claim. If the new claim is refused, the old one
@@ -116,12 +126,9 @@ impl Budget {
                 self.versions.remove(&claim.version);
             }
         }
-        if let Some(claims) = self.stages.get_mut(&claim.frame.stages) {
-            *claims -= 1;
-            if *claims == 0 {
-                self.stages.remove(&claim.frame.stages);
-            }
-        }
+        remove_one(&mut self.stages, claim.frame.stages);
+        remove_one(&mut self.beside, claim.frame.beside);
+        self.large -= u64::from(claim.frame.is_large);
         self.images_bytes -= claim.frame.images;
     }
 
@@ -136,7 +143,20 @@ impl Budget {
     }
 
     fn stages_bytes(&self) -> u64 {
-        self.stages.last_key_value().map_or(0, |(&bytes, _)| bytes)
+        let most =
+            |claims: &BTreeMap<u64, u64>| claims.last_key_value().map_or(0, |(&bytes, _)| bytes);
+        let beside = if self.large > 0 { most(&self.beside) } else { 0 };
+        most(&self.stages).saturating_add(beside)
+    }
+}
+
+/// Removes one of the claims of a number of bytes.
+fn remove_one(claims: &mut BTreeMap<u64, u64>, bytes: u64) {
+    if let Some(count) = claims.get_mut(&bytes) {
+        *count -= 1;
+        if *count == 0 {
+            claims.remove(&bytes);
+        }
     }
 }
 

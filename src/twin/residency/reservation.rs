@@ -88,7 +88,7 @@ impl Reservation {
 
     /// The reserved memory, in bytes.
     pub fn bytes(&self) -> u64 {
-        self.claim.bytes.saturating_add(self.claim.frame.sum())
+        self.claim.bytes.saturating_add(self.claim.frame.alone())
     }
 
     /// The part of it that is for scenes, in bytes.

@@ -118,8 +118,8 @@ impl Bins {
         Ok(())
     }
 
-    /// Frees what segments keep of earlier frames if it is more than `most_bytes`: each may have been long in another
-    /// frame.
+    /// Frees what segments and the threads' lists of pairs keep of earlier frames if it is more than `most_bytes`: each
+    /// may have been long in another frame.
     pub(super) fn trim(&mut self, most_bytes: u64) {
         let of_segments: usize = self.segments.iter().map(Segment::held_bytes).sum();
         let scratches = self.scratches.get_mut();
