@@ -19,6 +19,7 @@ mod bandwidth;
 mod bin;
 mod chain;
 mod device;
+mod discarded;
 mod growable_buffer;
 mod kernel;
 pub mod layout;
@@ -49,6 +50,7 @@ pub use roofline::Roofline;
 
 use self::chain::Chain;
 use self::device::Device;
+use self::discarded::Discarded;
 use self::read_back::MappedFrame;
 use self::resolve::{Outputs, Pixels};
 use self::shaders::Shaders;
@@ -73,6 +75,7 @@ pub struct Gpu {
     queue: TicketQueue,
     /// Empty after the device has failed; the next frame opens it again.
     chain: Mutex<Option<Chain>>,
+    discarded: Discarded,
 }
 
 /// How much of a device's memory is used, if that is less than all of it.
@@ -174,6 +177,7 @@ impl Gpu {
             cull: pool("cull")?,
             queue: TicketQueue::default(),
             chain: Mutex::new(Some(Chain::new(device, limits.mirror_bytes)?)),
+            discarded: Discarded::default(),
             shaders,
         })
     }
@@ -252,7 +256,7 @@ impl Gpu {
         let done = work(&mut chain);
         match done {
             // Memory may be half-written here, too.
-            Err(RenderError::Device { .. }) => discard(chain),
+            Err(RenderError::Device { .. }) => self.discarded.add(chain),
             _ => *slot = Some(chain),
         }
         done
@@ -319,12 +323,6 @@ impl Gpu {
         drawn.recycle();
         Ok(stats)
     }
-}
-
-/// Drops a device that has failed, in a thread of its own, because a driver that hangs would otherwise block
-/// all callers.
-fn discard(chain: Chain) {
-    std::thread::spawn(move || drop(chain));
 }
 
 impl Backend for Gpu {
