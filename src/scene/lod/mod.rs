@@ -147,9 +147,25 @@ impl Merging {
         // keeps every pair that `price` may accept in spite of rounding.
         let farthest_m2 = 4.0 * limit_m * limit_m * (1.0 + 1e-9);
         let nodes = &self.nodes[group.clone()];
-        for (place, from) in nodes.iter().enumerate() {
-            for (ahead, to) in nodes[place + 1..].iter().take(PARTNERS).enumerate() {
-                if from.mean_m.distance_squared(to.mean_m) > farthest_m2 {
+        // Coordinate by coordinate, so that the distances to all successors are computed by vectors. There is nothing near
+        // behind the last node.
+        let mut means_m = [[f64::INFINITY; GROUP + PARTNERS]; 3];
+        for (place, node) in nodes.iter().enumerate() {
+            for (coordinates, from) in means_m.iter_mut().zip(node.mean_m.to_array()) {
+                coordinates[place] = from;
+            }
+        }
+        for place in 0..nodes.len() {
+            let mut distances_m2 = [0.0; PARTNERS];
+            for coordinates in &means_m {
+                let from = coordinates[place];
+                let successors = &coordinates[place + 1..][..PARTNERS];
+                for (distance_m2, to) in distances_m2.iter_mut().zip(successors) {
+                    *distance_m2 += (from - to) * (from - to);
+                }
+            }
+            for (ahead, distance_m2) in distances_m2.into_iter().enumerate() {
+                if distance_m2 > farthest_m2 {
                     continue;
                 }
                 let first = group.start + place;
