@@ -11,6 +11,7 @@ has ended. All run, whatever fails.
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -19,11 +20,13 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-# These measure times, and run before the others, one after the other.
+# These compare times of a few milliseconds, and run before the others, one after the other.
 ALONE = ["suite", "session"]
 # These take longest, and begin first. One that computes stands before one that waits.
 LONG = ["gpu", "command_line", "Python client", "stress", "store", "viewer", "render"]
 AT_ONCE = 2
+# Several times what the longest takes. One that takes longer is stopped, and has failed.
+LIMIT_S = 1800
 
 
 class Job(NamedTuple):
@@ -47,20 +50,42 @@ def tests(messages: Path) -> list[Job]:
 
 def run(job: Job) -> tuple[bool, float]:
     began = time.monotonic()
+    with PRINTS:
+        print(f"-- {job.name} begins", flush=True)
     with tempfile.TemporaryFile() as output:
         environment = {**os.environ, "CARGO_MANIFEST_DIR": job.folder}
-        status = subprocess.run(
-            job.command, cwd=job.folder, env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-        ).returncode
+        # Its own process group: what it has started is stopped with it.
+        process = subprocess.Popen(
+            job.command,
+            cwd=job.folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        RUNNING.add(process)
+        try:
+            ended = f"exit status {process.wait(LIMIT_S)}"
+        except subprocess.TimeoutExpired:
+            stop(process)
+            ended = f"stopped after {LIMIT_S} s"
+        RUNNING.discard(process)
         took_s = time.monotonic() - began
         output.seek(0)
         said = output.read().decode(errors="replace")
     with PRINTS:
-        print(f"\n== {job.name}: {took_s:.0f} s, exit status {status}\n{said}", flush=True)
-    return status == 0, took_s
+        print(f"\n== {job.name}: {took_s:.0f} s, {ended}\n{said}", flush=True)
+    return process.returncode == 0, took_s
+
+
+def stop(process: "subprocess.Popen[bytes]") -> None:
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 PRINTS = threading.Lock()
+RUNNING: "set[subprocess.Popen[bytes]]" = set()
 
 
 def main() -> None:
@@ -99,7 +124,8 @@ def main() -> None:
                 return
             finish(job)
 
-    threads = [threading.Thread(target=work) for _ in range(AT_ONCE)]
+    # An interruption ends this thread, and with it the others.
+    threads = [threading.Thread(target=work, daemon=True) for _ in range(AT_ONCE)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -114,4 +140,9 @@ def main() -> None:
         sys.exit(f"failed: {', '.join(job.name for job in failed)}")
 
 
-main()
+signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))
+try:
+    main()
+finally:
+    for left in list(RUNNING):
+        stop(left)

@@ -189,12 +189,12 @@ mod tests {
         let newcomers = Newcomers::new(1);
         let elsewhere = IpAddr::from([10, 0, 0, 1]);
         let other = newcomers.admit(elsewhere).await;
+        let begun = Instant::now();
         let mut idle = Vec::new();
         for _ in 1..limits::NEWCOMERS {
             idle.push(newcomers.admit(HERE).await);
         }
-        // They come at once, so none of them has had the time to send a request.
-        let begun = Instant::now();
+        // They came at once, so none of them has had the time to send a request.
         let next = newcomers.admit(HERE).await;
         assert!(begun.elapsed() >= limits::NEWCOMER_GRACE);
         assert!(is_closed(&idle[0]).await && !is_closed(&idle[1]).await);

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -16,15 +17,25 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_scene::{Gaussians, Rig};
 use wildcity_twin::store::{Catalog, NewVersion};
 
-use crate::in_folder::{done, refused};
+use crate::in_folder::{copy, done, refused};
 use crate::onnx_models::library;
 use crate::root::root;
 use crate::versions::files;
 use crate::wildcity;
 
 /// A short street, and the same one spoiled, with a pinhole to the front and a dark fisheye with a rolling shutter to
-/// the left.
+/// the left. They are made once, and copied for each test.
 fn twins(dir: &Path) {
+    static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
+    let made = MADE.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        make_twins(dir.path());
+        dir
+    });
+    copy(made.path(), dir);
+}
+
+fn make_twins(dir: &Path) {
     let preset = Rig::preset("vehicle6").unwrap();
     let mounted = |name: &str, camera| {
         let preset = preset.cameras.iter().find(|camera| camera.name == name).unwrap();

@@ -6,14 +6,14 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::city_twin::city;
+use crate::in_folder::CITY;
 
 #[test]
 fn a_timed_drive_reports_every_kilometre_and_leaves_no_files() {
     let dir = tempfile::tempdir().unwrap();
     let report = bench_drive(
         dir.path(),
-        &["--crop", "16", "--memory-gib", "0.2", "--unpaced", "--from-m", "900", "--steps", "60"],
+        &["--crop", "16", "--memory-gib", "0.13", "--unpaced", "--from-m", "900", "--steps", "60"],
     );
     let count = |of: &str, field: &str| report[of][field].as_u64().unwrap();
     assert_eq!(count("all", "steps"), 60);
@@ -24,7 +24,7 @@ fn a_timed_drive_reports_every_kilometre_and_leaves_no_files() {
     assert_eq!(count("teleports", "steps"), 5);
     assert!(count("teleports", "loads") > 0);
     let limit_bytes = report["limit_bytes"].as_u64().unwrap();
-    assert_eq!(limit_bytes, (0.2 * f64::from(1 << 30)) as u64);
+    assert_eq!(limit_bytes, (0.13 * f64::from(1 << 30)) as u64);
     let held_bytes = count("all", "held_bytes_max");
     assert!(held_bytes > 0 && held_bytes <= limit_bytes, "{held_bytes} of {limit_bytes}");
     assert!(report["peak_rss_bytes"].as_u64().unwrap() > held_bytes);
@@ -43,7 +43,7 @@ fn bench_drive(dir: &Path, arguments: &[&str]) -> Value {
         .args(["bench", "drive", "city", "--backend", "cpu", "--json", "--teleports", "5"])
         .args(arguments)
         .arg("--twins")
-        .arg(city().dir.path())
+        .arg(CITY.dir.path())
         .arg("--csv")
         .arg(dir.join("steps.csv"))
         .env("TMPDIR", dir)

@@ -1,11 +1,14 @@
 //! The demo twin is built once, rebuilt when it is damaged, and never replaces a user's twin of that name.
 
 use std::fs;
+use std::io::{BufRead as _, BufReader};
 use std::path::Path;
-use std::process::Output;
+use std::process::{Command, Output, Stdio};
+use std::sync::OnceLock;
 
 use wildcity_twin::store::Catalog;
 
+use crate::in_folder::copy;
 use crate::scene_files::gaussians;
 use crate::versions::{commit, street};
 use crate::wildcity;
@@ -15,9 +18,46 @@ fn demo(dir: &Path) -> Output {
 }
 
 fn demo_with(dir: &Path, arguments: &[&str]) -> Output {
+    demo_command(dir, arguments).output().unwrap()
+}
+
+fn demo_command(dir: &Path, arguments: &[&str]) -> Command {
     let mut command = wildcity();
     command.args(["demo", "--steps", "1"]).args(arguments).arg("--twins").arg(dir.join("twins"));
-    command.arg("--out").arg(dir.join("out")).output().unwrap()
+    command.arg("--out").arg(dir.join("out"));
+    command
+}
+
+/// What the first drive said, with the demo twin that it built.
+struct Built {
+    said: String,
+    dir: tempfile::TempDir,
+}
+
+/// The demo twin: it takes seconds to build, so it is built once for all tests.
+fn built() -> &'static Built {
+    static BUILT: OnceLock<Built> = OnceLock::new();
+    BUILT.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        let output = demo(dir.path());
+        assert!(output.status.success(), "{output:?}");
+        Built { said: String::from_utf8(output.stderr).unwrap(), dir }
+    })
+}
+
+/// The first line that a demo says, which then is killed.
+fn first_line(dir: &Path) -> String {
+    let mut child = demo_command(dir, &[]).stderr(Stdio::piped()).spawn().unwrap();
+    let mut line = String::new();
+    BufReader::new(child.stderr.take().unwrap()).read_line(&mut line).unwrap();
+    child.kill().unwrap();
+    child.wait().unwrap();
+    line
+}
+
+/// Puts the demo twin into a directory of twins.
+pub(crate) fn copy_demo_twin(twins: &Path) {
+    copy(&built().dir.path().join("twins"), twins);
 }
 
 #[test]
@@ -40,6 +80,7 @@ fn a_twin_of_the_same_name_is_left_alone() {
 #[test]
 fn a_demo_with_traffic_makes_its_assets_and_mends_them() {
     let dir = tempfile::tempdir().unwrap();
+    copy_demo_twin(&dir.path().join("twins"));
     let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
     let mut pictures = Vec::new();
     for scenario in ["cut-in", "traffic"] {
@@ -68,8 +109,15 @@ fn a_damaged_demo_twin_is_built_again() {
         assert!(output.status.success(), "{output:?}");
         String::from_utf8(output.stderr).unwrap()
     };
+    // A device that does not exist is refused before anything is drawn, but after the twin was built.
+    let rebuild = || {
+        let output = demo_with(dir.path(), &["--backend", "gpu", "--device", "no such card"]);
+        assert_eq!(output.status.code(), Some(1), "{output:?}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert!(built().said.contains("building the demo twin in "));
+    copy_demo_twin(&dir.path().join("twins"));
     let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
-    assert!(drive().contains("building the demo twin in "));
     assert!(!drive().contains("building"), "built once");
     let names = fs::read_dir(dir.path().join("out")).unwrap();
     let names: Vec<String> =
@@ -77,14 +125,26 @@ fn a_damaged_demo_twin_is_built_again() {
     assert!(names.iter().all(|name| !name.contains("uploads")), "{names:?}");
     let version = catalog.version("demo", None).unwrap();
     let object = |hash: &str| dir.path().join("twins/demo/objects").join(&hash[..2]).join(hash);
-    for hash in [&version.manifest.chunks[3].object, &version.hash] {
-        let mut bytes = fs::read(object(hash)).unwrap();
+    let flip = |path: &Path| {
+        let mut bytes = fs::read(path).unwrap();
         bytes[40] ^= 1;
-        fs::write(object(hash), bytes).unwrap();
-        assert!(drive().contains("(its files are damaged)"));
-        fs::remove_file(object(hash)).unwrap();
-        assert!(drive().contains("(its files are damaged)"));
+        fs::write(path, bytes).unwrap();
+    };
+    let remove = |path: &Path| fs::remove_file(path).unwrap();
+    let both = [object(&version.manifest.chunks[3].object), object(&version.hash)];
+    for damage in [&flip as &dyn Fn(&Path), &remove] {
+        // Each alone is noticed.
+        for path in &both {
+            let whole = fs::read(path).unwrap();
+            damage(path);
+            assert!(first_line(dir.path()).contains("(its files are damaged)"), "{path:?}");
+            fs::write(path, whole).unwrap();
+        }
+        // Both are repaired by building the twin again.
+        both.iter().for_each(|path| damage(path));
+        assert!(rebuild().contains("(its files are damaged)"));
         assert_eq!(catalog.version("demo", None).unwrap(), version);
         assert_eq!(catalog.verify("demo", &mut |_, _| {}).unwrap().damaged.len(), 0);
     }
+    assert!(!drive().contains("building"), "it can be driven");
 }

@@ -38,6 +38,7 @@ fn software_is_not_taken_for_hardware() {
 #[test]
 fn device_requires_the_gpu_backend() {
     let directory = tempfile::tempdir().unwrap();
+    crate::demo::copy_demo_twin(&directory.path().join("t"));
     let run = |arguments: &[&str]| {
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_wildcity"));
         command.args(["demo", "--steps", "1", "--twins", "t", "--out", "o"]).args(arguments);

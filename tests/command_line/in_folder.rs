@@ -1,9 +1,16 @@
 //! The program, run in a folder of its own.
 
+use std::fs;
 use std::path::Path;
 use std::process::Output;
+use std::sync::LazyLock;
 
+use crate::city::{City, city};
+use crate::versions::files;
 use crate::wildcity;
+
+/// The twin "city", of a kilometre and 300 m more.
+pub(crate) static CITY: LazyLock<City> = LazyLock::new(|| city(1_300.0));
 
 fn run(dir: &Path, arguments: &[&str]) -> Output {
     wildcity().args(arguments).current_dir(dir).env("XDG_DATA_HOME", dir).output().unwrap()
@@ -21,4 +28,13 @@ pub(crate) fn refused(dir: &Path, arguments: &[&str]) -> String {
     let output = run(dir, arguments);
     assert_eq!(output.status.code(), Some(1), "{arguments:?}: {output:?}");
     String::from_utf8(output.stderr).unwrap()
+}
+
+/// Copies all files of a folder into another one.
+pub(crate) fn copy(from: &Path, to: &Path) {
+    for file in files(from) {
+        let target = to.join(file.strip_prefix(from).unwrap());
+        fs::create_dir_all(target.parent().unwrap()).unwrap();
+        fs::copy(&file, target).unwrap();
+    }
 }

@@ -15,8 +15,10 @@ use crate::support;
 
 /// How often the server is killed.
 const KILLS: usize = 100;
-/// Gaussians of a push, in some 25 cells.
-const GAUSSIANS: usize = 2_000;
+/// Kills on the same twin. Each is followed by a check of all its versions.
+const KILLS_OF_A_TWIN: usize = 20;
+/// Gaussians of a push, in 16 cells.
+const GAUSSIANS: usize = 500;
 
 struct Serving {
     child: Child,
@@ -65,28 +67,36 @@ async fn push(client: HttpClient, path: std::path::PathBuf, id: String) -> u64 {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_killed_server_has_the_old_version_or_the_new_one() {
-    let dir = tempfile::tempdir().unwrap();
-    let twins = dir.path().join("twins");
-    support::commit_twin(&twins);
-    let scene = |round: usize| {
-        let gaussians = gaussians(GAUSSIANS, 0, 150.0, 100 + round as u64);
-        write(dir.path(), "scene.ply", &gaussians)
+    let directory_with_twin = || {
+        let dir = tempfile::tempdir().unwrap();
+        support::commit_twin(&dir.path().join("twins"));
+        dir
     };
-    let latest = || {
-        let catalog = Catalog::open(&twins).unwrap();
+    let scene = |dir: &Path, round: usize| {
+        let gaussians = gaussians(GAUSSIANS, 0, 100.0, 100 + round as u64);
+        write(dir, "scene.ply", &gaussians)
+    };
+    let latest = |dir: &Path| {
+        let catalog = Catalog::open(&dir.join("twins")).unwrap();
         let version = catalog.version("test", None).unwrap();
         (version.number, version.manifest.provenance.source)
     };
     // Measure how long an undisturbed push takes.
+    let mut dir = directory_with_twin();
     let mut serving = Serving::start(dir.path());
     let begun = Instant::now();
-    push(serving.client.clone(), scene(KILLS), "first".to_owned()).await;
+    push(serving.client.clone(), scene(dir.path(), KILLS), "first".to_owned()).await;
     let mut whole = begun.elapsed();
     let mut random = Random(1);
     let (mut on_the_way, mut old, mut new) = (0, 0, 0);
     for round in 0..KILLS {
-        let (before, source) = latest();
-        let path = scene(round);
+        if round > 0 && round.is_multiple_of(KILLS_OF_A_TWIN) {
+            drop(serving);
+            dir = directory_with_twin();
+            serving = Serving::start(dir.path());
+        }
+        let (before, source) = latest(dir.path());
+        let path = scene(dir.path(), round);
         let id = format!("push-{round}");
         let pushing = tokio::spawn(push(serving.client.clone(), path.clone(), id.clone()));
         tokio::time::sleep(whole.mul_f64(random.unit())).await;
@@ -97,7 +107,7 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
         }
         drop(serving);
         pushing.abort();
-        let (after, now) = latest();
+        let (after, now) = latest(dir.path());
         match after - before {
             0 => {
                 assert_eq!(now, source, "round {round}");
@@ -109,7 +119,7 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
             }
             more => panic!("{more} versions of one push, round {round}"),
         }
-        let catalog = Catalog::open(&twins).unwrap();
+        let catalog = Catalog::open(&dir.path().join("twins")).unwrap();
         let checked = catalog.fsck("test", &mut |_, _| {}).unwrap();
         assert!(checked.is_sound(), "round {round}: {checked:?}");
         serving = Serving::start(dir.path());

@@ -12,36 +12,41 @@ use crate::served::Served;
 use crate::support::{self, Agent, Reply, TestServer, pose, refused};
 
 #[tokio::test]
-async fn a_thousand_sessions_leave_nothing_behind() {
+async fn hundreds_of_sessions_leave_nothing_behind() {
+    const SESSIONS: u64 = 400;
     let served = Served::start();
-    for _ in 0..200 {
+    for _ in 0..100 {
         served.whole_session(2).await;
     }
     let before = served.rss();
-    for _ in 0..1000 {
+    for _ in 0..SESSIONS {
         served.whole_session(2).await;
     }
     let after = served.rss();
+    eprintln!("{SESSIONS} sessions: {before} bytes grew to {after}");
     // A leaked session would keep its JPEGs, its history and its cameras: 10 kB at least.
-    assert!(after < before + (4 << 20), "{before} bytes grew to {after}");
+    assert!(after < before + SESSIONS * 4_000, "{before} bytes grew to {after}");
     assert_eq!(served.signal_and_wait(), Some(0));
 }
 
 #[tokio::test]
-async fn memory_is_flat_over_ten_thousand_steps() {
+async fn memory_is_flat_over_thousands_of_steps() {
+    const STEPS: u32 = 3_500;
     let served = Served::start();
     let mut agent = Agent::connect(served.address).await;
     agent.hello().await;
     agent.open(json!({})).await;
-    for step in 0..1000 {
+    for step in 0..500 {
         agent.step(f64::from(step)).await;
     }
     let before = served.rss();
-    for step in 1000..10_000 {
+    for step in 500..500 + STEPS {
         agent.step(f64::from(step)).await;
     }
     let after = served.rss();
-    assert!(after < before + (4 << 20), "{before} bytes grew to {after}");
+    eprintln!("{STEPS} steps: {before} bytes grew to {after}");
+    // A leak of 460 B per step would be detected.
+    assert!(after < before + u64::from(STEPS) * 460, "{before} bytes grew to {after}");
 }
 
 /// Drives a car the same way twice, in one session: as many bytes in memory after the second lap as in the
@@ -75,13 +80,14 @@ async fn two_laps(steps: u64) {
     assert_eq!(laps[0], laps[1], "what is driven twice is the same");
     let (early, late) = (early_bytes.unwrap(), served.rss());
     eprintln!("2 x {steps} steps: {early} bytes in the middle of the first lap, {late} at the end");
-    // A leak of 70 B per step would be detected over 10,000 steps.
-    assert!(late < early + (1 << 20), "{early} bytes grew to {late}");
+    // One and a half laps lie between. A leak of 70 B per step would be detected, in long laps a smaller one.
+    let accepted = (70 * steps * 3 / 2).min(1 << 20);
+    assert!(late < early + accepted, "{early} bytes grew to {late}");
 }
 
 #[tokio::test]
 async fn two_identical_laps_take_the_same_memory() {
-    two_laps(10_000).await;
+    two_laps(5_000).await;
 }
 
 #[tokio::test]
@@ -142,8 +148,9 @@ async fn connections_above_the_limit_are_refused() {
     second.open(json!({})).await;
 }
 
-/// A client with a small receive buffer that never reads: its megabytes do not fit anywhere.
-async fn client_that_never_reads(server: &TestServer, name: &str) -> Agent {
+/// A client with a small receive buffer that never reads an image of this size: its megabytes do not fit anywhere. Linux
+/// keeps 4 MB of a connection.
+async fn client_that_never_reads(server: &TestServer, name: &str, size_px: [u32; 2]) -> Agent {
     let socket = TcpSocket::new_v4().unwrap();
     socket.set_recv_buffer_size(4096).unwrap();
     let stream = socket.connect(server.address()).await.unwrap();
@@ -157,7 +164,7 @@ async fn client_that_never_reads(server: &TestServer, name: &str) -> Agent {
     let mut agent = Agent { socket, seq: 0 };
     agent.hello().await;
     let camera = json!({
-        "name": "c", "width": 4000, "height": 3000,
+        "name": "c", "width": size_px[0], "height": size_px[1],
         "fx": 8.0, "fy": 8.0, "cx": 4.0, "cy": 4.0, "camera_to_rig": pose(0.0),
     });
     let rig = json!({ "name": "r", "cameras": [camera] });
@@ -170,7 +177,7 @@ async fn client_that_never_reads(server: &TestServer, name: &str) -> Agent {
 async fn a_client_that_does_not_read_does_not_affect_others() {
     let (send, resume_grace) = (Duration::from_millis(500), Duration::from_millis(200));
     let server = TestServer::with(Limits { send, resume_grace, ..Limits::default() }).await;
-    let stuck = client_that_never_reads(&server, "stuck").await;
+    let stuck = client_that_never_reads(&server, "stuck", [4000, 3000]).await;
     let mut other = server.driver("other").await;
     for step in 0..50 {
         other.step(f64::from(step)).await;
@@ -208,12 +215,12 @@ async fn a_half_read_answer_does_not_affect_others() {
     let server = TestServer::start().await;
     let mut agents = Vec::new();
     for k in 0..8 {
-        agents.push(client_that_never_reads(&server, &format!("slow{k}")).await);
+        agents.push(client_that_never_reads(&server, &format!("slow{k}"), [2400, 1800]).await);
     }
     server.still_serves().await;
     // These clients are only slow: once they read, they get everything.
     for agent in &mut agents {
         let Reply::Binary(bytes) = agent.receive().await else { panic!("no observation") };
-        assert!(bytes.len() > 36_000_000);
+        assert!(bytes.len() > 3 * 2400 * 1800);
     }
 }

@@ -1,7 +1,7 @@
 //! The `wildcity` command, as users run it: files in, files, text and exit codes out.
 
 #[path = "../support/city.rs"]
-mod city_twin;
+mod city;
 #[path = "../support/data.rs"]
 mod data;
 #[path = "../support/drives.rs"]

@@ -6,7 +6,7 @@ use std::process::Output;
 
 use serde_json::Value;
 
-use crate::city_twin::city;
+use crate::in_folder::CITY;
 use crate::{support, wildcity};
 
 fn doctor(twins: &Path, episodes: &Path, uploads: &Path) -> Output {
@@ -121,13 +121,13 @@ fn the_doctor_reads_a_configuration() {
 fn soak(arguments: &[&str]) -> Output {
     let mut command = wildcity();
     command.args(["bench", "soak", "city", "--backend", "cpu", "--sessions", "3", "--steps", "4"]);
-    command.args(["--memory-gib", "0.2", "--twins"]).arg(city().dir.path());
+    command.args(["--memory-gib", "0.2", "--threads", "1", "--twins"]).arg(CITY.dir.path());
     command.args(arguments).output().unwrap()
 }
 
 #[test]
 fn a_soak_repeats_rounds_and_compares_their_images() {
-    let output = soak(&["--minutes", "0.1", "--growth", "1000"]);
+    let output = soak(&["--minutes", "0.05", "--growth", "1000"]);
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
     let line = text.lines().last().unwrap();
@@ -138,10 +138,10 @@ fn a_soak_repeats_rounds_and_compares_their_images() {
 
 #[test]
 fn a_mixed_soak_pushes_to_a_copy() {
-    let twin = city().dir.path().join("city");
+    let twin = CITY.dir.path().join("city");
     let versions = || fs::read_dir(twin.join("log")).unwrap().count();
     let before = versions();
-    let output = soak(&["--mixed", "--minutes", "0.1", "--growth", "1000"]);
+    let output = soak(&["--mixed", "--minutes", "0.05", "--growth", "1000"]);
     assert!(output.status.success(), "{output:?}");
     let text = String::from_utf8(output.stdout).unwrap();
     let others = text.lines().find(|line| line.contains(" pushes, each with garbage collection; "));
@@ -154,7 +154,7 @@ fn a_mixed_soak_pushes_to_a_copy() {
 #[test]
 fn a_soak_whose_memory_grows_fails() {
     // The most memory later may be less than at first, but not a hundredth of it.
-    let output = soak(&["--minutes", "0.05", "--growth=-99"]);
+    let output = soak(&["--minutes", "0.03", "--growth=-99"]);
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     let text = String::from_utf8(output.stderr).unwrap();
     assert!(text.contains("memory grew by"), "{text}");

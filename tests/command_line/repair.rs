@@ -6,6 +6,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Child, Stdio};
 
+use crate::demo::copy_demo_twin;
 use crate::onnx_models::{Folder, library, trained};
 use crate::support::{self, Agent};
 use crate::wildcity;
@@ -175,6 +176,7 @@ fn a_manifest_that_is_wrong_stops_the_server_before_it_listens() {
 #[test]
 fn the_demo_repairs_views_beside_its_drive() {
     let folder = tempfile::tempdir().unwrap();
+    copy_demo_twin(&folder.path().join("wildcity/twins"));
     let mut command = wildcity();
     command.args(["demo", "--off-trajectory", "3", "--repair", "--out", "out", "--onnxruntime"]);
     command.arg(library()).current_dir(folder.path()).env("XDG_DATA_HOME", folder.path());

@@ -9,41 +9,41 @@ use wildcity_scene::{RenderProfile, Scene};
 
 use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{agree, cpu, render, render_one};
-use crate::placed;
+use crate::{placed, shared_gpu};
 
 #[test]
 fn an_actor_is_drawn_as_if_the_twin_contained_it() {
-    placed::check_merged(&gpu());
+    placed::check_merged(&*shared_gpu());
 }
 
 #[test]
 fn an_actor_is_drawn_through_every_lens_as_if_the_twin_contained_it() {
-    placed::check_merged_lenses(&gpu());
+    placed::check_merged_lenses(&*shared_gpu());
 }
 
 #[test]
 fn a_moving_actor_is_drawn_as_by_a_moving_camera() {
-    placed::check_motion(&gpu());
+    placed::check_motion(&*shared_gpu());
 }
 
 #[test]
 fn tints_and_contact_shadows_are_those_of_the_reference() {
-    placed::check_light(&gpu(), &Reference);
+    placed::check_light(&*shared_gpu(), &Reference);
 }
 
 #[test]
 fn actors_leave_nothing_behind() {
-    placed::check_ghosts(&gpu());
+    placed::check_ghosts(&*shared_gpu());
 }
 
 #[test]
 fn instances_are_those_of_the_reference() {
-    placed::check_instances(&gpu(), &Reference);
+    placed::check_instances(&*shared_gpu(), &Reference);
 }
 
 #[test]
 fn instances_are_those_of_the_vectors() {
-    placed::check_instance_vectors(&gpu());
+    placed::check_instance_vectors(&*shared_gpu());
 }
 
 /// The cpu runs the first stages, the gpu the rest.
@@ -78,8 +78,7 @@ fn all_views_at_once_and_region_by_region() {
     let (scene, _) = placed::street_with_actors();
     let views: Vec<View> = placed::views().into_iter().map(|(_, view)| view).collect();
     let profile = RenderProfile::default();
-    let gpu = gpu();
-    let together = render(&gpu, &scene, &profile, &views);
+    let together = render(&*shared_gpu(), &scene, &profile, &views);
     for (image, view) in together.iter().zip(&views) {
         let truth = render_one(&Reference, &scene, &profile, *view);
         agree(image, &truth).unwrap();

@@ -6,6 +6,7 @@ mod data;
 mod gpu;
 #[path = "../support/images.rs"]
 mod images;
+#[allow(dead_code, reason = "the tests of the other backends use another part of it")]
 #[path = "../support/lenses.rs"]
 mod lenses;
 #[path = "../support/actors.rs"]
@@ -39,4 +40,18 @@ mod sky;
 mod stages;
 mod twins;
 
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+
 use wildcity_render::compare::gaussians;
+
+/// The best device with the shaders as they are and without limits. Tests that run at the same time share it: software
+/// Vulkan takes seconds to compile the kernels of a lens, and two tests that begin together would each compile them.
+fn shared_gpu() -> Arc<gpu::Watched> {
+    static SHARED: Mutex<Weak<gpu::Watched>> = Mutex::new(Weak::new());
+    let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+    shared.upgrade().unwrap_or_else(|| {
+        let opened = Arc::new(gpu::gpu());
+        *shared = Arc::downgrade(&opened);
+        opened
+    })
+}

@@ -96,10 +96,10 @@ fn sixteen_views_of_sizes_that_are_no_multiple_of_a_tile() {
     }
 }
 
-/// 132 B each at degree 3: 158 MB, two bindings of lavapipe.
+/// 132 B each at degree 3: 139 MB, two bindings of lavapipe.
 #[test]
 fn a_scene_of_several_pages() {
-    let scene = Scene::from_gaussians(&street(1_200_000, 3, 10));
+    let scene = Scene::from_gaussians(&street(1_050_000, 3, 10));
     compare_colors(&scene, &RenderProfile::default(), &street_views(), "pages");
 }
 

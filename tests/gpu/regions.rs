@@ -111,8 +111,8 @@ fn more_splats_than_lavapipe_holds_at_once() {
     let height = 400;
     let focal_px = 300.0;
     let mut random = Random(36);
-    let mut dust = Gaussians::with_capacity(0, 4_500_000);
-    for _ in 0..4_500_000 {
+    let mut dust = Gaussians::with_capacity(0, 4_200_000);
+    for _ in 0..4_200_000 {
         let z = 5.0 + 100.0 * random.unit();
         let slope = |size: f64| (random.unit() - 0.5) * size / focal_px;
         let [x, y] = [f64::from(width), f64::from(height)].map(slope);

@@ -9,14 +9,14 @@ use crate::streaming::{PROFILE, bytes, eyes, pixels, views};
 
 #[test]
 fn two_kilometres_with_the_memory_of_the_worst_frame_look_as_with_unlimited_memory() {
-    let City { dir, drive } = city();
+    let City { dir, drive } = city(2_000.0);
     let open = |limit_bytes: Option<u64>| {
         let cache = Cache::limited(Catalog::open(dir.path()).unwrap(), limit_bytes);
         let resident = cache.open("city", None).unwrap();
         (cache, resident)
     };
     let (_all, whole) = open(None);
-    let route = Route::new(drive).unwrap();
+    let route = Route::new(&drive).unwrap();
     let poses: Vec<_> =
         (0..=50).map(|i| route.at(f64::from(i) * route.length_m() / 50.0).world_from_rig).collect();
     let need = |pose| bytes(&whole, &whole.demand(&eyes(&views(pose)), &PROFILE));

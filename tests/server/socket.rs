@@ -31,14 +31,15 @@ async fn close_code(agent: &mut Agent) -> u16 {
 async fn pings_are_answered_while_a_request_runs() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
-    server.painter.slow_ms.store(1500, Ordering::SeqCst);
+    server.painter.slow_ms.store(3000, Ordering::SeqCst);
     agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
     for number in 0..5_u8 {
         tokio::time::sleep(Duration::from_millis(100)).await;
         let sent = Instant::now();
         agent.socket.send(Message::Ping(vec![number; 3].into())).await.unwrap();
         assert_eq!(frame(&mut agent).await, Some(Message::Pong(vec![number; 3].into())));
-        assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+        // Before the step ends, also on a busy machine.
+        assert!(sent.elapsed() < Duration::from_millis(400), "{:?}", sent.elapsed());
     }
     assert_eq!(agent.seen().await.meta["step"], 1);
 }
@@ -52,8 +53,8 @@ async fn pings_are_answered_whatever_runs() {
         let sent = Instant::now();
         agent.socket.send(Message::Ping("x".into())).await.unwrap();
         assert_eq!(frame(agent).await, Some(Message::Pong("x".into())));
-        // The rendering that runs has 300 ms left: the answer does not wait for it, on a busy machine either.
-        assert!(sent.elapsed() < Duration::from_millis(250), "{:?}", sent.elapsed());
+        // The rendering that runs has 700 ms left: the answer does not wait for it, on a busy machine either.
+        assert!(sent.elapsed() < Duration::from_millis(500), "{:?}", sent.elapsed());
     };
     pinged(&mut agent).await;
     agent.hello().await;
@@ -63,7 +64,7 @@ async fn pings_are_answered_whatever_runs() {
     }
     let of = |name: &str| json!({ "session": name, "pose": pose(1.0) });
     agent.ask(json!({ "type": "snapshot", "session": "a", "name": "s" })).await;
-    server.painter.slow_ms.store(400, Ordering::SeqCst);
+    server.painter.slow_ms.store(800, Ordering::SeqCst);
     for request in [
         json!({ "type": "step_many", "steps": [of("a"), of("b")] }),
         json!({ "type": "observe", "session": "a", "poses": [pose(1.0)] }),
@@ -127,13 +128,13 @@ async fn a_close_frame_is_answered_with_its_code() {
 async fn a_close_frame_is_answered_while_a_request_runs() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
-    server.painter.slow_ms.store(800, Ordering::SeqCst);
+    server.painter.slow_ms.store(1500, Ordering::SeqCst);
     agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
     tokio::time::sleep(Duration::from_millis(100)).await;
     let sent = Instant::now();
     agent.socket.send(Message::Close(None)).await.unwrap();
     assert_eq!(frame(&mut agent).await, Some(Message::Close(None)));
-    assert!(sent.elapsed() < Duration::from_millis(100), "{:?}", sent.elapsed());
+    assert!(sent.elapsed() < Duration::from_millis(500), "{:?}", sent.elapsed());
     let mut agent = server.agent().await;
     let resume = json!({ "type": "resume", "session": "a", "last_seq": 1 });
     let resumed = agent.ask(resume).await;

@@ -69,7 +69,7 @@ async fn a_run_takes_less_than_five_percent_more_than_its_rendering() {
     let suite = bench.write("suite.json", &suite);
     let mut shares = Vec::new();
     // Other programs run beside this one: one undisturbed attempt is enough.
-    for attempt in 0..4 {
+    for attempt in 0..8 {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
         let timed = Arc::new(Timed { cpu, spent: Mutex::default() });
         let agent = AgentChoice::BuiltIn(BuiltIn::Log);

@@ -146,7 +146,7 @@ fn check_merged_views(backend: &dyn Backend, views: Vec<(impl std::fmt::Display,
 /// Asserts that what an actor's motion does to an image with a rolling shutter is what the opposite motion of the
 /// camera does.
 pub(crate) fn check_motion(backend: &dyn Backend) {
-    let chunk = chunk_of(&actor(3_000, 1, 7));
+    let chunk = chunk_of(&actor(3_000, 3, 7));
     let profile = RenderProfile::default();
     for (name, rolling) in views().into_iter().filter(|(_, view)| view.rolling_shutter.is_some()) {
         let shutter = rolling.rolling_shutter.unwrap();

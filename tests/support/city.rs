@@ -1,8 +1,6 @@
-//! Two thin kilometres of a procedural city, with all levels of detail.
+//! A thin procedural city, with all levels of detail.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
-
-use std::sync::OnceLock;
 
 use wildcity_generate::CitySettings;
 use wildcity_scene::manifest::Provenance;
@@ -14,30 +12,25 @@ pub(crate) struct City {
     pub(crate) drive: Trajectory,
 }
 
-/// Two thin kilometres, all levels of detail.
-pub(crate) fn city() -> &'static City {
-    static CITY: OnceLock<City> = OnceLock::new();
-    CITY.get_or_init(|| {
-        let settings =
-            CitySettings { seed: 3, length_m: 2_000.0, millions_per_km: 1.0, speed_m_s: 30.0 };
-        let dir = tempfile::tempdir().unwrap();
-        let catalog = Catalog::open(dir.path()).unwrap();
-        let mut commit =
-            catalog.begin("city", CommitKind::Import, StorageOptions::default()).unwrap();
-        for cell in wildcity_generate::city(&settings).unwrap() {
-            commit.put(&cell.gaussians, None, &mut |_, _| {}).unwrap();
-        }
-        let drive = wildcity_generate::city_drive(&settings).unwrap();
-        let settings = VersionSettings {
-            profile: RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT },
-            rig: Rig::preset("vehicle6"),
-            trajectories: vec![drive.clone()],
-            sky: None,
-            geo: None,
-            twin_from_capture: None,
-            provenance: Provenance::of("test".into()),
-        };
-        commit.replace(None, settings).unwrap();
-        City { dir, drive }
-    })
+/// A twin "city" of this length.
+pub(crate) fn city(length_m: f64) -> City {
+    let settings = CitySettings { seed: 3, length_m, millions_per_km: 1.0, speed_m_s: 30.0 };
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let mut commit = catalog.begin("city", CommitKind::Import, StorageOptions::default()).unwrap();
+    for cell in wildcity_generate::city(&settings).unwrap() {
+        commit.put(&cell.gaussians, None, &mut |_, _| {}).unwrap();
+    }
+    let drive = wildcity_generate::city_drive(&settings).unwrap();
+    let settings = VersionSettings {
+        profile: RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT },
+        rig: Rig::preset("vehicle6"),
+        trajectories: vec![drive.clone()],
+        sky: None,
+        geo: None,
+        twin_from_capture: None,
+        provenance: Provenance::of("test".into()),
+    };
+    commit.replace(None, settings).unwrap();
+    City { dir, drive }
 }

@@ -79,7 +79,7 @@ def yaw_of(q: list[float]) -> float:
 
 
 @pytest.fixture(scope="module")
-def driven(reader: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> list[Driven]:
+def driven(quick_reader: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> list[Driven]:
     checkout()
     folder = tmp_path_factory.mktemp("anchors")
     for name, actors in ACTORS.items():
@@ -106,11 +106,11 @@ def driven(reader: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> 
     for agent in AGENTS:
         command = ["wildcity", "episode", "run", str(folder / "suite.json"), "--agent", agent]
         done = subprocess.run(
-            [*command, "--out", str(folder / agent)], env=reader, capture_output=True, text=True
+            [*command, "--out", str(folder / agent)], env=quick_reader, capture_output=True, text=True
         )
         assert done.returncode in (0, 1), f"{done.stdout}\n{done.stderr}"
     records = [folder / agent / "episodes" / f"{name}-0-1.jsonl" for agent in AGENTS for name in ACTORS]
-    return [Driven(record, reader) for record in records]
+    return [Driven(record, quick_reader) for record in records]
 
 
 def checkout(*names: str) -> list[Path]:

@@ -236,9 +236,9 @@ def test_an_address_that_is_none_is_refused(tmp_path: Path, agent: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def street(reader: dict[str, str]) -> Iterator[Server]:
+def street(quick_reader: dict[str, str]) -> Iterator[Server]:
     """A server with the demo street."""
-    with wildcity.serve(Path(reader["XDG_DATA_HOME"]) / "wildcity" / "twins") as running:
+    with wildcity.serve(Path(quick_reader["XDG_DATA_HOME"]) / "wildcity" / "twins") as running:
         yield Server(running.url)
 
 

@@ -3,6 +3,7 @@ import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
+import { isDeepStrictEqual } from "node:util";
 import { behindWire, decodedByPython, home, launch, open, serve, steps } from "./wildcity.mjs";
 
 let place, server, browser;
@@ -27,7 +28,7 @@ test("the first page lists the twin, and its link opens a session", async () => 
   await page.click("text=demo");
   await steps(page, 1);
   assert.equal(await page.$$eval("canvas[data-hash]", (all) => all.length), 6);
-  assert.match(await page.textContent("#where"), /demo v1/);
+  assert.match(await page.textContent("#where"), /demo v2/);
   assert.deepEqual(complaints, []);
   await close();
 });
@@ -38,12 +39,17 @@ test("the mosaic is what the Python client decodes", async () => {
   const shown = await page.$$eval("canvas[data-hash]", (all) => all.map((canvas) => {
     const { width, height, dataset } = canvas;
     const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
-    return { camera: dataset.camera, width, height, pixels: Array.from(data) };
+    // As a text: an array of a million numbers takes seconds to get here.
+    let text = "";
+    for (let at = 0; at < data.length; at += 8192) text += String.fromCharCode(...data.subarray(at, at + 8192));
+    return { camera: dataset.camera, width, height, pixels: btoa(text) };
   }));
   const sizes = Object.fromEntries(shown.map(({ camera, width, height }) => [camera, [width, height]]));
   const folder = await decodedByPython(server.socket, "demo", sizes);
   assert.equal(shown.length, 6);
-  for (const { camera, width, height, pixels } of shown) {
+  for (const { camera, width, height, pixels: text } of shown) {
+    const pixels = Buffer.from(text, "base64");
+    assert.equal(pixels.length, width * height * 4);
     const expected = await readFile(join(folder, camera));
     assert.equal(expected.length, width * height * 3);
     let most = 0;
@@ -60,7 +66,7 @@ test("keys move the car, watchers see it, and the record has its hashes", async 
   await steps(page, 1);
   const view = () => page.$eval(".view", ({ dataset }) =>
     ({ x: Number(dataset.x), step: Number(dataset.step), session: dataset.session }));
-  const start = await view();
+  const [start, first] = [await view(), await hashes(page)];
   const watcher = await open(browser, server, `#/watch/${start.session}`);
   await page.keyboard.down("KeyW");
   await page.waitForFunction((x) => Number(document.querySelector(".view").dataset.x) > x + 1, start.x);
@@ -68,16 +74,15 @@ test("keys move the car, watchers see it, and the record has its hashes", async 
   await page.keyboard.up("KeyW");
   await page.keyboard.down("Space");
   await page.waitForFunction(() => document.querySelector(".facts dd").textContent === "0 km/h");
-  // The speed is shown in whole km/h. The car stands when two further steps leave it where it is.
-  for (let before = await view(), after; after?.x !== before.x; ) {
-    before = after ?? before;
-    await steps(page, before.step + 2);
-    after = await view();
+  // The car nearly stands: images change so slowly that both pages show the same ones, which are not those of the start.
+  const limit = performance.now() + 120_000;
+  for (let both = []; !both.length || !isDeepStrictEqual(...both); ) {
+    assert.ok(performance.now() < limit, "the watcher's images are not the agent's");
+    await steps(page, (await view()).step + 1);
+    both = await Promise.all([hashes(page), hashes(watcher.page)]);
+    assert.equal(Object.keys(both[0]).length, 6);
+    assert.notDeepEqual(both[1], first);
   }
-  // Standing still, every step has the same images: those that the watcher sees are the agent's.
-  const driven = await hashes(page);
-  await watcher.page.waitForFunction((expected) =>
-    Object.entries(expected).every(([camera, hash]) => document.querySelector(`canvas[data-camera=${camera}]`).dataset.hash === hash), driven);
   assert.deepEqual(watcher.complaints, []);
   await watcher.close();
 
