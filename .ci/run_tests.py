@@ -9,6 +9,7 @@ time limits while others compute. Each runs in the folder of its package, as und
 has ended. All run, whatever fails.
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -80,11 +81,14 @@ def run(job: Job) -> tuple[bool, float]:
 
 
 def stop(process: "subprocess.Popen[bytes]") -> None:
-    os.killpg(process.pid, signal.SIGKILL)
+    # It may have ended meanwhile.
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
 
 PRINTS = threading.Lock()
+STOPPED = threading.Event()
 RUNNING: "set[subprocess.Popen[bytes]]" = set()
 
 
@@ -120,7 +124,7 @@ def main() -> None:
         while True:
             with takes:
                 job = next(queue, None)
-            if job is None:
+            if job is None or STOPPED.is_set():
                 return
             finish(job)
 
@@ -144,5 +148,6 @@ signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))
 try:
     main()
 finally:
+    STOPPED.set()
     for left in list(RUNNING):
         stop(left)

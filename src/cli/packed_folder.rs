@@ -2,19 +2,17 @@
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Read as _};
+use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use serde::Deserialize;
 use tempfile::TempDir;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-use wildcity_twin::ingest::SOG_DESCRIPTIONS;
+use wildcity_twin::ingest::{SOG_DESCRIPTIONS, SogFiles, is_below_folder, read_whole};
+use wildcity_twin::limits::SCENE_JSON_BYTES;
 
-/// Most bytes of a description: those of a scene of 100,000 blocks take 10 MB.
-const DESCRIPTION_BYTES: u64 = 64 << 20;
 /// Size from which an entry needs the fields of zip64, in bytes.
 const LARGE_BYTES: u64 = u32::MAX as u64;
 
@@ -28,26 +26,6 @@ impl PackedFolder {
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
-}
-
-/// The keys of a SOG's description that name files, relative to its folder.
-#[derive(Deserialize)]
-struct Description {
-    /// Other descriptions: the blocks of a streamed scene.
-    #[serde(default)]
-    filenames: Vec<String>,
-    environment: Option<String>,
-    means: Option<Images>,
-    scales: Option<Images>,
-    quats: Option<Images>,
-    sh0: Option<Images>,
-    #[serde(rename = "shN")]
-    sh_n: Option<Images>,
-}
-
-#[derive(Deserialize)]
-struct Images {
-    files: Vec<String>,
 }
 
 /// Packs the SOG in a folder, if `path` is a folder, or the only file of a push and describes a SOG. None for any other
@@ -78,15 +56,15 @@ pub(super) fn pack(path: &Path, is_only: bool) -> anyhow::Result<Option<PackedFo
 }
 
 fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {
-    let names = named_files(folder, description)?;
-    let dir = tempfile::tempdir()?;
-    // The name of the folder, also if it is given as `.`.
+    // It has a name also if the folder is given as `.`.
     let whole = fs::canonicalize(folder)?;
+    let names = named_files(&whole, description)?;
+    let dir = tempfile::tempdir()?;
     let name = whole.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let path = dir.path().join(format!("{name}.zip"));
     let mut archive = ZipWriter::new(BufWriter::new(File::create(&path)?));
     for name in names {
-        let mut file = File::open(folder.join(&name)).with_context(|| name.clone())?;
+        let mut file = File::open(whole.join(&name)).with_context(|| name.clone())?;
         // Without a time of the file system. The images are compressed already.
         let options = SimpleFileOptions::default()
             .compression_method(CompressionMethod::Stored)
@@ -98,47 +76,29 @@ fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {
     Ok(PackedFolder { path, _dir: dir })
 }
 
-/// The description and the files that it names, and those that these name, relative to the folder. What is named and does
-/// not exist is left out: a server needs the finest blocks alone, and says what it misses.
+/// The description and the files that it names, and those that these name, relative to the folder, which has no links in its
+/// path. What is named and does not exist is left out: a server needs the finest blocks alone, and says what it misses.
 fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<String>> {
-    let root = fs::canonicalize(folder)?;
     let mut names = BTreeSet::from([description.to_owned()]);
     let mut unread = vec![description.to_owned()];
     while let Some(name) = unread.pop() {
-        let mut json = Vec::new();
-        let file = File::open(folder.join(&name)).with_context(|| name.clone())?;
-        file.take(DESCRIPTION_BYTES + 1).read_to_end(&mut json).with_context(|| name.clone())?;
-        anyhow::ensure!(
-            json.len() as u64 <= DESCRIPTION_BYTES,
-            "{name} has more than {DESCRIPTION_BYTES} bytes"
-        );
-        let parsed = serde_json::from_slice(&json).with_context(|| name.clone())?;
-        let Description { filenames, environment, means, scales, quats, sh0, sh_n } = parsed;
+        let json =
+            read_whole(&folder.join(&name), SCENE_JSON_BYTES).with_context(|| name.clone())?;
+        let SogFiles { descriptions, images } = SogFiles::of(&json, &name)?;
         let beside = name.rfind('/').map_or("", |slash| &name[..=slash]);
-        let mut add = |named: &str| -> anyhow::Result<Option<String>> {
+        let descriptions = descriptions.into_iter().map(|named| (named, true));
+        for (named, is_description) in descriptions.chain(images.into_iter().map(|i| (i, false))) {
             let path = format!("{beside}{named}");
             let file = folder.join(&path);
+            let exists = file.is_file();
             // A link may lead out of the folder, where a name may not.
-            let is_inside =
-                is_below(named) && (!file.is_file() || fs::canonicalize(&file)?.starts_with(&root));
+            let is_inside = is_below_folder(&named)
+                && (!exists || fs::canonicalize(&file)?.starts_with(folder));
             anyhow::ensure!(is_inside, "{name} names {named:?}, which is not below its folder");
-            let is_new = file.is_file() && names.insert(path.clone());
-            Ok(is_new.then_some(path))
-        };
-        for named in filenames.iter().chain(&environment) {
-            unread.extend(add(named)?);
-        }
-        for images in [means, scales, quats, sh0, sh_n].into_iter().flatten() {
-            for named in &images.files {
-                add(named)?;
+            if exists && names.insert(path.clone()) && is_description {
+                unread.push(path);
             }
         }
     }
     Ok(names)
-}
-
-/// Whether a name leads to a file below the folder that it is relative to.
-fn is_below(name: &str) -> bool {
-    let has_no_way_up = name.split('/').all(|step| !["", ".", ".."].contains(&step));
-    has_no_way_up && !name.contains(['\\', '\0'])
 }

@@ -22,8 +22,7 @@ pub(crate) struct NewContent<'a> {
 
 /// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push
 /// of all cells replaces the twin, but keeps rig, trajectories, sky, place on the earth and alignment of the base.
-/// A push
-/// replaces nothing that others changed since its base, which is the latest version if the request names none.
+/// Neither replaces what others changed since the base, which is the latest version if the request names none.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,

@@ -48,8 +48,8 @@ pub use file::{FileError, read_whole};
 pub use objects::TrackedObject;
 pub use progress::Progress;
 pub use read_limits::{ReadLimits, StopFlag};
-pub use scene_files::ListedFiles;
-pub use sog::DESCRIPTIONS as SOG_DESCRIPTIONS;
+pub use scene_files::{ListedFiles, is_below_folder};
+pub use sog::{DESCRIPTIONS as SOG_DESCRIPTIONS, SogFiles};
 pub use tracked::read_tracked;
 pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 

@@ -25,6 +25,12 @@ pub(super) trait SceneFiles {
 /// The files that a scene may name: paths by name.
 pub type ListedFiles = BTreeMap<String, PathBuf>;
 
+/// Whether a name, with `/`, is a plain path below the folder of the file that names it.
+pub fn is_below_folder(name: &str) -> bool {
+    let is_below = name.split('/').all(|step| !["", ".", ".."].contains(&step));
+    is_below && !Path::new(name).is_absolute() && !name.contains(['\\', '\0'])
+}
+
 /// Files beside the one given first, on the local disk.
 pub(super) struct PartFiles<'a> {
     place: Place<'a>,
@@ -90,8 +96,7 @@ impl<'a> PartFiles<'a> {
     fn path(&self, name: &str) -> Result<PathBuf, FileError> {
         match &self.place {
             Place::Folder(folder) => {
-                let is_below = name.split('/').all(|step| !["", ".", ".."].contains(&step));
-                if !is_below || Path::new(name).is_absolute() || name.contains(['\\', '\0']) {
+                if !is_below_folder(name) {
                     return Err(FileError::OutsideFolder);
                 }
                 Ok(folder.join(name))

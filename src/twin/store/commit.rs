@@ -139,7 +139,7 @@ impl Commit {
     /// has the same content, it is returned, and no new one is made.
     ///
     /// With a `base`, nothing is replaced that other commits changed since that version. Without
-    /// one, the latest version is replaced, whatever it contains, if there is any.
+    /// one, the latest version is replaced, whatever it contains.
     ///
     /// # Errors
     /// [`StoreError::Overlap`] if others changed since `base` what this would replace; or what
@@ -150,18 +150,14 @@ impl Commit {
         base: Option<u64>,
         settings: VersionSettings,
     ) -> Result<Version, StoreError> {
-        settings.check()?;
-        self.check_clamped()?;
         let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
-        self.publish(base.as_ref().map(|base| base.number), |commit, latest| {
-            let manifest = commit.new_manifest(settings.clone())?;
-            if let (Some(base), Some(latest)) = (&base, latest)
-                && latest != base.number
-            {
+        let parent = base.as_ref().map(|base| base.number);
+        self.publish_all(parent, settings, |commit, latest, manifest| match (&base, latest) {
+            (Some(base), Some(latest)) if latest != base.number => {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
-                commit.check_overlap(base, &latest, &manifest)?;
+                commit.check_overlap(base, &latest, manifest)
             }
-            commit.put_manifest(manifest)
+            _ => Ok(()),
         })
     }
 
@@ -170,13 +166,24 @@ impl Commit {
     /// # Errors
     /// [`StoreError::TwinExists`] if others made a twin of this name meanwhile; otherwise as [`Commit::replace`].
     pub fn create(self, settings: VersionSettings) -> Result<Version, StoreError> {
+        self.publish_all(None, settings, |commit, latest, _| match latest {
+            Some(latest) => Err(StoreError::TwinExists { name: commit.name.clone(), latest }),
+            None => Ok(()),
+        })
+    }
+
+    /// Publishes exactly what was put, if `check` accepts it in place of the latest version.
+    fn publish_all(
+        self,
+        parent: Option<u64>,
+        settings: VersionSettings,
+        check: impl Fn(&Self, Option<u64>, &Manifest) -> Result<(), StoreError>,
+    ) -> Result<Version, StoreError> {
         settings.check()?;
         self.check_clamped()?;
-        self.publish(None, |commit, latest| {
-            if let Some(latest) = latest {
-                return Err(StoreError::TwinExists { name: commit.name.clone(), latest });
-            }
+        self.publish(parent, |commit, latest| {
             let manifest = commit.new_manifest(settings.clone())?;
+            check(commit, latest, &manifest)?;
             commit.put_manifest(manifest)
         })
     }

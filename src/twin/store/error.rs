@@ -190,7 +190,7 @@ pub enum StoreError {
     },
     /// Others made the twin that a commit would make.
     #[error(
-        "twin {name:?} exists since a moment ago, at version {latest}: make the change from that version"
+        "twin {name:?} was made by others meanwhile: make the change from its version {latest}"
     )]
     TwinExists {
         /// The twin.

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
-import os
 import shutil
 import tempfile
 import zipfile
@@ -14,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 DESCRIPTION_BYTES = 64 << 20
-"""Most bytes of a description: those of a scene of 100,000 blocks take 10 MB."""
+"""Most bytes of a description, as the server reads them."""
 
 METAS = ("lod-meta.json", "meta.json")
 """Files that describe a SOG; the first is that of a streamed one."""
@@ -30,13 +28,13 @@ def packed(path: Path, is_only: bool) -> Iterator[Path]:
     if not path.is_dir() and not (is_only and path.name in METAS):
         yield path
         return
-    folder, metas = (path, METAS) if path.is_dir() else (path.parent, (path.name,))
-    meta = next((meta for meta in metas if (folder / meta).is_file()), None)
-    if meta is None and not path.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
-    if meta is None:
-        known = " or ".join(METAS)
-        raise ValueError(f"{folder} is a folder without {known}: give a scene file, and the files that it names")
+    folder, meta = path.parent, path.name
+    if path.is_dir():
+        found = [meta for meta in METAS if (path / meta).is_file()]
+        if not found:
+            known = " or ".join(METAS)
+            raise ValueError(f"{path} is a folder without {known}: give a scene file, and the files that it names")
+        folder, meta = path, found[0]
     names = _named_files(folder, meta)
     with tempfile.TemporaryDirectory() as temporary:
         archive = Path(temporary) / f"{folder.resolve().name}.zip"

@@ -8,6 +8,7 @@
 //! a row. Version 2 looks bytes up in codebooks of 256, and alpha is the opacity; version 1, which
 //! names no version, spreads bytes between mins and maxs, and alpha is the logit.
 
+mod files;
 mod image;
 mod meta;
 mod streamed;
@@ -18,6 +19,7 @@ use wildcity_scene::{Gaussians, sh};
 use super::scene_files::SceneFiles;
 use super::validate::{self, Field};
 use super::{IngestError, activation, check_count};
+pub use files::SogFiles;
 use image::{Image, NamedFile};
 use meta::{Meta, Tables};
 
