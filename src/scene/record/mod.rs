@@ -21,6 +21,7 @@ mod round_trip;
 
 use std::ops::Range;
 
+use fearless_simd::{Level, dispatch, prelude::*};
 use serde::{Deserialize, Serialize};
 
 use super::chunk::{Chunk, LANES, Lanes, column, columns};
@@ -215,14 +216,20 @@ impl RecordFormat {
         }
         let width = columns(sh_degree);
         let groups = count.div_ceil(LANES);
+        let level = Level::new();
         lanes.expect(groups);
         let mut tile = vec![Lanes([0.0; LANES]); groups.min(TILE_GROUPS) * width];
         for start in (0..groups).step_by(TILE_GROUPS) {
             let end = groups.min(start + TILE_GROUPS);
             for (column, decoder) in &decoders {
-                decoder.decode(start..end, |group, k, values| {
-                    tile[(group - start) * width + column + k].0 = values;
-                });
+                dispatch!(level, simd => simd.vectorize(
+                    #[inline(always)]
+                    || decoder.decode(
+                        start..end,
+                        #[inline(always)]
+                        |group, k, values| tile[(group - start) * width + column + k].0 = values,
+                    )
+                ));
             }
             lanes.extend_from_slice(&tile[..(end - start) * width]);
         }

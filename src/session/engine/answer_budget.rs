@@ -7,12 +7,22 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use parking_lot::Mutex;
+
 use crate::error::SessionError;
 use crate::limits;
 
 /// Counts reserved bytes, at most [`limits::ANSWERS_BYTES`]. Clones share one count.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct AnswerBudget(Arc<AtomicU64>);
+pub(crate) struct AnswerBudget(Arc<Shared>);
+
+#[derive(Debug, Default)]
+struct Shared {
+    reserved: AtomicU64,
+    /// Memory of an answer that is gone, for the next one: allocated anew, it would be zeroed, which takes as long as
+    /// a tenth of a millisecond per 3 MB. The budget does not count it.
+    spare: Mutex<Vec<u64>>,
+}
 
 /// Reserved bytes of the budget. Dropping it returns them.
 #[derive(Debug)]
@@ -30,9 +40,21 @@ impl AnswerBudget {
         let limit = limits::ANSWERS_BYTES;
         let within_limit = |used: u64| used.checked_add(bytes).filter(|&sum| sum <= limit);
         self.0
+            .reserved
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, within_limit)
             .map(|_| BudgetShare { budget: self.clone(), bytes })
             .map_err(|_| SessionError::Busy { what: "too many answers are kept" })
+    }
+
+    /// So many words of any values.
+    pub(crate) fn words(&self, count: usize) -> Vec<u64> {
+        let mut words = std::mem::take(&mut *self.0.spare.lock());
+        // The budget counts what an answer uses: it may get an eighth more, as files of images vary in size.
+        if !(count..=count + count / 8).contains(&words.capacity()) {
+            return vec![0; count];
+        }
+        words.resize(count, 0);
+        words
     }
 }
 
@@ -42,11 +64,19 @@ impl BudgetShare {
         // `other` is dropped with 0 bytes, so that it returns none.
         self.bytes += std::mem::take(&mut other.bytes);
     }
+
+    /// Keeps the memory of an answer that is gone for the next one.
+    pub(crate) fn keep(&self, words: Vec<u64>) {
+        if size_of_val(&words[..]) <= limits::SPARE_ANSWER_BYTES {
+            let before = std::mem::replace(&mut *self.budget.0.spare.lock(), words);
+            drop(before);
+        }
+    }
 }
 
 impl Drop for BudgetShare {
     fn drop(&mut self) {
-        self.budget.0.fetch_sub(self.bytes, Ordering::Relaxed);
+        self.budget.0.reserved.fetch_sub(self.bytes, Ordering::Relaxed);
     }
 }
 

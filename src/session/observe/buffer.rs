@@ -16,14 +16,14 @@ pub struct ObservationBuffer {
 }
 
 impl ObservationBuffer {
-    /// `len` zeros, of which the first `header` are reserved for the header.
-    pub(crate) fn zeroed(
+    /// `len` bytes of any values, of which the first `header` are reserved for the header.
+    pub(crate) fn new(
         budget: &AnswerBudget,
         len: usize,
         header: usize,
     ) -> Result<Self, SessionError> {
         let share = budget.reserve(len as u64)?;
-        Ok(Self { words: vec![0; len.div_ceil(8)], len, header, start: 0, share })
+        Ok(Self { words: budget.words(len.div_ceil(8)), len, header, start: 0, share })
     }
 
     /// The message: the header, its length prefix included, and the tensors.
@@ -66,14 +66,21 @@ impl ObservationBuffer {
     }
 }
 
+impl Drop for ObservationBuffer {
+    fn drop(&mut self) {
+        self.share.keep(std::mem::take(&mut self.words));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::limits;
 
     #[test]
     fn the_budget_counts_all_memory() {
         let budget = AnswerBudget::default();
-        let mut buffer = ObservationBuffer::zeroed(&budget, 80_000, 16).unwrap();
+        let mut buffer = ObservationBuffer::new(&budget, 80_000, 16).unwrap();
         buffer.append(&budget, &[&[1; 5], &[2; 11]]).unwrap();
         assert_eq!(buffer.bytes().len(), 80_016);
         assert_eq!(buffer.words.capacity() * 8, 80_016);
@@ -81,8 +88,27 @@ mod tests {
     }
 
     #[test]
+    fn the_memory_of_an_answer_serves_the_next_of_about_its_size() {
+        let budget = AnswerBudget::default();
+        let mut next = |len: usize| {
+            let mut buffer = ObservationBuffer::new(&budget, len, 16).unwrap();
+            assert_eq!(buffer.bytes().len(), len);
+            let is_used = buffer.bytes().contains(&9);
+            buffer.bytes_mut().fill(9);
+            is_used
+        };
+        assert_eq!([80_000, 80_000, 72_000, 80_000].map(&mut next), [false, true, true, true]);
+        // Larger ones, and much smaller ones, get memory of their own.
+        assert_eq!([80_008, 60_000, 60_000].map(&mut next), [false, false, true]);
+        assert_eq!([limits::SPARE_ANSWER_BYTES + 8; 2].map(&mut next), [false, false]);
+        // Two at once.
+        let both = [1000; 2].map(|len| ObservationBuffer::new(&budget, len, 16).unwrap());
+        assert_ne!(both[0].bytes().as_ptr(), both[1].bytes().as_ptr());
+    }
+
+    #[test]
     fn the_message_begins_with_a_header_of_its_own_size() {
-        let mut buffer = ObservationBuffer::zeroed(&AnswerBudget::default(), 20, 16).unwrap();
+        let mut buffer = ObservationBuffer::new(&AnswerBudget::default(), 20, 16).unwrap();
         assert!(buffer.header_mut(17).is_none());
         buffer.header_mut(8).unwrap().fill(7);
         assert_eq!(buffer.bytes(), [7, 7, 7, 7, 7, 7, 7, 7, 0, 0, 0, 0]);

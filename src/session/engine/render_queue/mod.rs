@@ -12,6 +12,7 @@
 //! many large frames would discard most of what it renders.
 
 mod fair;
+mod scratch;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -28,12 +29,10 @@ use crate::error::SessionError;
 use crate::limits;
 
 pub use fair::FrameCost;
+pub use scratch::Scratch;
+pub(crate) use scratch::for_views;
 
 use fair::FairQueue;
-
-/// Buffers for RGB images that are encoded and then discarded. A render thread keeps its own between
-/// frames, so that no step allocates them.
-pub type Scratch = Vec<Vec<u8>>;
 
 /// One frame that waits.
 struct Job {
@@ -182,11 +181,11 @@ impl Shared {
 
     /// The body of a render thread: runs one job after the other until the queue is closed.
     fn run_jobs(&self, lane: Lane) {
-        let mut scratch = Scratch::new();
+        let mut scratch = Scratch::default();
         while let Some((cost, job)) = self.next(lane) {
             let begun = Instant::now();
             (job.work)(&mut scratch);
-            free_large(&mut scratch);
+            scratch.free_large();
             if is_large(cost) {
                 self.state.lock().rendered(cost, begun.elapsed());
             }
@@ -244,22 +243,10 @@ fn is_large(cost: FrameCost) -> bool {
     cost.pixels > limits::LARGE_PIXELS
 }
 
-/// Frees the buffers that only unusually large images need.
-fn free_large(scratch: &mut Scratch) {
-    scratch.retain(|image| image.capacity() <= limits::SCRATCH_IMAGE_BYTES);
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use wildcity_render::{Frame, FrameStats, OnViewDone, RenderError, Target};
-
-    #[test]
-    fn buffers_of_unusually_large_images_are_freed() {
-        let mut scratch = vec![vec![0; limits::SCRATCH_IMAGE_BYTES + 1], vec![0; 1000]];
-        free_large(&mut scratch);
-        assert_eq!(scratch, [vec![0; 1000]]);
-    }
 
     /// Renders nothing, and reports a given number of frames in flight.
     struct IdleBackend {

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use tracing::{Span, debug_span};
 
-use wildcity_render::{Backend, Frame, FrameStats, Target, View};
+use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 use super::buffer::ObservationBuffer;
 use super::encode::{AppliedEffects, EncodedImage, Encoding, encode, hashed};
@@ -17,7 +17,7 @@ use super::layout::{EpisodeKey, InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
-use crate::engine::render_queue::Scratch;
+use crate::engine::render_queue::{Scratch, for_views};
 use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
 use crate::options::PixelMaps;
@@ -84,7 +84,7 @@ impl ObservationBuilder {
         });
         let instances_at = floats_at + all.floats;
         let raw_at = instances_at + all.instances;
-        let mut buffer = ObservationBuffer::zeroed(budget, raw_at + all.raw, header)?;
+        let mut buffer = ObservationBuffer::new(budget, raw_at + all.raw, header)?;
         buffer.bytes_mut()[header..floats_at].copy_from_slice(&history);
 
         let images = captures.iter().map(|capture| capture.cameras.len()).sum();
@@ -123,7 +123,6 @@ impl ObservationBuilder {
     ) -> Result<(), SessionError> {
         let layout = self.layout.clone();
         let coverage = self.coverage.clone();
-        scratch.resize_with(scratch.len().max(frame.views.len()), Vec::new);
 
         let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
         let gate = match &mut self.repair {
@@ -155,23 +154,28 @@ impl ObservationBuilder {
         let has_effects = effects.iter().any(Option::is_some);
         let copied = 3 * pixels * u64::from(has_effects);
         let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
-        let mut opacity_maps = zeroed_maps(frame.views, 1, needs_opacity);
-        let mut depth_maps_m = zeroed_maps(frame.views, 1, needs_depth);
-        let mut normal_maps = zeroed_maps(frame.views, 3, needs_normals);
 
         // Where the renderer writes.
         let raw_at = match gate.is_some() || has_effects {
             true => self.raw_places(capture),
             false => Vec::new(),
         };
-        let mut targets = self.targets(capture, scratch);
-        for (target, opacity) in targets.iter_mut().zip(&mut opacity_maps) {
+        let Scratch { images, opacity, depth_m, normals } = scratch;
+        let needed = |is_needed: bool| if is_needed { frame.views } else { &[] };
+        let images = for_views(images, needed(!self.holds_pixels(capture)), 3);
+        let mut targets = self.targets(capture, images);
+        for (target, opacity) in
+            targets.iter_mut().zip(for_views(opacity, needed(needs_opacity), 1))
+        {
             target.opacity = Some(opacity);
         }
-        for (target, depth_m) in targets.iter_mut().zip(&mut depth_maps_m) {
+        for (target, depth_m) in targets.iter_mut().zip(for_views(depth_m, needed(needs_depth), 1))
+        {
             target.depth_m = Some(depth_m);
         }
-        for (target, normals) in targets.iter_mut().zip(&mut normal_maps) {
+        for (target, normals) in
+            targets.iter_mut().zip(for_views(normals, needed(needs_normals), 3))
+        {
             target.normals = Some(normals);
         }
 
@@ -236,25 +240,31 @@ impl ObservationBuilder {
         Ok(())
     }
 
+    /// Whether the buffer holds the pixels of a capture as they are, so that the renderer writes them there.
+    fn holds_pixels(&self, capture: &RigCapture) -> bool {
+        self.layout.encoding() == Encoding::Raw && capture.shown
+    }
+
     /// Where the pixels of each view of a capture are in the buffer, if the observation holds them there.
     fn raw_places(&self, capture: &RigCapture) -> Vec<Option<usize>> {
-        let is_raw = self.layout.encoding() == Encoding::Raw && capture.shown;
+        let holds_pixels = self.holds_pixels(capture);
         let mut next = self.raw_at;
         let place = |camera: &usize| {
             let at = next;
             next += 3 * self.layout.cameras()[*camera].camera.pixels();
-            is_raw.then_some(at)
+            holds_pixels.then_some(at)
         };
         capture.cameras.iter().map(place).collect()
     }
 
     /// Where the renderer writes a capture's images: into the buffer what the observation holds as
-    /// rendered, and into scratch buffers what is encoded first.
+    /// rendered, and into `images` what is encoded first.
     fn targets<'a>(
         &'a mut self,
         capture: &RigCapture,
-        scratch: &'a mut Scratch,
+        mut images: impl Iterator<Item = &'a mut [u8]>,
     ) -> Vec<Target<'a>> {
+        let holds_pixels = self.holds_pixels(capture);
         let layout = &self.layout;
         let floats_at = self.floats_at;
         let instances_at = self.instances_at;
@@ -270,7 +280,7 @@ impl ObservationBuilder {
         let mut raw_part = &mut raw_part[..own.raw];
 
         let mut targets = Vec::with_capacity(capture.cameras.len());
-        for (&camera, scratch) in capture.cameras.iter().zip(scratch) {
+        for &camera in &capture.cameras {
             let camera = &layout.cameras()[camera];
             let pixels = camera.camera.pixels();
             let mut map = |held: bool, values: usize| {
@@ -284,17 +294,13 @@ impl ObservationBuilder {
             let normals = map(normals, 3);
             let instances = (instances && capture.shown)
                 .then(|| as_ids(split_off_front(&mut instances_part, 2 * pixels)));
-            let rgb8 = if layout.encoding() == Encoding::Raw && capture.shown {
-                split_off_front(&mut raw_part, 3 * pixels)
-            } else {
-                if scratch.len() < 3 * pixels {
-                    scratch.resize(3 * pixels, 0);
-                }
-                &mut scratch[..3 * pixels]
+            let rgb8 = match holds_pixels {
+                true => Some(split_off_front(&mut raw_part, 3 * pixels)),
+                false => images.next(),
             };
             targets.push(Target {
                 rgba: None,
-                rgb8: Some(rgb8),
+                rgb8,
                 depth_m,
                 opacity,
                 normals,
@@ -386,12 +392,6 @@ fn add_motion(
         bytes.extend(measured.flat_map(f32::to_le_bytes));
     }
     [sensors.imu.map(|_| samples.len()), sensors.wheel_speed.map(|_| samples.len())]
-}
-
-/// A map of zeros, so many per pixel, for each view; none at all unless `needed`.
-fn zeroed_maps(views: &[View], values: usize, needed: bool) -> Vec<Vec<f32>> {
-    let views = if needed { views } else { &[] };
-    views.iter().map(|view| vec![0.0; values * view.camera.pixels()]).collect()
 }
 
 /// Splits the first bytes off a slice.
