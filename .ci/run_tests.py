@@ -56,16 +56,19 @@ def run(job: Job) -> tuple[bool, float]:
     with tempfile.TemporaryFile() as output:
         environment = {**os.environ, "CARGO_MANIFEST_DIR": job.folder}
         # Its own process group: what it has started is stopped with it.
-        process = subprocess.Popen(
-            job.command,
-            cwd=job.folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        RUNNING.add(process)
+        with STARTS:
+            if STOPPED.is_set():
+                return False, 0.0
+            process = subprocess.Popen(
+                job.command,
+                cwd=job.folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            RUNNING.add(process)
         try:
             ended = f"exit status {process.wait(LIMIT_S)}"
         except subprocess.TimeoutExpired:
@@ -89,6 +92,8 @@ def stop(process: "subprocess.Popen[bytes]") -> None:
 
 PRINTS = threading.Lock()
 STOPPED = threading.Event()
+STARTS = threading.Lock()
+"""What is started while this is held is in `RUNNING`, and nothing is once the runner has stopped."""
 RUNNING: "set[subprocess.Popen[bytes]]" = set()
 
 
@@ -148,6 +153,7 @@ signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))
 try:
     main()
 finally:
-    STOPPED.set()
+    with STARTS:
+        STOPPED.set()
     for left in list(RUNNING):
         stop(left)

@@ -76,8 +76,8 @@ fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {
     Ok(PackedFolder { path, _dir: dir })
 }
 
-/// The description and the files that it names, and those that these name, relative to the folder, which has no links in its
-/// path. What is named and does not exist is left out: a server needs the finest blocks alone, and says what it misses.
+/// The description and the files that it names, and those that these name, relative to `folder`, which must be canonical.
+/// What is named and does not exist is left out: a server needs the finest blocks alone, and says what it misses.
 fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<String>> {
     let mut names = BTreeSet::from([description.to_owned()]);
     let mut unread = vec![description.to_owned()];
@@ -85,20 +85,31 @@ fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<Stri
         let json =
             read_whole(&folder.join(&name), SCENE_JSON_BYTES).with_context(|| name.clone())?;
         let SogFiles { descriptions, images } = SogFiles::of(&json, &name)?;
-        let beside = name.rfind('/').map_or("", |slash| &name[..=slash]);
-        let descriptions = descriptions.into_iter().map(|named| (named, true));
-        for (named, is_description) in descriptions.chain(images.into_iter().map(|i| (i, false))) {
-            let path = format!("{beside}{named}");
-            let file = folder.join(&path);
-            let exists = file.is_file();
-            // A link may lead out of the folder, where a name may not.
-            let is_inside = is_below_folder(&named)
-                && (!exists || fs::canonicalize(&file)?.starts_with(folder));
-            anyhow::ensure!(is_inside, "{name} names {named:?}, which is not below its folder");
-            if exists && names.insert(path.clone()) && is_description {
+        for description in descriptions {
+            if let Some(path) = existing(folder, &name, &description)?
+                && names.insert(path.clone())
+            {
                 unread.push(path);
             }
         }
+        for image in images {
+            names.extend(existing(folder, &name, &image)?);
+        }
     }
     Ok(names)
+}
+
+/// The path, relative to `folder`, of a file that a description in it names; `None` if there is no such file.
+fn existing(folder: &Path, description: &str, named: &str) -> anyhow::Result<Option<String>> {
+    let outside = || format!("{description} names {named:?}, which is not below its folder");
+    anyhow::ensure!(is_below_folder(named), outside());
+    let beside = description.rfind('/').map_or("", |slash| &description[..=slash]);
+    let path = format!("{beside}{named}");
+    let file = folder.join(&path);
+    if !file.is_file() {
+        return Ok(None);
+    }
+    // A link may lead out of the folder, where a name may not.
+    anyhow::ensure!(fs::canonicalize(&file)?.starts_with(folder), outside());
+    Ok(Some(path))
 }

@@ -138,12 +138,11 @@ pub const LARGE_PIXELS: u64 = 24 << 20;
 /// depth and opacity (88 MB each), or for JPEGs to every session.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
-/// The memory of an answer up to this size is kept for the next one, in bytes: six raw 1440x928 images, depth and opacity.
-pub const SPARE_ANSWER_BYTES: usize = 96 << 20;
+/// The memory of one answer up to this size is kept for the next one, in bytes: six raw 1440x928 images take 24 MB.
+pub const SPARE_ANSWER_BYTES: usize = 32 << 20;
 
-/// A render thread keeps the buffers of images up to this size for the next frame, in bytes of RGB
-/// or of one map: 3840x2160 pixels of RGB. 16 of them are 400 MB.
-pub const SCRATCH_IMAGE_BYTES: usize = 3 * (8 << 20);
+/// What a render thread keeps for the next frame, in bytes: RGB and opacity of six 1440x928 images take 56 MB.
+pub const SCRATCH_BYTES: usize = 64 << 20;
 
 /// Longest line of an episode's file after the first: 256 image hashes of an `observe` take 17 kB.
 pub const EPISODE_LINE_BYTES: usize = 1 << 20;

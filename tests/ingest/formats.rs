@@ -1,10 +1,12 @@
 //! Scenes written by small writers of every format are read back, within the precision of the
 //! format.
 
+use std::collections::BTreeSet;
+
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 use wildcity_scene::Gaussians;
-use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, StopFlag};
+use wildcity_twin::ingest::{self, ListedFiles, ReadLimits, SogFiles, StopFlag};
 
 use crate::format_files::{
     Files, glb, gltf, gzip, ksplat, nurec_plain, opacity, sog, splat, spz_plain, spz4, streamed,
@@ -56,15 +58,30 @@ fn assert_alike(read: &Gaussians, written: &Gaussians, within: Within, name: &st
     }
 }
 
-/// Reads a scene of several files. Also returns its hash.
-fn read_files(files: &Files) -> Result<(Gaussians, String), ingest::IngestError> {
+fn written(files: &Files) -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     for (name, bytes) in files {
         let path = dir.path().join(name);
         std::fs::create_dir_all(path.parent().unwrap()).unwrap();
         std::fs::write(path, bytes).unwrap();
     }
-    ingest::read_hashed(&dir.path().join(&files[0].0), &mut |_, _| {})
+    dir
+}
+
+/// Reads a scene of several files. Also returns its hash.
+fn read_files(files: &Files) -> Result<(Gaussians, String), ingest::IngestError> {
+    ingest::read_hashed(&written(files).path().join(&files[0].0), &mut |_, _| {})
+}
+
+/// The files that a description of a SOG names, and those that these name.
+fn named_files(files: &Files, description: &str) -> BTreeSet<String> {
+    let (_, json) = files.iter().find(|(name, _)| name == description).unwrap();
+    let SogFiles { descriptions, images } = SogFiles::of(json, description).unwrap();
+    let beside = description.rfind('/').map_or("", |slash| &description[..=slash]);
+    let path = |name: &String| format!("{beside}{name}");
+    let others = descriptions.iter().flat_map(|name| named_files(files, &path(name)));
+    let own = descriptions.iter().chain(&images).map(path);
+    own.chain(others).collect()
 }
 
 #[test]
@@ -236,6 +253,22 @@ fn streamed_sog_gives_its_finest_level_and_its_environment() {
     assert!((40..50).all(|i| all.sh_of(i)[..3] == *sky.sh_of(i - 40)));
     assert!((40..50).all(|i| all.sh_of(i)[3..].iter().all(|&c| c == 0.0)));
     assert_eq!(read(&zip_of(&files, true)).unwrap(), all);
+}
+
+/// Programs that pack a SOG pack what [`SogFiles`] names.
+#[test]
+fn the_files_of_a_sog_are_those_that_are_read() {
+    let all = gaussians(50, 3, 20.0, 6);
+    for files in [sog(&all, 1), sog(&all, 2), streamed()] {
+        let dir = written(&files);
+        let path = dir.path().join(&files[0].0);
+        let limits = ReadLimits::of_own_file();
+        let read = ingest::read_limited(&path, &limits, &mut |_, _| {}).unwrap().parts;
+        let named = named_files(&files, &files[0].0);
+        assert!(read.len() >= 5 && read.is_subset(&named), "{read:?}, {named:?}");
+        // Coarse blocks are named and not read.
+        assert!(named.difference(&read).all(|name| name.starts_with("coarse/")), "{named:?}");
+    }
 }
 
 #[test]

@@ -20,14 +20,16 @@ fn limited() -> Cpu {
     backend
 }
 
-fn stats(backend: &Cpu, scene: &Scene, views: &[View]) -> FrameStats {
-    let mut rgb8: Vec<Vec<u8>> =
-        views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
-    let target = |rgb8| Target { rgb8: Some(rgb8), ..Target::default() };
-    let mut targets: Vec<Target<'_>> =
-        rgb8.iter_mut().map(|image| target(&mut image[..])).collect();
+/// The instances of each view, and what the frame took.
+fn instances(backend: &Cpu, scene: &Scene, views: &[View]) -> (Vec<Vec<u16>>, FrameStats) {
+    // Filled with other values first, so that a pixel that is not written shows up.
+    let mut ids: Vec<Vec<u16>> = views.iter().map(|view| vec![77; view.camera.pixels()]).collect();
+    let target = |ids| Target { instances: Some(ids), ..Target::default() };
+    let mut targets: Vec<Target<'_>> = ids.iter_mut().map(|ids| target(&mut ids[..])).collect();
     let profile = &RenderProfile::default();
-    backend.render(&Frame { scene, profile, views }, &mut targets, &|_, _| {}).unwrap()
+    let frame = Frame { scene, profile, views };
+    let stats = backend.render(&frame, &mut targets, &|_, _| {}).unwrap();
+    (ids, stats)
 }
 
 /// Renders with and without a bound, and compares every output and every count.
@@ -36,7 +38,9 @@ fn check(scene: &Scene, profile: &RenderProfile, views: &[View]) {
     let images = render(&bounded, scene, profile, views);
     assert!(images == render(&free, scene, profile, views), "{views:?}");
     assert!(images.iter().any(|image: &Image| image.rgba.iter().any(|&value| value > 0.0)));
-    let [bounded_stats, free_stats] = [&bounded, &free].map(|backend| stats(backend, scene, views));
+    let [(bounded_ids, bounded_stats), (free_ids, free_stats)] =
+        [&bounded, &free].map(|backend| instances(backend, scene, views));
+    assert!(bounded_ids == free_ids && !bounded_ids.concat().contains(&77), "{views:?}");
     assert_eq!(bounded_stats.visible_pairs, free_stats.visible_pairs);
     assert_eq!(bounded_stats.instances, free_stats.instances);
     assert_eq!(bounded_stats.evaluations, free_stats.evaluations);

@@ -76,7 +76,7 @@ fn ahead(ahead_m: f64, left_m: f64) -> [f64; 3] {
 }
 
 /// A car that drives away from the ego, and one that stands beside it.
-fn actors(asset: &Value) -> Value {
+pub(crate) fn actors(asset: &Value) -> Value {
     json!([
         {"name": "away", "asset": asset, "path": {"points": [ahead(12.0, 0.5), ahead(80.0, 0.5)], "speed": 9}},
         {"name": "parked", "asset": asset, "stand": {"xyz": ahead(3.0, 6.0), "yaw_rad": 0.7}}
@@ -291,7 +291,7 @@ async fn a_removed_actor_leaves_no_trace() {
         let pose = demo().at(EGO_M);
         let [seen, bare] =
             [with.step(pose, false).await.unwrap(), without.step(pose, false).await.unwrap()];
-        // Whole observations: the header's room is empty, so only pixels and the ego history differ.
+        // Of whole observations only pixels differ.
         assert_eq!(hashes(&seen) == hashes(&bare), step >= 2, "step {step}");
         let is_gone = step >= 4;
         assert_eq!(seen.buffer.bytes() == bare.buffer.bytes(), is_gone, "step {step}");

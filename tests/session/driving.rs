@@ -28,7 +28,8 @@ pub(crate) fn bench(cache: Cache) -> Bench {
     bench_with(cache, Arc::new(ForSections(crate::images::cpu())))
 }
 
-/// The cpu backend with no memory set aside for its stages: small limits are then those of sections.
+/// The cpu backend with no memory set aside for its stages: small limits are then those of sections. Buffers hold other
+/// values before it writes them.
 struct ForSections(Cpu);
 
 impl Backend for ForSections {
@@ -54,6 +55,13 @@ impl Backend for ForSections {
         targets: &mut [Target<'_>],
         finished: OnViewDone<'_>,
     ) -> Result<FrameStats, RenderError> {
+        // A value that is not written would show.
+        for Target { rgb8, depth_m, opacity, normals, instances, .. } in &mut *targets {
+            rgb8.iter_mut().for_each(|image| image.fill(77));
+            let maps = [depth_m, opacity, normals].into_iter().flatten();
+            maps.for_each(|map| map.fill(f32::NAN));
+            instances.iter_mut().for_each(|image| image.fill(77));
+        }
         self.0.render(frame, targets, finished)
     }
 }

@@ -16,5 +16,6 @@ mod driving;
 mod fairness;
 mod lanes;
 mod long;
+mod reuse;
 mod solids;
 mod trust;

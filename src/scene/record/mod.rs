@@ -198,6 +198,18 @@ impl RecordFormat {
         count: usize,
         lanes: &mut LanePages,
     ) -> Result<(), String> {
+        self.decode_with(Level::new(), part, sh_degree, count, lanes)
+    }
+
+    /// As [`RecordFormat::decode`], with the instructions of a level; the values do not depend on it.
+    fn decode_with(
+        self,
+        level: Level,
+        part: &[u8],
+        sh_degree: u8,
+        count: usize,
+        lanes: &mut LanePages,
+    ) -> Result<(), String> {
         let wanted = self.part_bytes(sh_degree, count);
         if part.len() != wanted {
             return Err(format!("{count} Gaussians take {wanted} bytes, not {}", part.len()));
@@ -216,7 +228,6 @@ impl RecordFormat {
         }
         let width = columns(sh_degree);
         let groups = count.div_ceil(LANES);
-        let level = Level::new();
         lanes.expect(groups);
         let mut tile = vec![Lanes([0.0; LANES]); groups.min(TILE_GROUPS) * width];
         for start in (0..groups).step_by(TILE_GROUPS) {
@@ -269,5 +280,45 @@ impl Clamped {
     /// The field with the most clamped values, and their number.
     pub fn worst(&self) -> Option<(&'static str, u64)> {
         self.0.iter().copied().max_by_key(|&(_, count)| count)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{DVec3, Quat};
+
+    use crate::chunk::ActivatedGaussian;
+
+    /// 1,000 Gaussians, so that the last lane group is not full.
+    #[test]
+    fn decoded_values_do_not_depend_on_the_vectors_of_the_processor() {
+        let count = 1_000;
+        let mut chunk = Chunk::new([0, 0], DVec3::ZERO, 1, count);
+        for i in 0..count {
+            let share = |k: usize| (i * k % 1_009) as f32 / 1_009.0;
+            let quat = Quat::from_xyzw(share(3), share(5) - 0.5, share(7), 0.6 + share(11));
+            let quat = quat.normalize();
+            let sh: Vec<f32> = (0..12).map(|k| share(13 + k) - 0.5).collect();
+            chunk.push_activated(&ActivatedGaussian {
+                mean_m: [30.0 * share(37), 30.0 * share(101), -share(467)],
+                scale_m: [0.1 + share(911), 0.1 + share(13), 0.01],
+                quat_wxyz: [quat.w, quat.x, quat.y, quat.z],
+                log2_opacity: -4.0 * share(17),
+                sh: &sh,
+            });
+        }
+        for format in RecordFormat::ALL {
+            let part = format.encode(&chunk, 0..count, &mut Clamped::default());
+            let [best, least] = [Level::new(), Level::baseline()].map(|level| {
+                let mut lanes = LanePages::new(columns(1), None);
+                format.decode_with(level, &part, 1, count, &mut lanes).unwrap();
+                Chunk::from_lanes([0, 0], DVec3::ZERO, 1, count, lanes)
+            });
+            for (index, column) in (0..count).flat_map(|i| (0..columns(1)).map(move |c| (i, c))) {
+                let values = [&best, &least].map(|chunk| chunk.value(index, column).to_bits());
+                assert_eq!(values[0], values[1], "{format}: {index}, column {column}");
+            }
+        }
     }
 }

@@ -7,8 +7,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use parking_lot::Mutex;
-
+use super::spare_memory::SpareMemory;
 use crate::error::SessionError;
 use crate::limits;
 
@@ -19,9 +18,7 @@ pub(crate) struct AnswerBudget(Arc<Shared>);
 #[derive(Debug, Default)]
 struct Shared {
     reserved: AtomicU64,
-    /// Memory of an answer that is gone, for the next one: allocated anew, it would be zeroed, which takes as long as
-    /// a tenth of a millisecond per 3 MB. The budget does not count it.
-    spare: Mutex<Vec<u64>>,
+    spare: SpareMemory,
 }
 
 /// Reserved bytes of the budget. Dropping it returns them.
@@ -46,31 +43,28 @@ impl AnswerBudget {
             .map_err(|_| SessionError::Busy { what: "too many answers are kept" })
     }
 
-    /// So many words of any values.
-    pub(crate) fn words(&self, count: usize) -> Vec<u64> {
-        let mut words = std::mem::take(&mut *self.0.spare.lock());
-        // The budget counts what an answer uses: it may get an eighth more, as files of images vary in size.
-        if !(count..=count + count / 8).contains(&words.capacity()) {
-            return vec![0; count];
-        }
-        words.resize(count, 0);
-        words
+    /// Memory for the next answer.
+    pub(crate) fn spare(&self) -> &SpareMemory {
+        &self.0.spare
+    }
+
+    /// Bytes that are reserved.
+    #[cfg(test)]
+    pub(crate) fn reserved(&self) -> u64 {
+        self.0.reserved.load(Ordering::Relaxed)
     }
 }
 
 impl BudgetShare {
+    /// The budget that it is a share of.
+    pub(crate) fn budget(&self) -> &AnswerBudget {
+        &self.budget
+    }
+
     /// Adds another share of the same budget to this one.
     pub fn merge(&mut self, mut other: Self) {
         // `other` is dropped with 0 bytes, so that it returns none.
         self.bytes += std::mem::take(&mut other.bytes);
-    }
-
-    /// Keeps the memory of an answer that is gone for the next one.
-    pub(crate) fn keep(&self, words: Vec<u64>) {
-        if size_of_val(&words[..]) <= limits::SPARE_ANSWER_BYTES {
-            let before = std::mem::replace(&mut *self.budget.0.spare.lock(), words);
-            drop(before);
-        }
     }
 }
 

@@ -4,6 +4,7 @@ pub(crate) mod answer_budget;
 mod exports;
 mod leases;
 pub(crate) mod render_queue;
+pub(crate) mod spare_memory;
 pub(crate) mod twin_summaries;
 
 use std::collections::BTreeMap;

@@ -3,6 +3,9 @@
 use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 
+/// Bytes of a word: the buffer's address is a multiple of them.
+const WORD_BYTES: usize = size_of::<u64>();
+
 /// Bytes at an address that is a multiple of 8, counted against the budget for answers.
 #[derive(Debug)]
 pub struct ObservationBuffer {
@@ -22,11 +25,15 @@ impl ObservationBuffer {
         len: usize,
         header: usize,
     ) -> Result<Self, SessionError> {
-        let share = budget.reserve(len as u64)?;
-        Ok(Self { words: budget.words(len.div_ceil(8)), len, header, start: 0, share })
+        let count = len.div_ceil(WORD_BYTES);
+        let mut share = budget.reserve((count * WORD_BYTES) as u64)?;
+        let words = budget.spare().take(count);
+        let more = words.capacity() - count;
+        share.merge(budget.reserve((more * WORD_BYTES) as u64)?);
+        Ok(Self { words, len, header, start: header, share })
     }
 
-    /// The message: the header, its length prefix included, and the tensors.
+    /// The message: the header, its length prefix included, and the tensors. Without a header the tensors alone.
     pub fn bytes(&self) -> &[u8] {
         &bytemuck::cast_slice(&self.words)[self.start..self.len]
     }
@@ -46,17 +53,15 @@ impl ObservationBuffer {
     }
 
     /// Appends copies of `parts`, one after the other.
-    pub(crate) fn append(
-        &mut self,
-        budget: &AnswerBudget,
-        parts: &[&[u8]],
-    ) -> Result<(), SessionError> {
+    pub(crate) fn append(&mut self, parts: &[&[u8]]) -> Result<(), SessionError> {
         let mut start = self.len;
         let len = start + parts.iter().map(|part| part.len()).sum::<usize>();
-        self.share.merge(budget.reserve((len - start) as u64)?);
+        let count = len.div_ceil(WORD_BYTES);
+        let more = count.saturating_sub(self.words.capacity());
+        self.share.merge(self.share.budget().reserve((more * WORD_BYTES) as u64)?);
         // Exactly: `Vec` would otherwise reserve up to twice as much, which the budget would not count.
-        self.words.reserve_exact(len.div_ceil(8) - self.words.len());
-        self.words.resize(len.div_ceil(8), 0);
+        self.words.reserve_exact(count - self.words.len());
+        self.words.resize(count, 0);
         self.len = len;
         for part in parts {
             self.bytes_mut()[start..start + part.len()].copy_from_slice(part);
@@ -68,47 +73,32 @@ impl ObservationBuffer {
 
 impl Drop for ObservationBuffer {
     fn drop(&mut self) {
-        self.share.keep(std::mem::take(&mut self.words));
+        self.share.budget().spare().recycle(std::mem::take(&mut self.words));
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::limits;
 
     #[test]
     fn the_budget_counts_all_memory() {
         let budget = AnswerBudget::default();
-        let mut buffer = ObservationBuffer::new(&budget, 80_000, 16).unwrap();
-        buffer.append(&budget, &[&[1; 5], &[2; 11]]).unwrap();
-        assert_eq!(buffer.bytes().len(), 80_016);
-        assert_eq!(buffer.words.capacity() * 8, 80_016);
-        assert_eq!(buffer.bytes()[80_004..80_006], [1, 2]);
-    }
-
-    #[test]
-    fn the_memory_of_an_answer_serves_the_next_of_about_its_size() {
-        let budget = AnswerBudget::default();
-        let mut next = |len: usize| {
-            let mut buffer = ObservationBuffer::new(&budget, len, 16).unwrap();
-            assert_eq!(buffer.bytes().len(), len);
-            let is_used = buffer.bytes().contains(&9);
-            buffer.bytes_mut().fill(9);
-            is_used
-        };
-        assert_eq!([80_000, 80_000, 72_000, 80_000].map(&mut next), [false, true, true, true]);
-        // Larger ones, and much smaller ones, get memory of their own.
-        assert_eq!([80_008, 60_000, 60_000].map(&mut next), [false, false, true]);
-        assert_eq!([limits::SPARE_ANSWER_BYTES + 8; 2].map(&mut next), [false, false]);
-        // Two at once.
-        let both = [1000; 2].map(|len| ObservationBuffer::new(&budget, len, 16).unwrap());
-        assert_ne!(both[0].bytes().as_ptr(), both[1].bytes().as_ptr());
+        for appended in [16, 40, 8] {
+            // The second and third have the memory of those before them.
+            let mut buffer = ObservationBuffer::new(&budget, 80_000, 16).unwrap();
+            buffer.append(&[&[1; 5], &vec![2; appended - 5]]).unwrap();
+            assert_eq!(buffer.bytes().len(), 80_000 - 16 + appended);
+            assert_eq!(buffer.bytes()[80_000 - 16 + 4..][..2], [1, 2]);
+            assert_eq!(budget.reserved(), (WORD_BYTES * buffer.words.capacity()) as u64);
+        }
+        assert_eq!(budget.reserved(), 0);
     }
 
     #[test]
     fn the_message_begins_with_a_header_of_its_own_size() {
         let mut buffer = ObservationBuffer::new(&AnswerBudget::default(), 20, 16).unwrap();
+        assert_eq!(buffer.bytes(), [0; 4]);
         assert!(buffer.header_mut(17).is_none());
         buffer.header_mut(8).unwrap().fill(7);
         assert_eq!(buffer.bytes(), [7, 7, 7, 7, 7, 7, 7, 7, 0, 0, 0, 0]);

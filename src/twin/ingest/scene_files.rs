@@ -25,7 +25,7 @@ pub(super) trait SceneFiles {
 /// The files that a scene may name: paths by name.
 pub type ListedFiles = BTreeMap<String, PathBuf>;
 
-/// Whether a name, with `/`, is a plain path below the folder of the file that names it.
+/// Whether a `/`-separated name is a plain path below the folder of the file that names it.
 pub fn is_below_folder(name: &str) -> bool {
     let is_below = name.split('/').all(|step| !["", ".", ".."].contains(&step));
     is_below && !Path::new(name).is_absolute() && !name.contains(['\\', '\0'])

@@ -152,7 +152,7 @@ impl Commit {
     ) -> Result<Version, StoreError> {
         let base = base.map(|base| self.catalog.version(&self.name, Some(base))).transpose()?;
         let parent = base.as_ref().map(|base| base.number);
-        self.publish_all(parent, settings, |commit, latest, manifest| match (&base, latest) {
+        self.publish_put(parent, settings, |commit, latest, manifest| match (&base, latest) {
             (Some(base), Some(latest)) if latest != base.number => {
                 let latest = commit.catalog.version(&commit.name, Some(latest))?;
                 commit.check_overlap(base, &latest, manifest)
@@ -166,14 +166,14 @@ impl Commit {
     /// # Errors
     /// [`StoreError::TwinExists`] if others made a twin of this name meanwhile; otherwise as [`Commit::replace`].
     pub fn create(self, settings: VersionSettings) -> Result<Version, StoreError> {
-        self.publish_all(None, settings, |commit, latest, _| match latest {
+        self.publish_put(None, settings, |commit, latest, _| match latest {
             Some(latest) => Err(StoreError::TwinExists { name: commit.name.clone(), latest }),
             None => Ok(()),
         })
     }
 
     /// Publishes exactly what was put, if `check` accepts it in place of the latest version.
-    fn publish_all(
+    fn publish_put(
         self,
         parent: Option<u64>,
         settings: VersionSettings,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 DESCRIPTION_BYTES = 64 << 20
-"""Most bytes of a description, as the server reads them."""
+"""Most bytes of a description: the limit of the server."""
 
 METAS = ("lod-meta.json", "meta.json")
 """Files that describe a SOG; the first is that of a streamed one."""

@@ -30,7 +30,6 @@ use crate::limits;
 
 pub use fair::FrameCost;
 pub use scratch::Scratch;
-pub(crate) use scratch::for_views;
 
 use fair::FairQueue;
 
@@ -185,7 +184,7 @@ impl Shared {
         while let Some((cost, job)) = self.next(lane) {
             let begun = Instant::now();
             (job.work)(&mut scratch);
-            scratch.free_large();
+            scratch.free_excess();
             if is_large(cost) {
                 self.state.lock().rendered(cost, begun.elapsed());
             }

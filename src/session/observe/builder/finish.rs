@@ -153,7 +153,7 @@ impl ObservationBuilder {
                 shown.iter().map(|image| &self.encoded[image.encoded].file[..]).collect()
             }
         };
-        self.buffer.append(&self.budget, &files)
+        self.buffer.append(&files)
     }
 
     /// The tensors of the ego history and of the shown images, in the order of the buffer.
@@ -234,7 +234,7 @@ impl ObservationBuilder {
         if layout.schedule().is_decision(now_us) {
             let earlier = layout.earlier_frames(history, now_us);
             let files: Vec<&[u8]> = earlier.iter().map(|one| &one.frame.bytes[..]).collect();
-            self.buffer.append(&self.budget, &files)?;
+            self.buffer.append(&files)?;
             for (index, one) in earlier.iter().enumerate() {
                 let PastFrame {
                     camera, time_us, hash, trust, sensor, ref repair, ref bytes, ..

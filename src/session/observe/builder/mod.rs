@@ -17,7 +17,7 @@ use super::layout::{EpisodeKey, InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
-use crate::engine::render_queue::{Scratch, for_views};
+use crate::engine::render_queue::Scratch;
 use crate::episode::{EgoHistory, Episode};
 use crate::error::SessionError;
 use crate::options::PixelMaps;
@@ -160,23 +160,21 @@ impl ObservationBuilder {
             true => self.raw_places(capture),
             false => Vec::new(),
         };
-        let Scratch { images, opacity, depth_m, normals } = scratch;
-        let needed = |is_needed: bool| if is_needed { frame.views } else { &[] };
-        let images = for_views(images, needed(!self.holds_pixels(capture)), 3);
-        let mut targets = self.targets(capture, images);
-        for (target, opacity) in
-            targets.iter_mut().zip(for_views(opacity, needed(needs_opacity), 1))
-        {
-            target.opacity = Some(opacity);
+        let mut targets = self.targets(capture, scratch.images.of_views(frame.views, 3));
+        if needs_opacity {
+            for (target, map) in targets.iter_mut().zip(scratch.opacity.of_views(frame.views, 1)) {
+                target.opacity = Some(map);
+            }
         }
-        for (target, depth_m) in targets.iter_mut().zip(for_views(depth_m, needed(needs_depth), 1))
-        {
-            target.depth_m = Some(depth_m);
+        if needs_depth {
+            for (target, map) in targets.iter_mut().zip(scratch.depth_m.of_views(frame.views, 1)) {
+                target.depth_m = Some(map);
+            }
         }
-        for (target, normals) in
-            targets.iter_mut().zip(for_views(normals, needed(needs_normals), 3))
-        {
-            target.normals = Some(normals);
+        if needs_normals {
+            for (target, map) in targets.iter_mut().zip(scratch.normals.of_views(frame.views, 3)) {
+                target.normals = Some(map);
+            }
         }
 
         // Each image is encoded as soon as it is complete, while others are still rendered; one that may be
@@ -295,12 +293,13 @@ impl ObservationBuilder {
             let instances = (instances && capture.shown)
                 .then(|| as_ids(split_off_front(&mut instances_part, 2 * pixels)));
             let rgb8 = match holds_pixels {
-                true => Some(split_off_front(&mut raw_part, 3 * pixels)),
-                false => images.next(),
+                true => split_off_front(&mut raw_part, 3 * pixels),
+                // There is one for each camera; the backend would refuse an empty one.
+                false => images.next().unwrap_or_default(),
             };
             targets.push(Target {
                 rgba: None,
-                rgb8,
+                rgb8: Some(rgb8),
                 depth_m,
                 opacity,
                 normals,

@@ -11,7 +11,7 @@ use super::bad;
 pub struct SogFiles {
     /// Other descriptions: the blocks of a streamed scene, and its surroundings.
     pub descriptions: Vec<String>,
-    /// Images.
+    /// Names of images.
     pub images: Vec<String>,
 }
 
@@ -35,7 +35,7 @@ struct Images {
 }
 
 impl SogFiles {
-    /// Reads a description; errors call it `name`.
+    /// Reads a description. Error messages contain `name`.
     ///
     /// # Errors
     /// It is no JSON, or a key that names files has another type.
