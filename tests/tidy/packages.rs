@@ -15,7 +15,10 @@ const CRATES: &[(&str, &[&str])] = &[
     ("tonic_prost", &["src/alpasim"]),
     ("prometheus_client", &["src/server/metrics.rs"]),
     ("bincode", &["src/twin/store/chunk_file.rs"]),
-    ("fearless_simd", &["src/render/cpu", "src/scene/sky", "src/repair/reference/warp.rs"]),
+    (
+        "fearless_simd",
+        &["src/render/cpu", "src/scene/record", "src/scene/sky", "src/repair/reference/warp.rs"],
+    ),
     ("wgpu", &["src/render/gpu"]),
     ("libc", &["src/heap"]),
     ("ort", &["src/repair/onnx.rs"]),
