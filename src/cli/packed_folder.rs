@@ -101,15 +101,19 @@ fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<Stri
 
 /// The path, relative to `folder`, of a file that a description in it names; `None` if there is no such file.
 fn existing(folder: &Path, description: &str, named: &str) -> anyhow::Result<Option<String>> {
-    let outside = || format!("{description} names {named:?}, which is not below its folder");
-    anyhow::ensure!(is_below_folder(named), outside());
+    anyhow::ensure!(
+        is_below_folder(named),
+        "{description} names {named:?}, which is not below its folder"
+    );
     let beside = description.rfind('/').map_or("", |slash| &description[..=slash]);
     let path = format!("{beside}{named}");
     let file = folder.join(&path);
     if !file.is_file() {
         return Ok(None);
     }
-    // A link may lead out of the folder, where a name may not.
-    anyhow::ensure!(fs::canonicalize(&file)?.starts_with(folder), outside());
+    anyhow::ensure!(
+        fs::canonicalize(&file)?.starts_with(folder),
+        "{description} names {named:?}, a link that leads out of the folder"
+    );
     Ok(Some(path))
 }

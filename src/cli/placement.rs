@@ -80,6 +80,12 @@ fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
     let log = catalog.versions(twin)?;
     let parent_of = |number| log.iter().find(|entry| entry.number == number)?.parent;
     let import = Import::of(&version.manifest.provenance)?;
+    let remedies = |parent: u64| {
+        format!(
+            "name version {parent}; or roll back to it (`wildcity twin rollback {twin} {parent}`) and push again; or give \
+             --axes and --scale in place of what the twin says, its alignment included"
+        )
+    };
     let mut number = version.number;
     let mut is_aligned = version.manifest.alignment()?.is_some();
     while let Some(parent) = parent_of(number).filter(|parent| *parent < number) {
@@ -91,13 +97,13 @@ fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
         let was_aligned = before.manifest.alignment()?.is_some();
         anyhow::ensure!(
             is_aligned || !was_aligned,
-            "version {number} was pushed, and does not say how version {parent} was aligned: name an older version, or \
-             give --axes and --scale"
+            "version {number} was pushed, and does not say how version {parent} was aligned: {}",
+            remedies(parent)
         );
         anyhow::ensure!(
             import == Import::of(&before.manifest.provenance)?,
-            "version {number} was pushed with other axes or another scale than version {parent}: name an older version, \
-             or give --axes and --scale"
+            "version {number} was pushed with other axes or another scale than version {parent}: {}",
+            remedies(parent)
         );
         number = parent;
         is_aligned = was_aligned;

@@ -69,12 +69,12 @@ pub(super) struct Push {
     #[arg(long = "set", value_name = "FIELD=VALUE")]
     settings: Vec<String>,
 
-    /// Description of this version; `wildcity twin log` shows it.
+    /// Description of this version, of up to 1,000 characters; `wildcity twin log` shows it.
     #[arg(long)]
     note: Option<String>,
 
-    /// Refuse the push if the PSNR between the images before and after it, at any pose along the twin's
-    /// trajectory, is lower than this, in dB.
+    /// Refuse the push if the PSNR between the images before and after it, at any of four poses along the twin's drives,
+    /// is lower than this, in dB; or if no pose sees a Gaussian.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
 }
@@ -110,6 +110,11 @@ impl Push {
         let cells = match &self.cells[..] {
             [] => None,
             [all] if all == "all" => Some(CellSelection::All(AllCells::All)),
+            cells if cells.iter().any(|cell| cell == "all") => {
+                anyhow::bail!(
+                    "--cells all replaces all cells: give it once, and no cells beside it"
+                )
+            }
             cells => Some(CellSelection::Listed(
                 cells.iter().map(|text| parse_cell(text)).collect::<Result<_, _>>()?,
             )),
@@ -180,8 +185,11 @@ pub(super) async fn upload_all(
     for path in paths {
         let packed = packed_folder::pack(path, paths.len() == 1)?;
         let (upload, name) = match &packed {
-            Some(packed) => (upload(client, packed.path()).await?, None),
-            None => (upload(client, path).await?, name_beside(paths, path)),
+            Some(packed) => (upload(client, packed.path()).await?, file_name(packed.path())),
+            None => {
+                let name = name_beside(paths, path).or_else(|| file_name(path));
+                (upload(client, path).await?, name)
+            }
         };
         files.push(PushFile { upload, axes: axes.to_owned(), scale, name });
     }
@@ -195,6 +203,10 @@ async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
     let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
     bar.finish_and_clear();
     Ok(upload.id)
+}
+
+fn file_name(path: &Path) -> Option<String> {
+    path.file_name().and_then(|name| name.to_str()).map(str::to_owned)
 }
 
 /// The name by which the first of some files names another one, `textures/paint.png`, if that lies below its folder. A

@@ -11,7 +11,7 @@ use wildcity_scene::align::{
 };
 use wildcity_scene::{Gaussians, Rig};
 use wildcity_session::Engine;
-use wildcity_twin::store::{CommitKind, Edit};
+use wildcity_twin::store::Edit;
 
 use crate::blocking::run_blocking;
 use crate::error::PushError;
@@ -78,7 +78,7 @@ impl EditRequest {
                 vec![drive_through(name, &points_m, *speed_m_s).map_err(of_path)?]
             }
         };
-        Ok(Edit { alignment, trajectories, rig: rig.clone(), kind: CommitKind::Push })
+        Ok(Edit { alignment, trajectories, rig: rig.clone() })
     }
 }
 

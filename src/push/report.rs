@@ -173,7 +173,7 @@ fn refuse_shrunk(cells: &[CellChange]) -> Result<(), PushError> {
     let shrunk: Vec<_> = cells.iter().filter(shrinks).collect();
     let Some(CellChange { cell: [x, y], before, after }) = shrunk.first() else { return Ok(()) };
     let reason = format!(
-        "{} cells would lose nearly all of their Gaussians, as ({x}, {y}): {after} Gaussians in place \
+        "{} of the cells would lose nearly all of their Gaussians, as ({x}, {y}): {after} Gaussians in place \
          of {before}. If you mean this, name the cells; if these Gaussians are the margin of a \
          neighbouring cell, name only the other cells",
         shrunk.len()

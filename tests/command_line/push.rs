@@ -140,7 +140,7 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
     fs::write(&outside, "secret").unwrap();
     std::os::unix::fs::symlink(&outside, folder.join("link.json")).unwrap();
     for (damaged, reason) in [
-        (r#"{"filenames": ["link.json"]}"#, "which is not below its folder"),
+        (r#"{"filenames": ["link.json"]}"#, "a link that leads out of the folder"),
         (r#"{"filenames": ["../street/0/meta.json"]}"#, "which is not below its folder"),
         (r#"{"filenames": ["/etc/meta.json"]}"#, "which is not below its folder"),
         ("{", "lod-meta.json"),

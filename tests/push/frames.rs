@@ -203,6 +203,9 @@ async fn cells_are_those_of_the_twin_and_other_cells_stay() {
     let manifest = latest(&server, "street").manifest;
     assert_eq!(manifest.gaussians(), 70);
     assert_eq!(manifest.twin_from_capture.unwrap().metres_per_unit, 2.0);
+    let versions = get(&server, "/v1/twins/street/versions").await.body["versions"].clone();
+    let kinds: Vec<&Value> = (0..3).map(|index| &versions[index]["kind"]).collect();
+    assert_eq!(kinds, ["push", "edit", "push"]);
 }
 
 #[tokio::test]

@@ -12,7 +12,7 @@ use wildcity_render::cpu::{Cpu, Simd};
 use wildcity_scene::Gaussians;
 use wildcity_scene::align::Alignment;
 use wildcity_server::Limits;
-use wildcity_twin::store::{Catalog, CommitKind, Edit};
+use wildcity_twin::store::{Catalog, Edit};
 
 use crate::http::{client, get, in_cell, post, push, push_of, send, write};
 use crate::scene_files::gaussians;
@@ -220,8 +220,7 @@ async fn all_cells_replace_nothing_that_changed_while_they_were_checked() {
     let begun = client.push("test", &whole).await.unwrap();
     let catalog = Catalog::open(server.twins.path()).unwrap();
     let twice = Alignment { metres_per_unit: 2.0, ..Alignment::IDENTITY };
-    let (trajectories, kind) = (Vec::new(), CommitKind::Import);
-    let edit = Edit { alignment: twice, trajectories, rig: None, kind };
+    let edit = Edit { alignment: twice, trajectories: Vec::new(), rig: None };
     let path = format!("/v1/twins/test/pushes/{}", begun.id);
     let has_cells = async {
         while get(&server, &path).await.body["report"]["cells"].as_array().is_none_or(Vec::is_empty)
@@ -266,6 +265,47 @@ async fn views_before_and_after_are_compared() {
     });
     let again = again.await;
     assert_eq!(again.state, PushState::Ready, "{again:?}");
+}
+
+/// Levels of detail are no difference, though a twin is drawn with them from afar and a push has none yet.
+#[tokio::test]
+async fn the_same_content_has_equal_views_from_afar() {
+    let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
+    let server = TestServer::configured(|config| config.backend = cpu).await;
+    let gaussians = in_cell([0, 0], 20_000, 1);
+    let pose = |x: f64| wildcity_client::Pose { xyz: [x, 0.0, 2.0], q: [1.0, 0.0, 0.0, 0.0] };
+    let exact = |push: &mut NewPush| {
+        push.cells = Some(CellSelection::All(AllCells::All));
+        push.record = Some("f32".to_owned());
+        push.preview.poses = Some(vec![pose(-150.0)]);
+    };
+    assert_eq!(push(&server, &gaussians, exact).await.version, Some(2));
+    let sections = |number| {
+        let catalog = Catalog::open(server.twins.path()).unwrap();
+        catalog.version("test", Some(number)).unwrap().manifest.chunks[0].sections.len()
+    };
+    assert!(sections(2) > 16, "no levels: {}", sections(2));
+    let again = push(&server, &gaussians, |push| {
+        exact(push);
+        push.preview.min_psnr_db = Some(99.0);
+        push.note = Some("once more".to_owned());
+    });
+    let again = again.await;
+    let previews = again.report.as_ref().map(|report| &report.previews[..]);
+    assert!(
+        matches!(previews, Some([seen]) if seen.psnr_db.is_none()) && again.version == Some(3),
+        "{again:?}"
+    );
+    // The rig looks past the twin, and a camera looks back.
+    let blind = push(&server, &gaussians, |push| {
+        exact(push);
+        push.preview.poses =
+            Some(vec![wildcity_client::Pose { xyz: [0.0, 900.0, 2.0], ..pose(0.0) }]);
+        push.preview.min_psnr_db = Some(1.0);
+    });
+    let blind = blind.await;
+    let error = blind.error.expect("nothing is seen");
+    assert!(error.message.contains("no Gaussian is seen from these poses"), "{}", error.message);
 }
 
 /// No agent waits for a preview: on a busy server its frames may take longer than a step may.

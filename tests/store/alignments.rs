@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;
-use wildcity_twin::store::{Catalog, CommitKind, Edit, NewVersion, StoreError, Version};
+use wildcity_twin::store::{Catalog, Edit, NewVersion, StoreError, Version};
 
 use crate::places::{cells_alone, change, commit};
 use crate::scene_files::gaussians;
@@ -19,7 +19,7 @@ fn turn(axis: DVec3, metres_per_unit: f64) -> Alignment {
 }
 
 fn edit(catalog: &Catalog, base: &Version, alignment: Alignment) -> Result<Version, StoreError> {
-    let edit = Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
+    let edit = Edit { alignment, trajectories: Vec::new(), rig: None };
     catalog.edit(base, edit, &mut |_, _| {})
 }
 
@@ -40,12 +40,7 @@ fn alignments_are_remembered_as_one_until_a_rollback() {
     let fourth = change(&catalog, [0, 0], 2).change(3, cells_alone()).unwrap();
     assert_eq!(fourth.manifest.twin_from_capture, Some(both));
     let rig = wildcity_scene::Rig::preset("vehicle6");
-    let rig = Edit {
-        alignment: Alignment::IDENTITY,
-        trajectories: Vec::new(),
-        rig,
-        kind: CommitKind::Import,
-    };
+    let rig = Edit { alignment: Alignment::IDENTITY, trajectories: Vec::new(), rig };
     let fifth = catalog.edit(&fourth, rig, &mut |_, _| {}).unwrap();
     assert_eq!(fifth.manifest.twin_from_capture, Some(both));
     // A rollback has that of the old version, and a new import none.

@@ -160,7 +160,7 @@ fn an_alignment_moves_the_images_with_the_world() {
     let new_from_old =
         Pose { position_m: DVec3::new(1.0, 2.0, 3.0), rotation: glam::DQuat::from_rotation_z(0.3) };
     let alignment = Alignment { new_from_old, metres_per_unit: 2.0 };
-    let edit = Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
+    let edit = Edit { alignment, trajectories: Vec::new(), rig: None };
     let third = catalog.edit(&second, edit, &mut |_, _| {}).unwrap();
     for (moved, view) in catalog.views(&third).unwrap().iter().zip(&views) {
         let wanted = alignment.pose(&view.world_from_camera);

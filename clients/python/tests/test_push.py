@@ -88,6 +88,10 @@ def test_a_scene_becomes_a_twin_and_then_another_version(server: str, tmp_path: 
     first = wildcity.push(path, twin="street", server=server, progress=seen.append)
     assert (first.version, first.report["gaussians"]) == (1, 2000)
     assert seen[0].state == "uploading" and seen[-1].state == "ready"
+    # The server has these bytes already, under another name.
+    copy = wildcity.push(path.rename(tmp_path / "copy.ply"), twin="copy", server=server)
+    assert copy.report["files"][0]["name"] == "copy.ply"
+    path = (tmp_path / "copy.ply").rename(path)
     uploaded = [step.done for step in seen if step.state == "uploading"]
     assert uploaded == sorted(uploaded) and uploaded[-1] == path.stat().st_size
 
@@ -111,7 +115,7 @@ def test_the_frame_of_a_push(server: str, tmp_path: Path) -> None:
     first, second = write_ply(tmp_path / "a.ply", 0.0, 1), write_ply(tmp_path / "b.ply", 0.0, 2)
     wildcity.push(first, twin="aligned", server=server)
     never = wildcity.push(first, twin="aligned", server=server, frame="capture")
-    assert (never.version, never.report["frame"], never.report.get("aligned")) == (1, "capture", None)
+    assert (never.version, never.report["frame"], never.report["aligned"]) == (1, "capture", False)
     twice = {"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 2}}
     HttpClient(server, None, 60.0).json("POST", "/v1/twins/aligned/edits", twice)
     tops = []
@@ -142,6 +146,7 @@ def test_a_push_in_the_frame_of_the_capture_is_the_golden_one(monkeypatch: pytes
         path, twin="city", axes="y-down-z-forward", frame="capture", base=3, note="epoch 30", push_id="epoch-30"
     )
     golden = vector("http/new_push_capture.json")
+    golden["files"][0]["name"] = "a.ply"
     # What is empty may be left out.
     assert {name: value for name, value in sent[0].items() if value != []} == {
         name: value for name, value in golden.items() if value != {}
@@ -174,7 +179,7 @@ def test_the_folder_of_a_sog_is_one_archive(monkeypatch: pytest.MonkeyPatch, tmp
 
     monkeypatch.setattr(pushing, "_upload", upload)
     client = HttpClient("http://127.0.0.1:1", None, 1.0)
-    wanted = [{"upload": "blake3-0", "axes": "identity", "scale": 1.0}]
+    wanted = [{"upload": "blake3-0", "axes": "identity", "scale": 1.0, "name": "street.zip"}]
     for path in (folder, folder / "lod-meta.json"):
         os.utime(folder / "0" / "meta.json", (0, len(names)))
         assert upload_all(client, [path], "identity", 1.0, lambda _: None) == wanted
@@ -182,7 +187,7 @@ def test_the_folder_of_a_sog_is_one_archive(monkeypatch: pytest.MonkeyPatch, tmp
     (tmp_path / "outside").write_text("secret")
     (folder / "link.json").symlink_to(tmp_path / "outside")
     for damaged, reason in (
-        ('{"filenames": ["link.json"]}', "not below its folder"),
+        ('{"filenames": ["link.json"]}', "a link that leads out of the folder"),
         ('{"filenames": ["../street/0/meta.json"]}', "not below its folder"),
         ('{"filenames": [1]}', "names of files are texts"),
         ('{"means": 1}', "no description"),
@@ -219,6 +224,10 @@ def test_refusals_raise_typed_errors(server: str, tmp_path: Path) -> None:
     assert refused.value.report["files"][0]["bad"] == 1
     with pytest.raises(ValueError, match="http"):
         wildcity.push(bad, twin="road", server="localhost:8080")
+    wrong: list[Any] = [(0, 0), [(0, 0), "all"], "some", [(1, 2, 3)]]
+    for cells in wrong:
+        with pytest.raises(ValueError, match="cells is .*; it must be"):
+            wildcity.push(late, twin="road", server=server, cells=cells)
     with pytest.raises(wildcity.ConnectFailed):
         wildcity.rollback("road", 1, server="http://127.0.0.1:1")
 

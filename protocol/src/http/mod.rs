@@ -257,7 +257,7 @@ pub struct PushReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub frame: Option<PushFrame>,
     /// Whether the base version was aligned: the frame of the capture is then another one than that of the twin.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    #[serde(default)]
     pub aligned: bool,
     /// Smallest and largest values over all Gaussians. Absent if there are none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -366,7 +366,7 @@ pub struct VersionInfo {
     pub version_hash: String,
     /// Time of the commit, in microseconds since 1970-01-01 UTC.
     pub created_us: i64,
-    /// What made the version: `import`, `push` or `rollback`.
+    /// What made the version: `import`, `edit`, `push` or `rollback`.
     pub kind: String,
     /// Whether sessions that open the latest version can get this one. False while a push is still
     /// preparing it.

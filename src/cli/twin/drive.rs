@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use wildcity_scene::align::Alignment;
-use wildcity_twin::store::{CommitKind, Edit};
+use wildcity_twin::store::Edit;
 
 use super::change;
 use crate::cli::directories::{TwinVersion, Twins};
@@ -20,7 +20,8 @@ Examples:
   wildcity twin drive street --trajectory capture/capture.json --rig capture/rig.json")]
 #[command(group = clap::ArgGroup::new("what").args(["trajectory", "rig"]).required(true).multiple(true))]
 pub(in crate::cli) struct Drive {
-    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
+    /// them changed the same, this is refused.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
@@ -43,7 +44,7 @@ impl Drive {
         let catalog = self.twins.catalog()?;
         let base = catalog.version(&self.twin.name, self.twin.number)?;
         let alignment = Alignment::IDENTITY;
-        let edit = Edit { alignment, trajectories, rig, kind: CommitKind::Import };
+        let edit = Edit { alignment, trajectories, rig };
         let version = catalog.edit(&base, edit, &mut |_, _| {})?;
         let names: Vec<&str> =
             version.manifest.trajectories.iter().map(|drive| drive.name.as_str()).collect();

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use crate::cli::directories::Twins;
 use crate::cli::time::utc;
-use wildcity_twin::store::{CommitKind, LogEntry, StoreError};
+use wildcity_twin::store::{LogEntry, StoreError};
 
 /// Show all versions of a twin, oldest first: when and how each was made, from which version, and the note of its push.
 #[derive(Debug, clap::Args)]
@@ -29,9 +29,9 @@ impl Log {
         let mut out = io::stdout().lock();
         let catalog = self.twins.catalog()?;
         for entry in catalog.versions(&self.twin)? {
-            // A new file has no parent: an import of a version is an edit of it, such as an alignment. Builds from before
-            // notes were shown gave it the note of its base.
-            let is_edit = entry.kind == CommitKind::Import && entry.parent.is_some();
+            let how = entry.how();
+            // Builds from before notes were shown gave edits the note of their base.
+            let is_edit = how == "edit";
             let note = match catalog.provenance(&self.twin, &entry) {
                 Ok(provenance) => provenance.note().filter(|_| !is_edit).map(str::to_owned),
                 Err(StoreError::GarbageCollected { .. }) => None,
@@ -40,16 +40,16 @@ impl Log {
                     None
                 }
             };
-            let LogEntry { number, hash, created_us, commit, parent, kind } = entry;
+            let LogEntry { number, hash, created_us, commit, parent, .. } = entry;
             if self.json {
                 let line = serde_json::json!({
-                    "number": number, "hash": hash, "created_us": created_us, "kind": kind,
+                    "number": number, "hash": hash, "created_us": created_us, "kind": how,
                     "parent": parent, "commit": commit, "note": note,
                 });
                 writeln!(out, "{line}")?;
             } else {
                 let from = parent.map_or(String::new(), |parent| format!(" of {parent}"));
-                let how = if is_edit { format!("edit{from}") } else { format!("{kind}{from}") };
+                let how = format!("{how}{from}");
                 let when = utc(created_us);
                 // A note may have lines; a version has one.
                 let note = note.map(|note| format!("  {}", note.replace(char::is_control, " ")));

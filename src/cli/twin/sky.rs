@@ -13,7 +13,8 @@ use super::change;
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["sky", "remove"]).required(true))]
 pub(in crate::cli) struct Sky {
-    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
+    /// them changed the same, this is refused.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 

@@ -74,11 +74,11 @@ pub(crate) fn check_psnr(
         let must = format!("{min_db}, but nothing can be compared: {why}");
         return Err(PushError::OutOfRange { field: "golden.min_psnr_db".to_owned(), must });
     }
-    let worst = report.preview.iter().enumerate().find(|(_, pose)| pose.psnr_db < min_db);
-    if let Some((index, PsnrPreview { world_from_rig, psnr_db })) = worst {
+    let worst = report.preview.iter().find(|pose| pose.psnr_db < min_db);
+    if let Some(PsnrPreview { world_from_rig, psnr_db }) = worst {
         let [x, y, z] = world_from_rig.position_m.to_array();
         let reason = format!(
-            "pose {index} at ({x:.1}, {y:.1}, {z:.1}) differs from the version before: {psnr_db:.1} dB, \
+            "the view from ({x:.1}, {y:.1}, {z:.1}) differs from that of the version before: {psnr_db:.1} dB, \
              min_psnr_db is {min_db}"
         );
         return Err(PushError::Content { reason, cells: Vec::new() });
@@ -105,6 +105,8 @@ fn reason_for_no_preview(
             "the twin has no recorded drive: give it one (`wildcity twin drive`), or name golden.poses".to_owned()
         }
         Some(poses) if poses.is_empty() => "golden.poses names none".to_owned(),
-        _ => "a camera of the twin's rig cannot be drawn smaller: leave it out".to_owned(),
+        _ => "no Gaussian is seen from these poses, or a camera of the twin's rig cannot be drawn smaller: name other \
+              golden.poses, or leave it out"
+            .to_owned(),
     }
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use tokio::time::Instant;
 
 use wildcity_render::compare::psnr::psnr_db_u8;
-use wildcity_render::{Frame, Target, View};
+use wildcity_render::{Frame, RenderError, Target, View};
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
@@ -45,9 +45,12 @@ type LoadedSections = BTreeMap<SectionRef, Arc<Chunk>>;
 
 /// Renders small images of a version before and after a proposed change, and compares them. The frames wait
 /// in the render queue with those of the sessions, until the deadline. It may be later than that of a step, because no
-/// agent waits for them. Without `poses`, the images are taken from some poses along the first trajectory, near the
-/// change. Calls `progress` with the number of poses that are done and the
-/// number of all poses.
+/// agent waits for them. Without `poses`, the images are taken from some poses along the trajectories, near the
+/// change. Poses from which no Gaussian is seen are left out. Calls `progress` with the number of poses that are done and
+/// the number of all poses.
+///
+/// The replaced cells are compared in full detail, so that levels of detail are no difference. What the record format
+/// rounds is one: the new Gaussians are not stored yet.
 ///
 /// # Errors
 /// The version cannot be read, or the backend refuses a frame.
@@ -94,8 +97,9 @@ pub(crate) async fn preview_psnr(
             let cells = change.cells.clone();
             let sky = resident.sky().cloned();
             run_blocking(move || {
-                let before = reader.read(&BTreeSet::new(), &views)?;
-                let after = merged(reader.read(&cells, &views)?, &new_scene);
+                let kept = reader.kept(&cells, &views)?;
+                let before = merged(kept.clone(), &reader.in_full_detail(&cells)?);
+                let after = merged(kept, &new_scene);
                 Ok(BothScenes {
                     before: Scene { sky: sky.clone(), ..before },
                     after: Scene { sky, ..after },
@@ -111,34 +115,52 @@ pub(crate) async fn preview_psnr(
         let before =
             render_small(engine, scenes.before, manifest.profile, views.clone(), deadline).await?;
         let after = render_small(engine, scenes.after, change.profile, views, deadline).await?;
-        let psnr_db = psnr_db_u8(before.iter().zip(&after));
-        previews.push(PsnrPreview { world_from_rig, psnr_db });
+        if before.sees_any || after.sees_any {
+            let psnr_db = psnr_db_u8(before.rgb8.iter().zip(&after.rgb8));
+            previews.push(PsnrPreview { world_from_rig, psnr_db });
+        }
     }
     Ok(previews)
 }
 
-/// The RGB pixels of all views, one after the other.
+/// What all views of a pose show.
+struct SmallImages {
+    /// Their RGB pixels, one view after the other.
+    rgb8: Vec<u8>,
+    /// Whether any pixel shows a Gaussian.
+    sees_any: bool,
+}
+
+/// Renders all views.
 async fn render_small(
     engine: &Engine,
     scene: Scene,
     profile: RenderProfile,
     views: Vec<View>,
     deadline: Instant,
-) -> Result<Vec<u8>, PushError> {
+) -> Result<SmallImages, PushError> {
     let pixels = views.iter().map(|view| view.camera.pixels() as u64).sum();
     let cost = FrameCost { session: PUSHES, pixels };
     let rendered = engine.run(cost, deadline, move |_, backend| {
-        let mut images: Vec<_> =
-            views.iter().map(|view| vec![0; 3 * view.camera.pixels()]).collect();
+        let pixels = || views.iter().map(|view| view.camera.pixels());
+        let mut images: Vec<_> = pixels().map(|pixels| vec![0; 3 * pixels]).collect();
+        let mut opacities: Vec<_> = pixels().map(|pixels| vec![0.0; pixels]).collect();
         let mut targets: Vec<_> = images
             .iter_mut()
-            .map(|rgb8| Target { rgb8: Some(rgb8), ..Target::default() })
+            .zip(&mut opacities)
+            .map(|(rgb8, opacity)| Target {
+                rgb8: Some(rgb8),
+                opacity: Some(opacity),
+                ..Target::default()
+            })
             .collect();
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
-        backend.render(&frame, &mut targets, &|_, _| {}).map(|_| images.concat())
+        backend.render(&frame, &mut targets, &|_, _| {})?;
+        let sees_any = opacities.iter().flatten().any(|&opacity| opacity > 0.0);
+        Ok(SmallImages { rgb8: images.concat(), sees_any })
     });
     let (pixels, _queued) = rendered.await?;
-    Ok(pixels.map_err(SessionError::from)?)
+    Ok(pixels.map_err(|error: RenderError| SessionError::from(error))?)
 }
 
 /// The scenes before and after the change at one pose, and what the next pose reuses.
@@ -158,16 +180,32 @@ struct SceneReader {
 }
 
 impl SceneReader {
-    /// The part of the version that the views show, without some of its cells. Sections that were read
-    /// before are not read again.
-    fn read(&mut self, without: &BTreeSet<[i32; 2]>, views: &[View]) -> Result<Scene, StoreError> {
+    /// The part of the version that the views show, without the replaced cells.
+    fn kept(&mut self, replaced: &BTreeSet<[i32; 2]>, views: &[View]) -> Result<Scene, StoreError> {
+        let manifest = &self.version.manifest;
+        let mut sections = demand(manifest, &viewpoints(views), &self.profile);
+        sections.retain(|section| !replaced.contains(&manifest.chunks[section.chunk].cell));
+        self.read(sections)
+    }
+
+    /// All of the replaced cells, as a push has them: each block at its finest level.
+    fn in_full_detail(&mut self, replaced: &BTreeSet<[i32; 2]>) -> Result<Scene, StoreError> {
+        let mut sections = Vec::new();
+        for (chunk, entry) in self.version.manifest.chunks.iter().enumerate() {
+            if replaced.contains(&entry.cell) {
+                let finest = (0..).zip(&entry.sections).filter(|(_, section)| section.level == 0);
+                sections.extend(finest.map(|(section, _)| SectionRef { chunk, section }));
+            }
+        }
+        self.read(sections)
+    }
+
+    /// Some sections. Those that were read before are not read again.
+    fn read(&mut self, sections: Vec<SectionRef>) -> Result<Scene, StoreError> {
         let manifest = &self.version.manifest;
         let mut scene = Scene::default();
-        for section in demand(manifest, &viewpoints(views), &self.profile) {
+        for section in sections {
             let chunk = &manifest.chunks[section.chunk];
-            if without.contains(&chunk.cell) {
-                continue;
-            }
             let read = match self.loaded.get(&section) {
                 Some(known) => known.clone(),
                 None => {
@@ -193,11 +231,12 @@ fn merged(mut kept: Scene, new: &Scene) -> Scene {
     kept
 }
 
-/// Poses along the first trajectory: spread over the part that lies in the replaced cells, or over all of
-/// it if no part does.
+/// Poses along the trajectories: spread over the parts that lie in the replaced cells, or over all of
+/// them if no part does.
 fn preview_poses(change: &ProposedChange) -> Vec<Pose> {
-    let Some(drive) = change.before.manifest.trajectories.first() else { return Vec::new() };
-    let poses: Vec<Pose> = drive.keyframes.iter().map(|key| key.world_from_rig).collect();
+    let drives = &change.before.manifest.trajectories;
+    let keyframes = drives.iter().flat_map(|drive| &drive.keyframes);
+    let poses: Vec<Pose> = keyframes.map(|key| key.world_from_rig).collect();
     let is_replaced = |pose: &&Pose| change.cells.contains(&cell_at(&pose.position_m.to_array()));
     let replaced: Vec<&Pose> = poses.iter().filter(is_replaced).collect();
     let candidates = if replaced.is_empty() { poses.iter().collect() } else { replaced };

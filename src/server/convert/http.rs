@@ -262,7 +262,7 @@ pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
         version: entry.number,
         version_hash: entry.hash.clone(),
         created_us: entry.created_us,
-        kind: entry.kind.to_string(),
+        kind: entry.how().to_owned(),
         ready: held.is_none_or(|held| entry.number <= held),
         parent: entry.parent,
     };

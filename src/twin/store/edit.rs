@@ -21,8 +21,6 @@ pub struct Edit {
     pub trajectories: Vec<Trajectory>,
     /// The rig in metres; the base's stays if there is none.
     pub rig: Option<Rig>,
-    /// How the version is made, for the log.
-    pub kind: CommitKind,
 }
 
 impl Catalog {
@@ -43,7 +41,7 @@ impl Catalog {
         edit: Edit,
         progress: &mut dyn FnMut(u64, u64),
     ) -> Result<Version, StoreError> {
-        let Edit { alignment, trajectories: new, rig, kind } = edit;
+        let Edit { alignment, trajectories: new, rig } = edit;
         let manifest = &base.manifest;
         let is_aligned = alignment != Alignment::IDENTITY;
         let mut trajectories = manifest.trajectories.clone();
@@ -55,7 +53,7 @@ impl Catalog {
         trajectories.extend(new);
         let levels = manifest.chunks.iter().flat_map(|chunk| &chunk.sections).any(|s| s.level > 0);
         let storage = StorageOptions { record: manifest.record, levels };
-        let mut commit = self.begin(&manifest.twin, kind, storage)?;
+        let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         if !is_aligned {
             let trajectories = Some(trajectories);
             let change = VersionChange { trajectories, rig, ..VersionChange::edit() };

@@ -20,6 +20,17 @@ pub struct LogEntry {
     pub kind: CommitKind,
 }
 
+impl LogEntry {
+    /// How it was made, as people are told: `edit` is an import of a version of the twin, such as an alignment. An import
+    /// of files has no parent.
+    pub fn how(&self) -> &'static str {
+        match self.kind {
+            CommitKind::Import if self.parent.is_some() => "edit",
+            kind => kind.name(),
+        }
+    }
+}
+
 /// How a version was made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -33,13 +44,13 @@ pub enum CommitKind {
     Rollback,
 }
 
-impl std::fmt::Display for CommitKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.pad(match self {
+impl CommitKind {
+    fn name(self) -> &'static str {
+        match self {
             Self::Import => "import",
             Self::Push => "push",
             Self::Rollback => "rollback",
-        })
+        }
     }
 }
 

@@ -66,9 +66,10 @@ def _named_files(folder: Path, meta: str) -> set[str]:
         beside = name[: name.rfind("/") + 1]
         for named in blocks + images:
             path = beside + named
-            # A link may lead out of the folder, where a name may not.
-            if not _is_below(named) or not (folder / path).resolve().is_relative_to(folder.resolve()):
+            if not _is_below(named):
                 raise ValueError(f"{folder / name} names {named!r}, which is not below its folder")
+            if not (folder / path).resolve().is_relative_to(folder.resolve()):
+                raise ValueError(f"{folder / name} names {named!r}, a link that leads out of the folder")
             if path not in names and (folder / path).is_file():
                 names.add(path)
                 if named in blocks:

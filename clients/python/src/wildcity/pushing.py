@@ -88,8 +88,9 @@ def push(
     cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.
     base: the version that the scene was trained from; cells that changed since then are not overwritten.
     record, levels, profile, note: storage format, levels of detail, changes of the render profile as
-        `["near=0.2"]`, and a description for people.
-    min_psnr_db: refuse the push if a view along the twin's trajectory has a lower PSNR than this, in dB.
+        `["near=0.2"]`, and a description for people, of up to 1,000 characters.
+    min_psnr_db: refuse the push if a view along the twin's drives has a lower PSNR than this, in dB, or if none shows
+        anything.
     push_id: id of the push; sending the same id again does not make a second version.
     progress: is called with every change of the progress.
     timeout: how long one HTTP answer may take, in seconds.
@@ -97,7 +98,8 @@ def push(
     An interrupted upload continues where it stopped.
 
     Raises `PushFailed` if the scene is refused, `Refused` if a request is refused, and `ConnectFailed` if the
-    server does not answer.
+    server does not answer. Before anything is sent, `ValueError` if `cells` or a SOG cannot be understood, and `OSError`
+    if a file cannot be read.
     """
     paths = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     http_client = HttpClient(server, token, timeout)
@@ -110,7 +112,7 @@ def push(
     }
     if min_psnr_db is not None:
         request["golden"] = {"min_psnr_db": min_psnr_db}
-    cells = cells if cells is None or isinstance(cells, str) else [(x, y) for x, y in cells]
+    cells = _checked_cells(cells)
     optional = {"frame": frame, "cells": cells, "base": base, "record": record, "note": note}
     request |= {name: value for name, value in optional.items() if value is not None}
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
@@ -190,6 +192,21 @@ def _finished_push(answer: dict[str, Any]) -> Push:
     raise PushFailed(code, error["message"], cells, answer.get("report"))
 
 
+def _checked_cells(
+    cells: Literal["all"] | Sequence[tuple[int, int]] | None,
+) -> Literal["all"] | list[tuple[int, int]] | None:
+    """The cells as a request has them.
+
+    Raises `ValueError` for what is no list of cells.
+    """
+    if cells is None or cells == "all":
+        return cells
+    try:
+        return [(int(x), int(y)) for x, y in cells]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'cells is {cells!r}; it must be "all" or a list of cells, as [(3, -1)]') from error
+
+
 def upload_all(
     http_client: HttpClient,
     paths: Sequence[str | os.PathLike[str]],
@@ -203,13 +220,10 @@ def upload_all(
     for path in map(Path, paths):
         with packed(path, is_only=len(paths) == 1) as sent:
             upload = _upload(http_client, sent, report)
-        file = {"upload": upload, "axes": axes, "scale": scale}
-        files.append(file)
-        if sent != path:
-            continue
         folder = Path(paths[0]).parent
-        if path.is_relative_to(folder) and path.parent != folder:
-            file["name"] = path.relative_to(folder).as_posix()
+        is_beside = sent == path and path.is_relative_to(folder)
+        name = path.relative_to(folder).as_posix() if is_beside else sent.name
+        files.append({"upload": upload, "axes": axes, "scale": scale, "name": name})
     return files
 
 

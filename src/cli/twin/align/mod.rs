@@ -11,7 +11,7 @@ use glam::DVec3;
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, scale_of};
-use wildcity_twin::store::{CommitKind, Edit};
+use wildcity_twin::store::Edit;
 
 use super::change;
 use crate::cli::directories::{TwinVersion, Twins};
@@ -30,7 +30,8 @@ use crate::cli::{output, progress};
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Align {
-    /// The twin: NAME, or NAME@NUMBER to start from an older version.
+    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
+    /// them changed the same, this is refused.
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
@@ -148,8 +149,7 @@ impl Align {
         }
 
         let bar = progress::count("writing");
-        let edit =
-            Edit { alignment, trajectories: Vec::new(), rig: None, kind: CommitKind::Import };
+        let edit = Edit { alignment, trajectories: Vec::new(), rig: None };
         let version = catalog.edit(&base, edit, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         if base.manifest.geo.is_some() {
