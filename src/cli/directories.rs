@@ -159,6 +159,15 @@ pub(super) struct TwinVersion {
     pub(super) number: Option<u64>,
 }
 
+/// The twin that an edit changes.
+#[derive(Debug, clap::Args)]
+pub(super) struct EditedTwin {
+    /// The twin: NAME, or NAME@NUMBER for the version that the edit is made from [default: the latest]. What later
+    /// versions changed stays; if the edit would overwrite some of it, it is refused.
+    #[arg(value_name = "TWIN")]
+    pub(super) twin: TwinVersion,
+}
+
 impl std::str::FromStr for TwinVersion {
     type Err = String;
 

@@ -82,8 +82,8 @@ fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
     let import = Import::of(&version.manifest.provenance)?;
     let remedies = |parent: u64| {
         format!(
-            "name version {parent}; or roll back to it (`wildcity twin rollback {twin} {parent}`) and push again; or give \
-             --axes and --scale in place of what the twin says, its alignment included"
+            "name an older version; or roll back (`wildcity twin rollback {twin} {parent}`) and push again; or give --axes \
+             and --scale (without --twin), which then include its alignment"
         )
     };
     let mut number = version.number;

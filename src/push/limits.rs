@@ -60,15 +60,15 @@ pub const PUSH_GAUSSIANS: u64 = 250_000_000;
 /// The most poses of one preview: 32 small images before, and 32 after.
 pub const PREVIEW_MAX_POSES: usize = 32;
 
-/// Poses of a preview whose push names none, along the twin's first trajectory.
+/// Poses of a preview whose push names none, along the twin's trajectories.
 pub const PREVIEW_DEFAULT_POSES: usize = 4;
 
 /// Longest side of the images that are compared, in pixels.
 pub const PREVIEW_SIDE_PX: u32 = 320;
 
-/// Gaussians of a push that gets a preview. They are in memory as a scene beside the push itself: 92 B
-/// each at SH degree 1, 1.8 GB.
-pub const PREVIEW_GAUSSIANS: usize = 20_000_000;
+/// Most Gaussians of a push that gets a preview, and most of the cells that it replaces. Both are in memory as scenes
+/// beside the push itself: 92 B each at SH degree 1, 1.8 GB.
+pub const PREVIEW_GAUSSIANS: u64 = 20_000_000;
 
 /// Most Gaussians in which the ground is searched: 236 B each at SH degree 3 are 240 MB, less than the smallest push may
 /// take.

@@ -136,6 +136,15 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
     let (ok, said) =
         wildcity(&["push", block.to_str().unwrap(), "--twin", "block", "--server", &url]);
     assert!(ok && said.contains("0.zip: 45 Gaussians"), "{said}");
+    // The server has these bytes already, under another name.
+    let again = dir.path().join("again");
+    fs::rename(folder.join("0"), &again).unwrap();
+    let asked = ["push", again.to_str().unwrap(), "--twin", "block", "--server", &url];
+    let (ok, said) = wildcity(&asked);
+    assert!(ok && said.contains("again.zip: 45 Gaussians"), "{said}");
+    let (ok, said) = wildcity(&[&asked[..], &["--cells", "all", "--cells", "3,7"]].concat());
+    assert!(!ok && said.contains("--cells all replaces all cells"), "{said}");
+    fs::rename(&again, folder.join("0")).unwrap();
     let outside = dir.path().join("outside");
     fs::write(&outside, "secret").unwrap();
     std::os::unix::fs::symlink(&outside, folder.join("link.json")).unwrap();
@@ -200,7 +209,7 @@ async fn an_actor_is_pushed_as_it_is_imported() {
     let ply = write(dir.path(), "block.ply", &in_cell([0, 0], 400, 1));
     let own = dir.path().join("own").display().to_string();
     let paint = van.parent().unwrap().join("Textures/colormap-car.png");
-    let axes = ["--axes", "0 0 1 1 0 0 0 1 0", "--gaussians", "20000", "--record", "q32"];
+    let axes = ["--axes", "0 0 1 1 0 0 0 1 0", "--gaussians", "2000", "--record", "q32"];
     let scale = ["--class", "object", "--scale", "0.5", "--record", "f32"];
     for (file, parts, options) in
         [(&van, vec![paint.to_str().unwrap()], &axes[..]), (&ply, vec![], &scale[..])]

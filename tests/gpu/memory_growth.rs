@@ -52,7 +52,7 @@ fn two_thousand_steps() {
         steps.for_each(|step| draw(&gpu, &scene, step).unwrap());
         memory(&gpu)
     };
-    let (before, device_before) = steps(0..1_000);
+    let (before, device_before) = steps(0..500);
     let (after, device_after) = steps(0..STEPS);
     assert!(after <= before + GROWTH_BYTES, "{before} B grew to {after} B");
     assert_eq!(device_before, device_after);

@@ -224,10 +224,11 @@ def test_refusals_raise_typed_errors(server: str, tmp_path: Path) -> None:
     assert refused.value.report["files"][0]["bad"] == 1
     with pytest.raises(ValueError, match="http"):
         wildcity.push(bad, twin="road", server="localhost:8080")
-    wrong: list[Any] = [(0, 0), [(0, 0), "all"], "some", [(1, 2, 3)]]
+    # Without a server: nothing is sent.
+    wrong: list[Any] = [(0, 0), [(0, 0), "all"], "some", [(1, 2, 3)], [(3.5, 0)], ["37"]]
     for cells in wrong:
-        with pytest.raises(ValueError, match="cells is .*; it must be"):
-            wildcity.push(late, twin="road", server=server, cells=cells)
+        with pytest.raises(ValueError, match=r"cells is .*; it must be"):
+            wildcity.push(late, twin="road", server="http://127.0.0.1:1", cells=cells)
     with pytest.raises(wildcity.ConnectFailed):
         wildcity.rollback("road", 1, server="http://127.0.0.1:1")
 

@@ -159,11 +159,12 @@ pub enum AllCells {
 #[serde(default, deny_unknown_fields)]
 #[cfg_attr(feature = "schema", schemars(rename = "Golden"))]
 pub struct PreviewRequest {
-    /// Poses of the rig, `world_from_rig`. If absent, a few along the twin's first trajectory.
+    /// Poses of the rig, `world_from_rig`. If absent, four along the twin's trajectories. The report leaves out poses from which no
+    /// Gaussian is seen.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(length(max = 32)))]
     pub poses: Option<Vec<Pose>>,
-    /// Refuse the push if the PSNR at any pose is below this, in dB.
+    /// Refuse the push if the PSNR at any pose is below this, in dB, or no pose sees a Gaussian.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub min_psnr_db: Option<f64>,
 }

@@ -6,7 +6,7 @@ use wildcity_scene::align::Alignment;
 use wildcity_twin::store::Edit;
 
 use super::change;
-use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::input_files::read_trajectories;
 use crate::cli::rig::rig_of;
 
@@ -20,10 +20,8 @@ Examples:
   wildcity twin drive street --trajectory capture/capture.json --rig capture/rig.json")]
 #[command(group = clap::ArgGroup::new("what").args(["trajectory", "rig"]).required(true).multiple(true))]
 pub(in crate::cli) struct Drive {
-    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
-    /// them changed the same, this is refused.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
+    #[command(flatten)]
+    edited: EditedTwin,
 
     /// JSON file of a drive, in the twin's axes and metres, as `wildcity import --help` shows it. May be given again.
     #[arg(long, value_name = "FILE")]
@@ -42,7 +40,7 @@ impl Drive {
         let trajectories = read_trajectories(&self.trajectory)?;
         let rig = self.rig.as_deref().map(rig_of).transpose()?;
         let catalog = self.twins.catalog()?;
-        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
         let alignment = Alignment::IDENTITY;
         let edit = Edit { alignment, trajectories, rig };
         let version = catalog.edit(&base, edit, &mut |_, _| {})?;

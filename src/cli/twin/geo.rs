@@ -1,6 +1,6 @@
 //! `wildcity twin geo`.
 
-use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::directories::{EditedTwin, Twins};
 use wildcity_scene::geo::GeoAnchor;
 
 use super::change;
@@ -13,10 +13,8 @@ use super::change;
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["anchor", "remove"]).required(true))]
 pub(in crate::cli) struct Geo {
-    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
-    /// them changed the same, this is refused.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
+    #[command(flatten)]
+    edited: EditedTwin,
 
     /// Place of the twin's origin: LATITUDE,LONGITUDE[,ALTITUDE], or EPSG:CODE,EASTING,NORTHING[,ALTITUDE].
     #[arg(value_name = "ANCHOR", allow_hyphen_values = true)]
@@ -39,7 +37,8 @@ Examples:
 impl Geo {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let anchor = self.anchor;
-        let version = change::commit(&self.twins, &self.twin, |change| change.geo = Some(anchor))?;
+        let version =
+            change::commit(&self.twins, &self.edited.twin, |change| change.geo = Some(anchor))?;
         let anchor = version.manifest.geo.as_ref();
         let what = anchor.map_or(Ok("no place on the earth".to_owned()), serde_json::to_string)?;
         change::print(&version, &what)

@@ -29,9 +29,9 @@ impl Log {
         let mut out = io::stdout().lock();
         let catalog = self.twins.catalog()?;
         for entry in catalog.versions(&self.twin)? {
-            let how = entry.how();
             // Builds from before notes were shown gave edits the note of their base.
-            let is_edit = how == "edit";
+            let is_edit = entry.is_edit();
+            let how = entry.kind_name();
             let note = match catalog.provenance(&self.twin, &entry) {
                 Ok(provenance) => provenance.note().filter(|_| !is_edit).map(str::to_owned),
                 Err(StoreError::GarbageCollected { .. }) => None,

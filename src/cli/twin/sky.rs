@@ -1,6 +1,6 @@
 //! `wildcity twin sky`.
 
-use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::sky_source::SkySource;
 use wildcity_twin::store::NewSky;
 
@@ -13,10 +13,8 @@ use super::change;
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["sky", "remove"]).required(true))]
 pub(in crate::cli) struct Sky {
-    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
-    /// them changed the same, this is refused.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
+    #[command(flatten)]
+    edited: EditedTwin,
 
     #[command(flatten)]
     source: SkySource,
@@ -38,7 +36,8 @@ Examples:
 impl Sky {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let sky = self.source.read("identity")?.map(NewSky::Put);
-        let version = change::commit(&self.twins, &self.twin, |change| change.sky = Some(sky))?;
+        let version =
+            change::commit(&self.twins, &self.edited.twin, |change| change.sky = Some(sky))?;
         let what = version
             .manifest
             .sky

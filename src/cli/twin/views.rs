@@ -15,7 +15,7 @@ use wildcity_scene::views::{RecordedView, reduced_mask};
 use wildcity_scene::{Manifest, Trajectory};
 use wildcity_twin::store::{Commit, CommitKind, StorageOptions, VersionChange};
 
-use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::real_images::{ImageList, RealImage, camera_names, own_vehicle, picture};
 use crate::cli::{placement, progress};
 
@@ -32,10 +32,8 @@ use super::change;
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["images", "remove"]).required(true))]
 pub(in crate::cli) struct Views {
-    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
-    /// them changed the same, this is refused.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
+    #[command(flatten)]
+    edited: EditedTwin,
 
     /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, as of `wildcity eval`.
     #[arg(long, value_name = "FILE_OR_DIR")]
@@ -100,10 +98,10 @@ struct Placed<'a> {
 impl Views {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
-        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
         let manifest = &base.manifest;
         let storage = StorageOptions { record: manifest.record, ..StorageOptions::default() };
-        let mut commit = catalog.begin(&self.twin.name, CommitKind::Import, storage)?;
+        let mut commit = catalog.begin(&self.edited.twin.name, CommitKind::Import, storage)?;
         let mut listed = 0;
         match &self.images {
             None => commit.set_views(None),
@@ -111,7 +109,7 @@ impl Views {
                 ensure!(
                     !manifest.trajectories.is_empty(),
                     "twin {} has no recorded drive that images could belong to: `wildcity twin drive` adds one",
-                    self.twin.name
+                    self.edited.twin.name
                 );
                 let list = ImageList::read(images, self.image_dir.as_deref(), None)?;
                 let alignment = match &self.axes {

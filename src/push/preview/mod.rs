@@ -30,11 +30,15 @@ pub(crate) fn comparison(
     report: &PushReport,
     base: Option<&Arc<Version>>,
 ) -> Result<Option<ProposedChange>, PushError> {
-    let fits = gaussians.len() <= limits::PREVIEW_GAUSSIANS;
+    let replaced: u64 = report.cells.iter().map(|change| change.before).sum();
+    let most = limits::PREVIEW_GAUSSIANS;
+    let fits = (gaussians.len() as u64).max(replaced) <= most;
     let is_wanted = request.preview_poses.is_some() || request.min_psnr_db.is_some();
     if is_wanted && !fits {
-        let most = limits::PREVIEW_GAUSSIANS;
-        let must = format!("set, for {} Gaussians; at most {most} are compared", gaussians.len());
+        let must = format!(
+            "set, for {} Gaussians in place of {replaced}; at most {most} are compared",
+            gaussians.len()
+        );
         return Err(PushError::OutOfRange { field: "golden".to_owned(), must });
     }
     let Some(base) = base else { return Ok(None) };

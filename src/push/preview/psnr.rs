@@ -159,8 +159,8 @@ async fn render_small(
         let sees_any = opacities.iter().flatten().any(|&opacity| opacity > 0.0);
         Ok(SmallImages { rgb8: images.concat(), sees_any })
     });
-    let (pixels, _queued) = rendered.await?;
-    Ok(pixels.map_err(|error: RenderError| SessionError::from(error))?)
+    let (images, _queued) = rendered.await?;
+    Ok(images.map_err(|error: RenderError| SessionError::from(error))?)
 }
 
 /// The scenes before and after the change at one pose, and what the next pose reuses.

@@ -59,8 +59,13 @@ pub(crate) fn upload(upload: &Upload) -> Value {
 /// The body of `POST /v1/twins/{twin}/pushes`, checked as far as it can be without the files.
 pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> {
     let body: http::NewPush = read_body(body)?;
-    // The hash is computed from the parsed body, so that white space does not make it a different push.
-    let request_hash = blake3::hash(json!([&twin, &body]).to_string().as_bytes());
+    // The hash is computed from the parsed body, so that white space does not make it a different push. Nor does the name
+    // of a lone file, which no other names.
+    let mut content = body.clone();
+    if let [lone] = &mut content.files[..] {
+        lone.name = None;
+    }
+    let request_hash = blake3::hash(json!([&twin, &content]).to_string().as_bytes());
     let http::NewPush { id, files, frame, base, cells, record, levels, profile, note, preview } =
         body;
     let preview_poses = preview
@@ -262,7 +267,7 @@ pub(crate) fn versions(versions: &[LogEntry], held: Option<u64>) -> Value {
         version: entry.number,
         version_hash: entry.hash.clone(),
         created_us: entry.created_us,
-        kind: entry.how().to_owned(),
+        kind: entry.kind_name().to_owned(),
         ready: held.is_none_or(|held| entry.number <= held),
         parent: entry.parent,
     };

@@ -9,27 +9,37 @@ use crate::limits;
 
 /// One block of memory, at most [`limits::SPARE_ANSWER_BYTES`]. The budget for answers does not count it.
 #[derive(Default)]
-pub(crate) struct SpareMemory(Mutex<Vec<u64>>);
+pub(crate) struct SpareMemory(Mutex<Spare>);
+
+#[derive(Default)]
+struct Spare {
+    words: Vec<u64>,
+    /// Whether it did not fit when it was asked for.
+    is_unfit: bool,
+}
 
 impl SpareMemory {
     /// `count` words of any values: the spare ones if they are enough and not more than twice as many.
     pub(crate) fn take(&self, count: usize) -> Vec<u64> {
         let mut spare = self.0.lock();
-        if !(count..=2 * count).contains(&spare.capacity()) {
+        if !(count..=2 * count).contains(&spare.words.capacity()) {
+            spare.is_unfit = true;
             return vec![0; count];
         }
-        let mut words = std::mem::take(&mut *spare);
+        let mut words = std::mem::take(&mut spare.words);
         drop(spare);
         words.resize(count, 0);
         words
     }
 
-    /// Keeps the words of an answer that is gone, unless those that are kept already are more.
+    /// Keeps the words of an answer that is gone. Those that are kept already stay if they are more, unless they did not
+    /// fit since.
     pub(crate) fn recycle(&self, mut words: Vec<u64>) {
         if words.capacity() * size_of::<u64>() <= limits::SPARE_ANSWER_BYTES {
             let mut spare = self.0.lock();
-            if words.capacity() > spare.capacity() {
-                std::mem::swap(&mut *spare, &mut words);
+            if spare.is_unfit || words.capacity() > spare.words.capacity() {
+                std::mem::swap(&mut spare.words, &mut words);
+                spare.is_unfit = false;
             }
         }
     }
@@ -37,7 +47,7 @@ impl SpareMemory {
 
 impl fmt::Debug for SpareMemory {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_tuple("SpareMemory").field(&self.0.lock().capacity()).finish()
+        f.debug_tuple("SpareMemory").field(&self.0.lock().words.capacity()).finish()
     }
 }
 
@@ -58,10 +68,10 @@ mod tests {
             was_spare
         };
         assert_eq!([1000, 1000, 500, 1000].map(next), [false, true, true, true]);
-        // One of another size does not replace it, and a larger one does.
-        assert_eq!([499, 1000, 1001, 1001].map(next), [false, true, false, true]);
+        // Those that do not fit are replaced, also by fewer.
+        assert_eq!([1001, 1001, 499, 499].map(next), [false, true, false, true]);
         let too_large = limits::SPARE_ANSWER_BYTES / size_of::<u64>() + 1;
-        assert_eq!([too_large, too_large, 1001].map(next), [false, false, true]);
+        assert_eq!([too_large, too_large, 499].map(next), [false, false, true]);
     }
 
     #[test]
@@ -69,6 +79,11 @@ mod tests {
         let spare = SpareMemory::default();
         spare.recycle(vec![9; 1000]);
         let [first, second] = [spare.take(1000), spare.take(1000)];
-        assert_eq!([first, second], [vec![9; 1000], vec![0; 1000]]);
+        assert_eq!([&first[..], &second], [[9; 1000], [0; 1000]]);
+        // The larger of two that come back is kept.
+        let spare = SpareMemory::default();
+        spare.recycle(first);
+        spare.recycle(vec![7; 10]);
+        assert_eq!(spare.take(1000), [9; 1000]);
     }
 }

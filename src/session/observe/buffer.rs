@@ -27,9 +27,12 @@ impl ObservationBuffer {
     ) -> Result<Self, SessionError> {
         let count = len.div_ceil(WORD_BYTES);
         let mut share = budget.reserve((count * WORD_BYTES) as u64)?;
-        let words = budget.spare().take(count);
-        let more = words.capacity() - count;
-        share.merge(budget.reserve((more * WORD_BYTES) as u64)?);
+        let mut words = budget.spare().take(count);
+        // The spare words may be more than the budget has left.
+        match budget.reserve(((words.capacity() - count) * WORD_BYTES) as u64) {
+            Ok(more) => share.merge(more),
+            Err(_) => words = vec![0; count],
+        }
         Ok(Self { words, len, header, start: header, share })
     }
 

@@ -13,7 +13,7 @@ pub struct LogEntry {
     pub created_us: i64,
     /// Identity of the commit that made it; `None` for versions from before commits had one.
     pub commit: Option<String>,
-    /// The version that it was made from: the base of a push, or the version that a rollback
+    /// The version that it was made from: the base of a push or an edit, or the version that a rollback
     /// restored.
     pub parent: Option<u64>,
     /// How it was made.
@@ -21,12 +21,18 @@ pub struct LogEntry {
 }
 
 impl LogEntry {
-    /// How it was made, as people are told: `edit` is an import of a version of the twin, such as an alignment. An import
-    /// of files has no parent.
-    pub fn how(&self) -> &'static str {
+    /// Whether it is an edit of another version, such as an alignment. An import of files has no parent.
+    pub fn is_edit(&self) -> bool {
+        self.kind == CommitKind::Import && self.parent.is_some()
+    }
+
+    /// The name of how it was made: `import`, `edit`, `push` or `rollback`.
+    pub fn kind_name(&self) -> &'static str {
         match self.kind {
-            CommitKind::Import if self.parent.is_some() => "edit",
-            kind => kind.name(),
+            _ if self.is_edit() => "edit",
+            CommitKind::Import => "import",
+            CommitKind::Push => "push",
+            CommitKind::Rollback => "rollback",
         }
     }
 }
@@ -35,23 +41,13 @@ impl LogEntry {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CommitKind {
-    /// By an import of a whole scene.
+    /// By an import of a whole scene, or by an edit.
     #[default]
     Import,
     /// By a push to a server.
     Push,
     /// By restoring an old version.
     Rollback,
-}
-
-impl CommitKind {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Import => "import",
-            Self::Push => "push",
-            Self::Rollback => "rollback",
-        }
-    }
 }
 
 /// A record of the log, stored as JSON. How a version was made is stored here and not in the manifest,

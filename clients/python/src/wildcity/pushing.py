@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import operator
 import os
 import time
 import urllib.parse
@@ -98,10 +99,10 @@ def push(
     An interrupted upload continues where it stopped.
 
     Raises `PushFailed` if the scene is refused, `Refused` if a request is refused, and `ConnectFailed` if the
-    server does not answer. Before anything is sent, `ValueError` if `cells` or a SOG cannot be understood, and `OSError`
-    if a file cannot be read.
+    server does not answer; `ValueError` if `cells` or a SOG cannot be understood, and `OSError` if a file cannot be read.
     """
     paths = [files] if isinstance(files, (str, os.PathLike)) else list(files)
+    wanted_cells = _checked_cells(cells)
     http_client = HttpClient(server, token, timeout)
     report = progress or (lambda _: None)
     request: dict[str, Any] = {
@@ -112,8 +113,7 @@ def push(
     }
     if min_psnr_db is not None:
         request["golden"] = {"min_psnr_db": min_psnr_db}
-    cells = _checked_cells(cells)
-    optional = {"frame": frame, "cells": cells, "base": base, "record": record, "note": note}
+    optional = {"frame": frame, "cells": wanted_cells, "base": base, "record": record, "note": note}
     request |= {name: value for name, value in optional.items() if value is not None}
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
     # The request has an id, so the server carries it out once even if it is repeated after a lost answer.
@@ -199,10 +199,12 @@ def _checked_cells(
 
     Raises `ValueError` for what is no list of cells.
     """
-    if cells is None or cells == "all":
-        return cells
     try:
-        return [(int(x), int(y)) for x, y in cells]
+        if cells is None or isinstance(cells, str):
+            if cells not in (None, "all"):
+                raise ValueError("no name of cells")
+            return cells
+        return [(operator.index(x), operator.index(y)) for x, y in cells]
     except (TypeError, ValueError) as error:
         raise ValueError(f'cells is {cells!r}; it must be "all" or a list of cells, as [(3, -1)]') from error
 

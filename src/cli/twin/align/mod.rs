@@ -14,7 +14,7 @@ use wildcity_scene::align::{Alignment, GroundPlane, GroundSearch, find_ground, s
 use wildcity_twin::store::Edit;
 
 use super::change;
-use crate::cli::directories::{TwinVersion, Twins};
+use crate::cli::directories::{EditedTwin, Twins};
 use crate::cli::{output, progress};
 
 /// Put a capture on the ground: find the plane that the scene stands on, and make it level, at height 0, in metres.
@@ -30,10 +30,8 @@ use crate::cli::{output, progress};
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(in crate::cli) struct Align {
-    /// The twin: NAME; or NAME@NUMBER if the change was made for an older version. Later versions are kept, and if one of
-    /// them changed the same, this is refused.
-    #[arg(value_name = "TWIN")]
-    twin: TwinVersion,
+    #[command(flatten)]
+    edited: EditedTwin,
 
     /// What is up in the twin now, within 45 degrees: x, -x, y, -y, z, -z; auto tries all directions.
     #[arg(long, value_name = "AXIS", default_value = "auto", allow_hyphen_values = true)]
@@ -121,19 +119,20 @@ impl Align {
     pub(in crate::cli) fn run(self) -> anyhow::Result<()> {
         let metres_per_unit = self.metres_per_unit()?;
         let catalog = self.twins.catalog()?;
-        let base = catalog.version(&self.twin.name, self.twin.number)?;
+        let base = catalog.version(&self.edited.twin.name, self.edited.twin.number)?;
         let sh_degree = base.manifest.sh_degree;
         let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
         catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
 
         let search = GroundSearch { up: self.up.0, seed: self.seed, ..GroundSearch::default() };
-        let ground =
-            find_ground(&gaussians, &search).with_context(|| format!("twin {}", self.twin.name))?;
+        let ground = find_ground(&gaussians, &search)
+            .with_context(|| format!("twin {}", self.edited.twin.name))?;
         let alignment = Alignment::onto(&ground).scaled(metres_per_unit)?;
         print_proposal(&ground, &alignment)?;
 
         let picture = self.picture.clone();
-        let picture = picture.unwrap_or_else(|| format!("{}-align.png", self.twin.name).into());
+        let picture =
+            picture.unwrap_or_else(|| format!("{}-align.png", self.edited.twin.name).into());
         let (png, step_m) =
             picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
         output::write(&picture, &png)?;
@@ -153,7 +152,7 @@ impl Align {
         let version = catalog.edit(&base, edit, &mut progress::show(&bar))?;
         bar.finish_and_clear();
         if base.manifest.geo.is_some() {
-            let name = &self.twin.name;
+            let name = &self.edited.twin.name;
             writeln!(
                 io::stderr(),
                 "note: the version has no place on the earth, because it was that of the old axes: \
