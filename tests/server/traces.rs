@@ -3,14 +3,16 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Debug;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use serde_json::json;
+use tokio::time::timeout;
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt as _};
 use tracing_subscriber::registry::LookupSpan;
 
-use crate::support::{TestServer, pose};
+use crate::support::{TEST_TIMEOUT, TestServer, pose};
 
 /// A span that has begun.
 #[derive(Clone, Debug, Default)]
@@ -70,14 +72,20 @@ async fn a_step_is_traced_with_its_parts() {
     agent.open(json!({ "session": "traced", "outputs": { "encoding": "jpeg" } })).await;
     let step = json!({ "type": "step", "session": "traced", "pose": pose(1.0) });
     let seq = agent.look(step).await.meta["seq"].to_string();
-    // The answer is sent before its span ends.
     agent.ask(json!({ "type": "close" })).await;
 
-    let spans = spans.0.lock().unwrap().clone();
     let is_step = |seen: &Seen| {
         seen.fields.get("type").is_some_and(|kind| kind == "step")
             && seen.fields.get("session").is_some_and(|session| session == "traced")
     };
+    // The answer is sent before its span ends: a thread that drew it may hold a part of it for a moment.
+    let has_ended = async {
+        while !spans.0.lock().unwrap().values().any(|seen| is_step(seen) && seen.ended) {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    timeout(TEST_TIMEOUT, has_ended).await.expect("the span of the step ends");
+    let spans = spans.0.lock().unwrap().clone();
     let steps: Vec<u64> =
         spans.iter().filter(|(_, seen)| is_step(seen)).map(|(id, _)| *id).collect();
     let [step] = steps[..] else { panic!("one step: {spans:#?}") };
