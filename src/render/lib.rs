@@ -63,8 +63,8 @@ pub const FIRST_ACTOR_INSTANCE: u16 = 2;
 pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 
 /// Buffers for the images of one view, row by row from the top; an image that is `None` is not computed.
-/// A backend writes every value of each buffer that it is given, whatever it held before. Pixels outside of the lens' field are 0 in all
-/// of them.
+/// A backend writes every value of each buffer that it is given, whatever it held before. Pixels outside of the lens'
+/// field are 0 in all of them.
 #[derive(Debug, Default)]
 pub struct Target<'a> {
     /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the sky or the

@@ -49,8 +49,8 @@ type LoadedSections = BTreeMap<SectionRef, Arc<Chunk>>;
 /// change. Poses from which no Gaussian is seen are left out. Calls `progress` with the number of poses that are done and
 /// the number of all poses.
 ///
-/// The replaced cells are compared in full detail, so that levels of detail are no difference. What the record format
-/// rounds is one: the new Gaussians are not stored yet.
+/// The replaced cells are compared in full detail, so that levels of detail are no difference. Rounding by the record
+/// format is one: the new Gaussians are not stored yet.
 ///
 /// # Errors
 /// The version cannot be read, or the backend refuses a frame.

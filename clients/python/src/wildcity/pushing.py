@@ -199,11 +199,9 @@ def _checked_cells(
 
     Raises `ValueError` for what is no list of cells.
     """
+    if cells is None or (isinstance(cells, str) and cells == "all"):
+        return cells
     try:
-        if cells is None or isinstance(cells, str):
-            if cells not in (None, "all"):
-                raise ValueError("no name of cells")
-            return cells
         return [(operator.index(x), operator.index(y)) for x, y in cells]
     except (TypeError, ValueError) as error:
         raise ValueError(f'cells is {cells!r}; it must be "all" or a list of cells, as [(3, -1)]') from error
