@@ -16,9 +16,9 @@ fn composite(gathered: Sums, view: u32, at_px: vec2f, thread: u32) -> Sums {
     let on_image = all(at_px < vec2f(frame.view[view].size_px));
     let rgb = sky(view, at_px, any(shows) && on_image, thread);
     let weight = select(vec4f(0.0), sums.transmittance, shows);
-    sums.red += weight * rgb[0];
-    sums.green += weight * rgb[1];
-    sums.blue += weight * rgb[2];
+    sums.red = fma(weight, rgb[0], sums.red);
+    sums.green = fma(weight, rgb[1], sums.green);
+    sums.blue = fma(weight, rgb[2], sums.blue);
     return apply_appearance(sums, view, at_px);
 }
 

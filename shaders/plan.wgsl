@@ -23,9 +23,11 @@ const SPLATS_DIGITS: u32 = 4;
 const TOUCHES: u32 = 5;
 const TOUCHES_SORT: u32 = 6;
 const TOUCHES_DIGITS: u32 = 7;
-const TILES: u32 = 8;
-const INSTANCES: u32 = 9;
-const JOB_COUNT: u32 = 10;
+const MACRO_TILES: u32 = 8;
+const BATCHES: u32 = 9;
+const BATCH_TILES: u32 = 10;
+const INSTANCES: u32 = 11;
+const JOB_COUNT: u32 = 12;
 
 // Runs after the prefix sum over the visible splats of all cluster views.
 @compute @workgroup_size(1)
@@ -50,10 +52,18 @@ fn touches() {
     jobs[TOUCHES_DIGITS].job = job(DIGITS * div_ceil(length, SORT_BLOCK), SCAN_BLOCK);
 }
 
-// Runs after the prefix sum over the splats of all tiles.
+// Runs after the prefix sum over the batches of all macro tiles.
+@compute @workgroup_size(1)
+fn batches() {
+    let total = block_sums[div_ceil(jobs[MACRO_TILES].job.length, SCAN_BLOCK)];
+    jobs[BATCHES].job = job(total, 1u);
+    jobs[BATCH_TILES].job = job(MACRO_COLUMNS * MACRO_ROWS * total, SCAN_BLOCK);
+}
+
+// Runs after the prefix sum over the splats of all tiles in all batches.
 @compute @workgroup_size(1)
 fn instances() {
-    let total = block_sums[div_ceil(jobs[TILES].job.length, SCAN_BLOCK)];
+    let total = block_sums[div_ceil(jobs[BATCH_TILES].job.length, SCAN_BLOCK)];
     counters.instances = total;
     jobs[INSTANCES].job = job(select(0u, total, total <= frame.instance_capacity), WORKGROUP);
 }

@@ -67,5 +67,5 @@ fn write(at: u32, four: vec4u) {
 
 // Clamps to [0, 1], scales to 255, and rounds to the nearest integer.
 fn to_8_bit(linear: vec4f) -> vec4u {
-    return vec4u(saturate(linear) * 255.0 + 0.5);
+    return vec4u(fma(saturate(linear), vec4f(255.0), vec4f(0.5)));
 }

@@ -127,9 +127,8 @@ struct Counters {
     splats: u32,
     touches: u32,
     instances: u32,
-    batches: atomic<u32>,
-    most_batches: atomic<u32>,
-    most_touches: atomic<u32>,
+    block_pairs: atomic<u32>,
+    most_iterations: atomic<u32>,
 }
 
 struct SplatShape {

@@ -91,7 +91,9 @@ pub(crate) const MUTATIONS: &[Mutation] = &[
     mutation("bin", "i - prefix_before(band_index)", "i", BIN),
     mutation("sort", "sorted_masks[to] = masks[i]", "sorted_masks[to] = masks[to]", BIN),
     mutation("ranges", "ranges[own].y = i + 1u", "ranges[own].y = i", BIN),
-    mutation("expand", "offsets[tile] = atomicLoad(&counts[thread])", "offsets[tile] = 0u", BIN),
+    mutation("expand", "own.stride] = atomicLoad(&counts[thread])", "own.stride] = 0u", BIN),
+    mutation("expand", "first_batches[middle] <= number", "first_batches[middle] < number", BIN),
+    mutation("expand", "index + 1u == stride", "index == 0u", BIN),
     mutation("expand", "word_starts[word] = next", "word_starts[word] = first", BIN),
     mutation("expand", "& (own_bit - 1u)", "& ~(own_bit | (own_bit - 1u))", BIN),
     mutation("expand", "k / MACRO_COLUMNS", "k / 4u", BIN),
@@ -107,10 +109,13 @@ pub(crate) const MUTATIONS: &[Mutation] = &[
         "instance_splats[first + (k ^ 1u)]",
         RASTERIZE,
     ),
-    mutation("rasterize", "sums.green += weight", "sums.green += alpha", RASTERIZE),
+    mutation("rasterize", "sums.green = fma(weight", "sums.green = fma(alpha", RASTERIZE),
+    mutation("rasterize", "first.x < size", "first.x < size - 1.0", RASTERIZE),
+    mutation("rasterize", "last.y >= size", "last.y > size", RASTERIZE),
+    mutation("rasterize", "* BLOCK_PX + in_block", "* BLOCK_PX + in_block.yx", RASTERIZE),
     mutation("rasterize", "vec4f(0.0, 1.0, 2.0, 3.0)", "vec4f(0.0, 1.0, 3.0, 2.0)", RASTERIZE),
     mutation("rasterize", "sums.depth / select", "sums.depth * select", RASTERIZE),
-    mutation("rasterize", "saturate(linear) * 255.0", "saturate(linear) * 250.0", RASTERIZE),
+    mutation("rasterize", "vec4f(255.0)", "vec4f(250.0)", RASTERIZE),
 ];
 
 /// Faults of lenses and rolling shutters: an expression of `project_unscented`, and another one of its type; or a

@@ -43,6 +43,8 @@ fn constants_are_the_same() {
         ("DIGITS", Literal::U32(layout::DIGITS)),
         ("MAX_GROUPS", Literal::U32(layout::MAX_GROUPS)),
         ("RASTER_BATCH", Literal::U32(layout::RASTER_BATCH)),
+        ("BLOCK_PX", Literal::U32(layout::BLOCK_PX)),
+        ("BATCH_ITERATIONS", Literal::U32(layout::BATCH_ITERATIONS)),
         ("MACRO_COLUMNS", Literal::U32(layout::MACRO_COLUMNS)),
         ("MACRO_ROWS", Literal::U32(layout::MACRO_ROWS)),
         ("LARGE_SPLAT_MACRO_TILES", Literal::U32(layout::LARGE_SPLAT_MACRO_TILES)),
@@ -106,7 +108,7 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, touches, instances, batches, most_batches, most_touches }
+        Counters { splats, touches, instances, block_pairs, most_iterations }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

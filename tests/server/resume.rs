@@ -141,7 +141,7 @@ async fn last_seq_is_the_number_that_the_server_counts_by() {
 /// A client that did not get the answer to `close` resumes and repeats it, as with any other request.
 #[tokio::test]
 async fn a_lost_answer_to_close_can_be_repeated() {
-    let resume_grace = Duration::from_millis(600);
+    let resume_grace = Duration::from_millis(1500);
     let server = TestServer::with(Limits { resume_grace, ..Limits::default() }).await;
     let mut agent = server.driver("a").await;
     agent.step(1.0).await;

@@ -1,5 +1,6 @@
 //! Stopping: running steps are finished, every client is notified, every episode has an end.
 
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
@@ -38,4 +39,22 @@ async fn running_steps_are_answered_and_waiting_clients_notified() {
             std::fs::read_to_string(episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
         assert!(text.lines().last().unwrap().contains("server_error"), "{name}: {text}");
     }
+}
+
+/// A GPU's driver crashes if the process ends while another thread drops the device.
+#[test]
+fn the_backend_is_dropped_before_the_program_ends() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let painter = runtime.block_on(async {
+        let server = TestServer::start().await;
+        let mut agent = server.agent().await;
+        agent.open(json!({ "deadline_ms": 100, "outputs": { "encoding": "raw" } })).await;
+        server.painter.slow_ms.store(1000, Ordering::SeqCst);
+        let late = agent.ask(json!({ "type": "step", "pose": pose(1.0) })).await;
+        refused(&late, "deadline_exceeded");
+        server.running.stop().await;
+        server.painter
+    });
+    drop(runtime);
+    assert_eq!(Arc::strong_count(&painter), 1);
 }

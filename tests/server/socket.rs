@@ -1,7 +1,7 @@
 //! WebSocket itself (RFC 6455): pings and Close frames at any time.
 
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
 use serde_json::json;
@@ -31,16 +31,15 @@ async fn close_code(agent: &mut Agent) -> u16 {
 async fn pings_are_answered_while_a_request_runs() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
-    server.painter.slow_ms.store(3000, Ordering::SeqCst);
+    let begun = server.painter.begun.load(Ordering::SeqCst);
+    server.painter.held.store(true, Ordering::SeqCst);
     agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
+    server.painter.begins(begun + 1).await;
     for number in 0..5_u8 {
-        tokio::time::sleep(Duration::from_millis(100)).await;
-        let sent = Instant::now();
         agent.socket.send(Message::Ping(vec![number; 3].into())).await.unwrap();
         assert_eq!(frame(&mut agent).await, Some(Message::Pong(vec![number; 3].into())));
-        // Before the step ends, also on a busy machine.
-        assert!(sent.elapsed() < Duration::from_millis(400), "{:?}", sent.elapsed());
     }
+    server.painter.held.store(false, Ordering::SeqCst);
     assert_eq!(agent.seen().await.meta["step"], 1);
 }
 
@@ -50,11 +49,8 @@ async fn pings_are_answered_whatever_runs() {
     let server = TestServer::start().await;
     let mut agent = Agent::connect(server.address()).await;
     let pinged = async |agent: &mut Agent| {
-        let sent = Instant::now();
         agent.socket.send(Message::Ping("x".into())).await.unwrap();
         assert_eq!(frame(agent).await, Some(Message::Pong("x".into())));
-        // The rendering that runs has 700 ms left: the answer does not wait for it, on a busy machine either.
-        assert!(sent.elapsed() < Duration::from_millis(500), "{:?}", sent.elapsed());
     };
     pinged(&mut agent).await;
     agent.hello().await;
@@ -64,16 +60,18 @@ async fn pings_are_answered_whatever_runs() {
     }
     let of = |name: &str| json!({ "session": name, "pose": pose(1.0) });
     agent.ask(json!({ "type": "snapshot", "session": "a", "name": "s" })).await;
-    server.painter.slow_ms.store(800, Ordering::SeqCst);
     for request in [
         json!({ "type": "step_many", "steps": [of("a"), of("b")] }),
         json!({ "type": "observe", "session": "a", "poses": [pose(1.0)] }),
         json!({ "type": "reset", "session": "a" }),
         json!({ "type": "restore", "session": "a", "name": "s" }),
     ] {
+        let begun = server.painter.begun.load(Ordering::SeqCst);
+        server.painter.held.store(true, Ordering::SeqCst);
         agent.send(request.clone()).await;
-        tokio::time::sleep(Duration::from_millis(100)).await;
+        server.painter.begins(begun + 1).await;
         pinged(&mut agent).await;
+        server.painter.held.store(false, Ordering::SeqCst);
         let reply = agent.receive().await;
         assert!(matches!(reply, Reply::Binary(_)), "{request}: {reply:?}");
     }
@@ -128,13 +126,13 @@ async fn a_close_frame_is_answered_with_its_code() {
 async fn a_close_frame_is_answered_while_a_request_runs() {
     let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
-    server.painter.slow_ms.store(1500, Ordering::SeqCst);
+    let begun = server.painter.begun.load(Ordering::SeqCst);
+    server.painter.held.store(true, Ordering::SeqCst);
     agent.send(json!({ "type": "step", "pose": pose(1.0) })).await;
-    tokio::time::sleep(Duration::from_millis(100)).await;
-    let sent = Instant::now();
+    server.painter.begins(begun + 1).await;
     agent.socket.send(Message::Close(None)).await.unwrap();
     assert_eq!(frame(&mut agent).await, Some(Message::Close(None)));
-    assert!(sent.elapsed() < Duration::from_millis(500), "{:?}", sent.elapsed());
+    server.painter.held.store(false, Ordering::SeqCst);
     let mut agent = server.agent().await;
     let resume = json!({ "type": "resume", "session": "a", "last_seq": 1 });
     let resumed = agent.ask(resume).await;
@@ -144,7 +142,7 @@ async fn a_close_frame_is_answered_while_a_request_runs() {
 #[tokio::test]
 async fn the_servers_own_close_frame_says_why() {
     // A silent client.
-    let idle = Duration::from_millis(200);
+    let idle = Duration::from_millis(600);
     let server = TestServer::with(Limits { idle, ..Limits::default() }).await;
     let mut agent = server.agent().await;
     let Reply::Text(answer) = agent.receive().await else { panic!("no text") };

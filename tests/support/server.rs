@@ -34,6 +34,8 @@ pub(crate) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 pub(crate) struct Painter {
     /// Milliseconds that a frame takes.
     pub(crate) slow_ms: AtomicU64,
+    /// Whether frames that have begun do not end.
+    pub(crate) held: AtomicBool,
     /// Whether the next frame crashes.
     pub(crate) crash: AtomicBool,
     /// Whether the next frame fails with `RenderError::TooMany`.
@@ -50,6 +52,16 @@ impl Painter {
         let key = key ^ world_from_camera.rotation.z.to_bits().rotate_left(43);
         let mixed = (key ^ index as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         (mixed >> 56) as u8
+    }
+
+    /// Waits for this number of frames to begin, from the first on.
+    pub(crate) async fn begins(&self, frames: u64) {
+        let beginning = async {
+            while self.begun.load(Ordering::SeqCst) < frames {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        tokio::time::timeout(TEST_TIMEOUT, beginning).await.expect("a frame begins");
     }
 
     /// The expected image of a camera.
@@ -74,6 +86,9 @@ impl Backend for Painter {
         assert!(!self.crash.swap(false, Ordering::SeqCst), "a crash was asked for");
         if self.too_many.swap(false, Ordering::SeqCst) {
             return Err(RenderError::TooMany { what: "dots", limit: 1 });
+        }
+        while self.held.load(Ordering::SeqCst) {
+            std::thread::sleep(Duration::from_millis(1));
         }
         std::thread::sleep(Duration::from_millis(self.slow_ms.load(Ordering::SeqCst)));
         for (k, (view, target)) in frame.views.iter().zip(targets).enumerate() {

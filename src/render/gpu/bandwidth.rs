@@ -2,7 +2,8 @@
 //! the memory side of the stage's roofline.
 
 use super::layout::{
-    Counters, DIGITS, Frame as GpuFrame, GEOMETRY_WORDS, RASTER_BATCH, SOA_BLOCK, SORT_BLOCK,
+    BLOCK_PX, Counters, DIGITS, EXPAND_BATCH, Frame as GpuFrame, GEOMETRY_WORDS, MACRO_COLUMNS,
+    MACRO_ROWS, SOA_BLOCK, SORT_BLOCK,
 };
 use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
@@ -34,8 +35,8 @@ pub struct FrameCounts {
     pub touches: u64,
     /// (Splat, tile) pairs.
     pub instances: u64,
-    /// Batches of [`RASTER_BATCH`] splats that tiles blended.
-    pub batches: u64,
+    /// Pairs of a splat and a block of 8 x 8 px of a tile that were blended.
+    pub block_pairs: u64,
 }
 
 impl FrameCounts {
@@ -58,7 +59,7 @@ impl FrameCounts {
         self.splats += u64::from(counters.splats);
         self.touches += u64::from(counters.touches);
         self.instances += u64::from(counters.instances);
-        self.batches += u64::from(counters.batches);
+        self.block_pairs += u64::from(counters.block_pairs);
     }
 
     /// Name and bytes of each stage: what it reads and writes if each kernel reads and writes every array
@@ -74,8 +75,8 @@ impl FrameCounts {
     /// | tile sort | touch, pass of 8 bits | histogram 4, key and two values read and written 24, counters 5/4 |
     /// | expand | touch | macro tile 4, mask 8, splat 4 |
     /// | | instance | splat 4 |
-    /// | | tile | offset and its prefix sum 20, range 8 |
-    /// | | macro tile | range 8, written once and read twice |
+    /// | | tile of a batch of touches | offset and its prefix sum 20 |
+    /// | | tile, macro tile | range 8, written once; a macro tile's is read three times |
     /// | rasterize | visible pair | shape and colour 48, once: neighbouring tiles find them in the cache |
     /// | | instance, tile, pixel | splat 4; range 8; 4 for each requested value |
     pub fn stage_bytes(&self) -> [(&'static str, u64); 6] {
@@ -92,6 +93,8 @@ impl FrameCounts {
             u64::from(bits.div_ceil(DIGIT_BITS)) * pass
         };
         let scanned = 4 + 12 + 4;
+        let batches = touches.div_ceil(EXPAND_BATCH.into()).max(macro_tiles);
+        let batch_tiles = batches * u64::from(MACRO_COLUMNS * MACRO_ROWS);
         let bits = |number: u64| u64::BITS - number.leading_zeros();
         let depth_bits = DEPTH_BITS + bits(u64::from(self.views.max(1) - 1));
         [
@@ -103,15 +106,24 @@ impl FrameCounts {
             ("sort", sorted(splats, depth_bits, 1)),
             ("bin", splats * (2 * 40 + scanned) + touches * 12),
             ("tile sort", sorted(touches, bits(macro_tiles), 2)),
-            ("expand", touches * 16 + instances * 4 + tiles * (scanned + 8) + macro_tiles * 24),
+            (
+                "expand",
+                touches * 16 + instances * 4 + batch_tiles * scanned + tiles * 8 + macro_tiles * 32,
+            ),
             ("rasterize", splats * 48 + instances * 4 + tiles * 8 + self.pixels * 4 * self.planes),
         ]
     }
 
-    /// Fewest multiply-adds, or instructions of the same cost, of stage rasterize: five for each splat of
-    /// a batch and pixel of the tile, for `d`, `u` (two), the exponent, and its comparison. Pixels that a
-    /// splat touches take ten more, and pixels that have stopped take none; neither is counted.
+    /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels that have stopped
+    /// are counted too.
+    pub fn evaluations(&self) -> u64 {
+        self.block_pairs * u64::from(BLOCK_PX * BLOCK_PX)
+    }
+
+    /// Fewest multiply-adds, or instructions of the same cost, of stage rasterize: five for each evaluation, for
+    /// `d`, `u` (two), the exponent, and its comparison. Pixels that a splat touches take ten more; these are not
+    /// counted.
     pub fn rasterize_operations(&self) -> u64 {
-        5 * self.batches * u64::from(RASTER_BATCH) * u64::from(TILE_PX * TILE_PX)
+        5 * self.evaluations()
     }
 }

@@ -4,7 +4,7 @@
 //! with one bit for each touched tile, by the same exact test per row of tiles as on the cpu. Such a
 //! (splat, macro tile) pair is a touch. The radix sort orders the touches by macro tile: there are a
 //! quarter as many of them as (splat, tile) pairs, which are called instances. Then one workgroup per
-//! macro tile distributes its splats to its tiles, 1,024 at a time, by transposing a bit matrix.
+//! 1,024 touches of a macro tile distributes their splats to its tiles, by transposing a bit matrix.
 //!
 //! Binning and its sort take half the time and half the bytes of sorting all instances, and produce the
 //! same lists. The last part is necessary: when each tile of `rasterize` instead picked its splats from
@@ -13,11 +13,12 @@
 //!
 //! Twin of `render/cpu/bin`; WGSL: `bin`, `sort`, `ranges`, and `expand` in `shaders`.
 
-use wgpu::{Buffer, ComputePass};
+use wgpu::{CommandEncoder, ComputePass};
 
 use super::device::Device;
 use super::growable_buffer::{GrowableBuffer, INTERMEDIATE};
 use super::kernel::{Groups, Kernel, module};
+use super::layout::{EXPAND_BATCH, MACRO_COLUMNS, MACRO_ROWS, WORKGROUP};
 use super::plan::{Plan, job};
 use super::project::SplatBuffers;
 use super::scan::Scan;
@@ -30,6 +31,7 @@ pub(super) struct Bin {
     count_touches: Kernel,
     emit_touches: Kernel,
     find_ranges: Kernel,
+    count_batches: Kernel,
     count_instances: Kernel,
     list_instances: Kernel,
     /// For each splat, the index of its first touch.
@@ -42,8 +44,10 @@ pub(super) struct Bin {
     touch_masks: [GrowableBuffer; 2],
     /// Range of each macro tile's touches.
     macro_ranges: GrowableBuffer,
-    /// For each tile, the index of its first instance.
-    tile_offsets: GrowableBuffer,
+    /// For each macro tile, the index of its first batch of touches.
+    first_batches: GrowableBuffer,
+    /// For each tile of each batch of touches, the index of its first instance.
+    batch_offsets: GrowableBuffer,
     /// Range of each tile's instances.
     pub(super) ranges: GrowableBuffer,
     /// The splat of each instance, tile after tile.
@@ -80,6 +84,7 @@ impl Bin {
             count_touches: kernel("bin", "count"),
             emit_touches: kernel("bin", "emit"),
             find_ranges: kernel("ranges", "main"),
+            count_batches: kernel("expand", "batches"),
             count_instances: kernel("expand", "count"),
             list_instances: kernel("expand", "list"),
             splat_offsets: buffer("splat offsets"),
@@ -87,7 +92,8 @@ impl Bin {
             touch_splats: [buffer("touch splats"), buffer("touch splats")],
             touch_masks: [buffer("touch masks"), buffer("touch masks")],
             macro_ranges: buffer("macro tile ranges"),
-            tile_offsets: buffer("tile offsets"),
+            first_batches: buffer("first batches"),
+            batch_offsets: buffer("batch offsets"),
             ranges: buffer("ranges"),
             instances: buffer("instances"),
         }
@@ -99,10 +105,15 @@ impl Bin {
     }
 
     /// Makes room. Returns what the buffers can hold then.
-    pub(super) fn reserve(&mut self, device: &Device, sizes: BinSizes) -> BinCapacity {
+    pub(super) fn reserve(
+        &mut self,
+        device: &Device,
+        scan: &mut Scan,
+        sizes: BinSizes,
+    ) -> BinCapacity {
         self.splat_offsets.reserve(device, 4 * sizes.splats);
         self.macro_ranges.reserve(device, 8 * u64::from(sizes.macro_tiles));
-        self.tile_offsets.reserve(device, 4 * u64::from(sizes.tiles));
+        self.first_batches.reserve(device, 4 * u64::from(sizes.macro_tiles));
         self.ranges.reserve(device, 8 * u64::from(sizes.tiles));
         self.instances.reserve(device, 4 * sizes.instances);
         let touches = [&mut self.touch_macro_tiles, &mut self.touch_splats, &mut self.touch_masks];
@@ -111,10 +122,13 @@ impl Bin {
         }
         let capacity =
             |words: &GrowableBuffer| (words.buffer().size() / 4).min(Self::limit(device)) as u32;
-        BinCapacity {
-            touches: capacity(&self.touch_macro_tiles[0]),
-            instances: capacity(&self.instances),
-        }
+        let touches = capacity(&self.touch_macro_tiles[0]);
+        // The last batch of each macro tile may be smaller than the others.
+        let batches = u64::from(touches / EXPAND_BATCH) + u64::from(sizes.macro_tiles);
+        let batch_tiles = u64::from(MACRO_COLUMNS * MACRO_ROWS) * batches;
+        self.batch_offsets.reserve(device, 4 * batch_tiles);
+        scan.reserve(device, batch_tiles);
+        BinCapacity { touches, instances: capacity(&self.instances) }
     }
 
     /// Lists the touches of all splats; `sorted` tells which of their buffers are in order.
@@ -180,33 +194,40 @@ impl Bin {
         ];
         self.find_ranges.run(device, pass, Groups::Job(touches), &found);
 
-        // The number of splats of each tile.
-        let groups = Groups::Count(macro_tiles);
-        let common = [
-            frame,
-            (1, self.macro_ranges.bind()),
+        // The batches of each macro tile.
+        let macro_tile = [frame, (1, self.macro_ranges.bind()), (4, self.first_batches.bind())];
+        let groups = Groups::Count(macro_tiles.div_ceil(WORKGROUP));
+        self.count_batches.run(device, pass, groups, &macro_tile);
+        scan.run(device, pass, plan.job(job::MACRO_TILES), self.first_batches.buffer());
+        plan.set_batches(device, pass, scan.block_sums());
+
+        // The number of splats of each tile in each batch.
+        let batches = plan.job(job::BATCHES);
+        let batch = [
             (2, self.touch_masks[sorted].bind()),
-            (4, self.tile_offsets.bind()),
+            (5, self.batch_offsets.bind()),
+            (6, batches.bind()),
         ];
-        let counters = [(8, plan.counters().as_entire_binding())];
-        let counted: Vec<_> = common.iter().cloned().chain(counters).collect();
-        self.count_instances.run(device, pass, groups, &counted);
+        let common: Vec<_> = macro_tile.into_iter().chain(batch).collect();
+        self.count_instances.run(device, pass, Groups::Job(batches), &common);
 
         // The list of each tile.
-        scan.run(device, pass, plan.job(job::TILES), self.tile_offsets.buffer());
+        scan.run(device, pass, plan.job(job::BATCH_TILES), self.batch_offsets.buffer());
         plan.set_instances(device, pass, scan.block_sums());
         let outputs = [
             (3, self.touch_splats[sorted].bind()),
-            (5, plan.job(job::INSTANCES).bind()),
-            (6, self.ranges.bind()),
-            (7, self.instances.bind()),
+            (7, plan.job(job::INSTANCES).bind()),
+            (8, self.ranges.bind()),
+            (9, self.instances.bind()),
         ];
         let all: Vec<_> = common.into_iter().chain(outputs).collect();
-        self.list_instances.run(device, pass, groups, &all);
+        self.list_instances.run(device, pass, Groups::Job(batches), &all);
     }
 
-    /// The buffer that must be cleared before [`Bin::list_instances`].
-    pub(super) fn macro_ranges(&self) -> &Buffer {
-        self.macro_ranges.buffer()
+    /// Empties the ranges of all macro tiles and tiles, before [`Bin::list_instances`].
+    pub(super) fn clear_ranges(&self, encoder: &mut CommandEncoder) {
+        for ranges in [&self.macro_ranges, &self.ranges] {
+            encoder.clear_buffer(ranges.buffer(), 0, None);
+        }
     }
 }

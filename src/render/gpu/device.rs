@@ -5,9 +5,8 @@
 //!
 //! The backend is tested on Mesa's software device, lavapipe. Such devices leave a shader's loops,
 //! without an error, after 65,535 iterations of all of its loops together. The limits
-//! [`Device::max_tile_splats`], [`Device::max_macro_tile_touches`], and [`Device::max_view_tiles`] keep
-//! each shader below that number: frames are split into more regions, or refused. Other devices have no
-//! such limit.
+//! [`Device::max_tile_iterations`] and [`Device::max_view_tiles`] keep each shader below that number: frames are
+//! split into more regions, or refused. Other devices have no such limit.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -23,7 +22,7 @@ use wgpu::{
     DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags, Limits, PollType, Queue,
 };
 
-use super::layout::{EXPAND_BATCH, MACRO_COLUMNS, MACRO_ROWS, RASTER_BATCH, WORKGROUP};
+use super::layout::{MACRO_COLUMNS, MACRO_ROWS, WORKGROUP};
 use super::shaders::Shaders;
 use crate::RenderError;
 
@@ -313,24 +312,11 @@ impl Device {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most splats that a tile can blend, if the background takes `background_iterations` loop iterations
-    /// of a thread. A batch of `rasterize` takes one iteration, one for each of its splats, and two to
-    /// load them.
-    pub(super) fn max_tile_splats(&self, background_iterations: u64) -> u64 {
-        let batch = u64::from(RASTER_BATCH);
-        let blended = |most: u64| most.saturating_sub(background_iterations) / (batch + 3) * batch;
-        self.loop_iterations().map_or(u64::MAX, blended)
-    }
-
-    /// Most touches of a macro tile that `expand` can distribute.
-    ///
-    /// Half of the iterations are for batches of 1,024 touches, 45 iterations each. The other half is for
-    /// the touched tiles: with at most 64,000 splats per tile ([`Device::max_tile_splats`]), a macro tile
-    /// has 2 million (splat, tile) pairs, which are visited twice by 256 threads: 16,000 iterations of a
-    /// thread.
-    pub(super) fn max_macro_tile_touches(&self) -> u64 {
-        let batch = u64::from(EXPAND_BATCH);
-        self.loop_iterations().map_or(u32::MAX.into(), |most| most / 2 / 45 * batch)
+    /// Most loop iterations of a thread of `rasterize` for the splats of its tile, if the background takes
+    /// `background_iterations`. A thread finds its view among 16, and sums four blocks: 32 iterations with some to spare.
+    pub(super) fn max_tile_iterations(&self, background_iterations: u64) -> u64 {
+        let left = |most: u64| most.saturating_sub(background_iterations + 32);
+        self.loop_iterations().map_or(u64::MAX, left)
     }
 
     /// Most tiles of a view that can be binned at once, even if all 256 splats of a workgroup of `emit`

@@ -33,10 +33,15 @@ pub const MACRO_ROWS: u32 = 4;
 /// writes at most 16 macro tiles of 4 rows of tiles, 64 row masks, while the 255 other threads wait;
 /// beyond that, all 256 threads share the work.
 pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
-/// Splats of a macro tile that are distributed to its tiles at a time: 8 KiB of workgroup memory.
+/// Touches of a macro tile that one workgroup distributes to its tiles: 8 KiB of workgroup memory.
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
+/// Side of the blocks of a tile that blend only the splats which reach them.
+pub const BLOCK_PX: u32 = 8;
+/// Loop iterations of a thread of `rasterize` for each batch, beside those for the splats of its block, with one for the end of
+/// each loop: 1 for the batch, 3 to load two splats, 5 for the four words of its list, 4 for their ends, and 3 to spare.
+pub const BATCH_ITERATIONS: u32 = 16;
 /// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
 /// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
 pub const SOA_BLOCK: u32 = 32;
@@ -390,7 +395,7 @@ pub struct JobSlot {
     pub pad: [[u32; 4]; 15],
 }
 
-/// Counters that the host reads after a frame (24 bytes).
+/// Counters that the host reads after a frame (20 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Counters {
@@ -400,12 +405,11 @@ pub struct Counters {
     pub touches: u32,
     /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,
-    /// Batches of [`RASTER_BATCH`] splats that tiles blended.
-    pub batches: u32,
-    /// Most batches of one tile.
-    pub most_batches: u32,
-    /// Most splats that touch one macro tile.
-    pub most_touches: u32,
+    /// Pairs of a splat and a block of 8 x 8 px of a tile that were blended.
+    pub block_pairs: u32,
+    /// Most loop iterations of a thread of `rasterize` before the background: one for each pair of its block, and
+    /// [`BATCH_ITERATIONS`] for each batch.
+    pub most_iterations: u32,
 }
 
 /// Shape of a splat (32 bytes): [`crate::layout::Splat`] without its colour.

@@ -31,16 +31,13 @@ pub(super) struct Capacity {
     pub(super) touches: u64,
     /// (Splat, tile) pairs.
     pub(super) instances: u64,
-    /// Touches of the macro tile that has most.
-    pub(super) macro_tile_touches: u64,
 }
 
 impl Capacity {
     /// The smallest number of regions into which a region with these needs must be split to fit a limit.
     pub(super) fn min_regions(self, limit: Self) -> u64 {
-        let Self { splats, touches, instances, macro_tile_touches } =
-            self.combine(limit, u64::div_ceil);
-        splats.max(touches).max(instances).max(macro_tile_touches)
+        let Self { splats, touches, instances } = self.combine(limit, u64::div_ceil);
+        splats.max(touches).max(instances)
     }
 
     /// The larger of both, count by count.
@@ -61,7 +58,6 @@ impl Capacity {
             splats: combine(self.splats, other.splats),
             touches: combine(self.touches, other.touches),
             instances: combine(self.instances, other.instances),
-            macro_tile_touches: combine(self.macro_tile_touches, other.macro_tile_touches),
         }
     }
 }
@@ -216,14 +212,8 @@ mod tests {
         let mut cache = PartitionCache::default();
         let rows = rows();
         let key = PartitionKey { gaussians: 1, sizes_px: vec![[16, 64]] };
-        let limit =
-            Capacity { splats: 800, touches: 4000, instances: 8000, macro_tile_touches: 100 };
-        let needs = |splats, instances| Capacity {
-            splats,
-            touches: instances / 2,
-            instances,
-            macro_tile_touches: 1,
-        };
+        let limit = Capacity { splats: 800, touches: 4000, instances: 8000 };
+        let needs = |splats, instances| Capacity { splats, touches: instances / 2, instances };
         assert_eq!(cache.get(&key, &rows), [rows.all()]);
         let drawn = vec![(0..4, needs(500, 1)), (4..6, needs(200, 1)), (6..12, needs(1, 6999))];
         cache.insert(key.clone(), drawn, limit);

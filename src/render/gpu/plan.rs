@@ -18,9 +18,11 @@ pub(super) mod job {
     pub(crate) const TOUCHES: u64 = 5;
     pub(crate) const TOUCHES_SORT: u64 = 6;
     pub(crate) const TOUCHES_DIGITS: u64 = 7;
-    pub(crate) const TILES: u64 = 8;
-    pub(crate) const INSTANCES: u64 = 9;
-    pub(crate) const COUNT: usize = 10;
+    pub(crate) const MACRO_TILES: u64 = 8;
+    pub(crate) const BATCHES: u64 = 9;
+    pub(crate) const BATCH_TILES: u64 = 10;
+    pub(crate) const INSTANCES: u64 = 11;
+    pub(crate) const COUNT: usize = 12;
 }
 
 /// Counts that are known before the first stage of a frame runs; those that the device computes are zero.
@@ -39,6 +41,7 @@ pub(super) struct Counts {
 pub(super) struct Plan {
     splats: Kernel,
     touches: Kernel,
+    batches: Kernel,
     instances: Kernel,
     frame: GrowableBuffer,
     jobs: GrowableBuffer,
@@ -53,6 +56,7 @@ impl Plan {
         let mut plan = Self {
             splats: kernel("splats"),
             touches: kernel("touches"),
+            batches: kernel("batches"),
             instances: kernel("instances"),
             frame: GrowableBuffer::new(
                 device,
@@ -77,7 +81,7 @@ impl Plan {
             (job::SPLATS_SCAN, splats, SCAN_BLOCK),
             (job::SPLATS_SORT, splats, SORT_BLOCK),
             (job::SPLATS_DIGITS, DIGITS * splats.div_ceil(SORT_BLOCK), SCAN_BLOCK),
-            (job::TILES, frame.tiles, SCAN_BLOCK),
+            (job::MACRO_TILES, frame.macro_tiles, SCAN_BLOCK),
         ] {
             jobs[slot as usize].job = job(length, per_group);
         }
@@ -112,7 +116,13 @@ impl Plan {
         self.run(&self.touches, device, pass, sums);
     }
 
-    /// Sets the jobs that depend on the number of instances, after the prefix sum over the tiles' splats.
+    /// Sets the jobs that depend on the number of batches, after the prefix sum over the batches of macro tiles.
+    pub(super) fn set_batches(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
+        let buffers = [(1, self.jobs.bind()), (2, sums.as_entire_binding())];
+        self.batches.run(device, pass, Groups::Count(1), &buffers);
+    }
+
+    /// Sets the job that depends on the number of instances, after the prefix sum over the tiles' splats.
     pub(super) fn set_instances(&self, device: &Device, pass: &mut ComputePass<'_>, sums: &Buffer) {
         self.run(&self.instances, device, pass, sums);
     }
@@ -148,7 +158,9 @@ mod tests {
             ("TOUCHES", job::TOUCHES),
             ("TOUCHES_SORT", job::TOUCHES_SORT),
             ("TOUCHES_DIGITS", job::TOUCHES_DIGITS),
-            ("TILES", job::TILES),
+            ("MACRO_TILES", job::MACRO_TILES),
+            ("BATCHES", job::BATCHES),
+            ("BATCH_TILES", job::BATCH_TILES),
             ("INSTANCES", job::INSTANCES),
             ("JOB_COUNT", job::COUNT as u64),
         ]);

@@ -3,6 +3,7 @@
 mod report;
 
 use std::io::{self, Write};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, ensure};
 
@@ -44,7 +45,7 @@ pub(super) struct Gpu {
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Frames to time, after two that are not timed.
+    /// Frames to time, after two or a second that are not timed.
     #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 
@@ -65,6 +66,8 @@ Examples:
 
 /// Frames before those that are timed: the first one uploads the scene and allocates buffers.
 const WARM_UP: u32 = 2;
+/// They take at least this long: a graphics card that was idle needs hundreds of milliseconds to raise its clock.
+const WARM_UP_TIME: Duration = Duration::from_secs(1);
 
 impl Gpu {
     pub(super) fn run(self) -> anyhow::Result<()> {
@@ -103,7 +106,11 @@ impl Gpu {
         let usage = || device.usage().context("the device was lost");
         let profile = RenderProfile::default();
         let frame = Frame { scene: &scene, profile: &profile, views: &views };
+        let warm_up = Instant::now();
         time(device, &frame, WARM_UP, "gpu")?;
+        while warm_up.elapsed() < WARM_UP_TIME {
+            time(device, &frame, 1, "gpu")?;
+        }
         let before = usage()?;
         let own = time(device, &frame, self.repeat, "gpu")?;
         let usage = usage()?;

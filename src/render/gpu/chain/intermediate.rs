@@ -95,12 +95,7 @@ impl Chain {
     /// Makes sure that the buffers will be large enough for another backend's outputs.
     fn make_room(&mut self, outputs: &StageOutputs) -> Result<(), RenderError> {
         let Counts { splats, instances, .. } = counts(outputs);
-        let needs = Capacity {
-            splats: splats.into(),
-            touches: 0,
-            instances: instances.into(),
-            macro_tile_touches: 0,
-        };
+        let needs = Capacity { splats: splats.into(), touches: 0, instances: instances.into() };
         self.check_room(needs)?;
         self.high_water = self.high_water.max(needs);
         Ok(())
@@ -114,11 +109,6 @@ impl Chain {
             ("visible splats at once", needs.splats, limit.splats),
             ("(Gaussian, macro tile) pairs at once", needs.touches, limit.touches),
             ("(Gaussian, tile) pairs at once", needs.instances, limit.instances),
-            (
-                "visible splats in 32 tiles (on a software device)",
-                needs.macro_tile_touches,
-                limit.macro_tile_touches,
-            ),
         ] {
             if needed > limit {
                 return Err(RenderError::TooMany { what, limit });

@@ -18,7 +18,7 @@ use super::bin::{Bin, BinCapacity, BinSizes};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::{TIMESTAMP_BYTES, timestamps};
-use super::layout::{Counters, Frame as GpuFrame, RASTER_BATCH};
+use super::layout::{BATCH_ITERATIONS, BLOCK_PX, Counters, Frame as GpuFrame, RASTER_BATCH};
 use super::lens::Lenses;
 use super::mirror::Mirror;
 use super::partition::{Capacity, PartitionCache, PartitionKey, Region, TileRows};
@@ -30,7 +30,6 @@ use super::resolve::{Outputs, Planes};
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::actor_views::ActorViews;
-use crate::constants::TILE_PX;
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
 
@@ -146,8 +145,6 @@ impl Chain {
                 splats: INITIAL_SPLATS.min(SplatBuffers::limit(&device)),
                 touches: INITIAL_TOUCHES.min(Bin::limit(&device)),
                 instances: INITIAL_INSTANCES.min(Bin::limit(&device)),
-                // No buffer depends on it; it only has a limit.
-                macro_tile_touches: 0,
             },
             partitions: PartitionCache::default(),
             retries: 0,
@@ -301,8 +298,11 @@ impl Chain {
             // Check whether it fitted.
             let (needs, fits) = self.evaluate(&counters, &current.parameters);
             if fits {
-                let limit = self.device.max_tile_splats(self.rasterize.background_iterations());
-                if u64::from(counters.most_batches) * u64::from(RASTER_BATCH) > limit {
+                let most = self.device.max_tile_iterations(self.rasterize.background_iterations());
+                if u64::from(counters.most_iterations) > most {
+                    // So many are drawn wherever they are in the tile.
+                    let batches = most / u64::from(RASTER_BATCH + BATCH_ITERATIONS);
+                    let limit = batches * u64::from(RASTER_BATCH);
                     let what = "visible splats in one tile (on a software device)";
                     return Err(RenderError::TooMany { what, limit });
                 }
@@ -324,12 +324,10 @@ impl Chain {
             splats: counters.splats.into(),
             touches: counters.touches.into(),
             instances: counters.instances.into(),
-            macro_tile_touches: counters.most_touches.into(),
         };
         let fits = counters.splats <= parameters.splat_capacity
             && counters.touches <= parameters.touch_capacity
-            && counters.instances <= parameters.instance_capacity
-            && needs.macro_tile_touches <= self.limit().macro_tile_touches;
+            && counters.instances <= parameters.instance_capacity;
         if !fits {
             self.retries += 1;
             tracing::debug!(?needs, "the buffers on the device are too small");
@@ -348,10 +346,10 @@ impl Chain {
         let splats = u64::from(parameters.splat_capacity);
         let GpuFrame { macro_tiles, tiles, .. } = *parameters;
         let sizes = BinSizes { splats, macro_tiles, tiles, touches, instances };
-        let BinCapacity { touches, instances } = self.bin.reserve(device, sizes);
+        let BinCapacity { touches, instances } = self.bin.reserve(device, &mut self.scan, sizes);
         parameters.touch_capacity = touches;
         parameters.instance_capacity = instances;
-        self.scan.reserve(device, splats.max(cluster_views.max(tiles).into()));
+        self.scan.reserve(device, splats.max(cluster_views.into()));
         self.sort.reserve(device, &mut self.scan, splats.max(touches.into()));
         self.timestamps.reserve(device, TIMESTAMP_BYTES);
     }
@@ -359,12 +357,7 @@ impl Chain {
     /// The most that the device can hold at once.
     fn limit(&self) -> Capacity {
         let listed = Bin::limit(&self.device);
-        Capacity {
-            splats: SplatBuffers::limit(&self.device),
-            touches: listed,
-            instances: listed,
-            macro_tile_touches: self.device.max_macro_tile_touches(),
-        }
+        Capacity { splats: SplatBuffers::limit(&self.device), touches: listed, instances: listed }
     }
 
     /// The error for a row of tiles that exceeds the limit.
@@ -372,8 +365,6 @@ impl Chain {
         let limit = self.limit();
         let (what, limit) = if needs.splats > limit.splats {
             ("visible splats in one row of tiles", limit.splats)
-        } else if needs.macro_tile_touches > limit.macro_tile_touches {
-            ("visible splats in eight tiles (on a software device)", limit.macro_tile_touches)
         } else {
             ("(Gaussian, tile) pairs in one row of tiles", limit.instances)
         };
@@ -392,8 +383,7 @@ fn add_time(stats: &mut FrameStats, stage: &'static str, time: Duration) {
 
 /// Adds the counts of a region. A splat that reaches into two bands of a view counts twice.
 fn add_counts(stats: &mut FrameStats, counters: &Counters) {
-    let evaluations_per_batch = u64::from(RASTER_BATCH * TILE_PX * TILE_PX);
     stats.visible_pairs += u64::from(counters.splats);
     stats.instances += u64::from(counters.instances);
-    stats.evaluations += u64::from(counters.batches) * evaluations_per_batch;
+    stats.evaluations += u64::from(counters.block_pairs) * u64::from(BLOCK_PX * BLOCK_PX);
 }

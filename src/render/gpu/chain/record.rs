@@ -102,7 +102,7 @@ impl Chain {
         }
 
         if must_run(Stage::Bin) {
-            recorder.encoder.clear_buffer(self.bin.macro_ranges(), 0, None);
+            self.bin.clear_ranges(&mut recorder.encoder);
             let mut pass = recorder.stage("bin");
             self.bin.list_touches(device, &mut pass, plan, scan, splats, sorted);
             drop(pass);

@@ -16,6 +16,7 @@ mod scratch;
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
+use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use parking_lot::{Condvar, Mutex};
@@ -39,7 +40,8 @@ struct Job {
     work: Box<dyn FnOnce(&mut Scratch) + Send>,
 }
 
-/// The queue, whose render threads end when it is dropped.
+/// The queue. When it is dropped, it waits for its render threads to end: the last of them would otherwise drop the
+/// backend while the process ends, and a GPU's driver crashes if the process ends meanwhile.
 pub(crate) struct RenderQueue {
     shared: Arc<Shared>,
 }
@@ -61,6 +63,7 @@ struct State {
     ns_per_pixel: f64,
     /// Whether there is a thread for small frames.
     has_side_thread: bool,
+    threads: Vec<JoinHandle<()>>,
 }
 
 /// Which frames a render thread takes.
@@ -82,7 +85,9 @@ impl RenderQueue {
         let shared = Shared { backend, state: Mutex::default(), changed: Condvar::new() };
         let queue = Self { shared: Arc::new(shared) };
         for number in 0..threads {
-            queue.shared.clone().start_thread(format!("render-{number}"), Lane::Main)?;
+            let mut state = queue.shared.state.lock();
+            let name = format!("render-{number}");
+            queue.shared.clone().start_thread(&mut state, name, Lane::Main)?;
         }
         Ok(queue)
     }
@@ -140,16 +145,36 @@ impl RenderQueue {
 
 impl Drop for RenderQueue {
     fn drop(&mut self) {
-        self.shared.state.lock().is_closed = true;
+        let mut state = self.shared.state.lock();
+        state.is_closed = true;
+        let threads = std::mem::take(&mut state.threads);
+        drop(state);
         self.shared.changed.notify_all();
+        // A driver that hangs must not keep the process. A job that holds the queue may drop it in a render thread.
+        let deadline = Instant::now() + limits::LAST_FRAME;
+        let is_other = |thread: &JoinHandle<()>| thread.thread().id() != thread::current().id();
+        for thread in threads.into_iter().filter(is_other) {
+            while !thread.is_finished() && Instant::now() < deadline {
+                thread::sleep(Duration::from_millis(1));
+            }
+        }
     }
 }
 
 impl Shared {
-    fn start_thread(self: Arc<Self>, name: String, lane: Lane) -> Result<(), SessionError> {
+    fn start_thread(
+        self: Arc<Self>,
+        state: &mut State,
+        name: String,
+        lane: Lane,
+    ) -> Result<(), SessionError> {
         let body = move || self.run_jobs(lane);
-        let started = std::thread::Builder::new().name(name).spawn(body);
-        started.map(|_| ()).map_err(|error| SessionError::Thread { reason: error.to_string() })
+        let thread = thread::Builder::new()
+            .name(name)
+            .spawn(body)
+            .map_err(|error| SessionError::Thread { reason: error.to_string() })?;
+        state.threads.push(thread);
+        Ok(())
     }
 
     fn add(self: &Arc<Self>, cost: FrameCost, job: Job) -> Result<(), SessionError> {
@@ -170,8 +195,8 @@ impl Shared {
         state.queue.push(cost, job);
         if needs_side_thread {
             // Without the thread, small frames wait for the large one.
-            state.has_side_thread =
-                self.clone().start_thread("render-side".into(), Lane::Side).is_ok();
+            let name = "render-side".to_owned();
+            state.has_side_thread = self.clone().start_thread(&mut state, name, Lane::Side).is_ok();
         }
         drop(state);
         self.changed.notify_all();
