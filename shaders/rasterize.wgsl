@@ -1,8 +1,11 @@
 // Stage rasterize: one workgroup per tile blends the tile's splats front to back. Each thread has four
 // pixels of a row, so that loading a splat and computing the terms that depend on the row are shared by
 // four pixels. Splats are loaded batch by batch into workgroup memory, with a list of those whose box
-// reaches each block of 8 x 8 px: most splats are smaller than a tile, and 16 threads that have a block
+// reaches each block of 4 x 4 px: most splats are smaller than a tile, and the four threads of a block
 // blend only those in its list.
+//
+// A tile where a road meets the horizon has hundreds of times the splats of others, and the device waits for
+// it. So a thread evaluates two splats at a time: neither waits for the other.
 //
 // Products and sums are written as `fma` where a compiler could contract them: it may do so in one variant
 // of this shader and not in another, and a pixel's bytes must not depend on what else is requested.
@@ -26,21 +29,25 @@
 @group(0) @binding(5) var<storage, read> colors: array<SplatColor>;
 @group(0) @binding(6) var<storage, read_write> counters: Counters;
 
-// 64 threads of 4 pixels. A batch takes 40 B per splat, 5 KiB of workgroup memory, so that this memory
+// 64 threads of 4 pixels. A batch takes 44 B per splat, 6 KiB of workgroup memory, so that this memory
 // does not limit how many workgroups a multiprocessor can hold.
 const THREADS: u32 = TILE_PX * TILE_PX / 4;
-// Two by two.
-const BLOCKS: u32 = 4;
-const BLOCK_THREADS: u32 = THREADS / BLOCKS;
+// Blocks of a tile: four by four.
+const BLOCKS: u32 = 16;
 const BATCH_WORDS: u32 = RASTER_BATCH / 32;
+// Index of a splat of no opacity, after those of a batch.
+const NO_SPLAT: u32 = RASTER_BATCH;
 
-var<workgroup> means: array<vec2f, RASTER_BATCH>;
-// Cholesky factor (l0, l1, l2), and base-2 logarithm of the peak opacity.
-var<workgroup> factors: array<vec4f, RASTER_BATCH>;
+// Mean, and the first row of the Cholesky factor (l0, l1).
+var<workgroup> mean_factors: array<vec4f, RASTER_BATCH + 1>;
+// l2 of the Cholesky factor, and base-2 logarithm of the peak opacity.
+var<workgroup> opacities: array<vec2f, RASTER_BATCH + 1>;
 // Colour, and depth in metres.
-var<workgroup> color_depths: array<vec4f, RASTER_BATCH>;
-// For each block, one bit per splat of the batch, set if the splat's box reaches it. Block after block.
-var<workgroup> block_splats: array<atomic<u32>, BLOCKS * BATCH_WORDS>;
+var<workgroup> color_depths: array<vec4f, RASTER_BATCH + 1>;
+// For each splat of the batch, one bit per block that its box reaches; four splats together.
+var<workgroup> splat_blocks: array<vec4u, RASTER_BATCH / 4>;
+// For each block, one bit per splat of the batch. Block after block.
+var<workgroup> block_splats: array<u32, BLOCKS * BATCH_WORDS>;
 // For each block, the number of its set bits in all batches.
 var<workgroup> block_pairs: array<atomic<u32>, BLOCKS>;
 var<workgroup> done_count: atomic<u32>;
@@ -61,13 +68,15 @@ fn main(
     let view = frame.view[view_index];
     let tile_of_view = tile - view.first_tile;
     let corner = vec2u(tile_of_view % view.columns, tile_of_view / view.columns) * TILE_PX;
-    let block = thread / BLOCK_THREADS;
-    let in_block = vec2u(thread % 2u * 4u, thread % BLOCK_THREADS / 2u);
-    let first_pixel = vec2u(block % 2u, block / 2u) * BLOCK_PX + in_block;
+    let block = thread / 4u;
+    let first_pixel = vec2u(block % 4u, block / 4u) * BLOCK_PX + vec2u(0u, thread % 4u);
     let at_px = vec2f(corner + first_pixel) + 0.5;
 
     if thread == 0u {
         atomicStore(&done_count, 0u);
+        mean_factors[NO_SPLAT] = vec4f(0.0);
+        opacities[NO_SPLAT] = vec2f(0.0, -1e30);
+        color_depths[NO_SPLAT] = vec4f(0.0);
     }
     if thread < BLOCKS {
         atomicStore(&block_pairs[thread], 0u);
@@ -83,6 +92,7 @@ fn main(
         atomicAdd(&done_count, 1u);
     }
     var batches = 0u;
+    var pairs = 0u;
     let range = ranges[tile];
     for (var first = range.x; first < range.y; first += RASTER_BATCH) {
         // End when all threads are done.
@@ -90,60 +100,58 @@ fn main(
         if thread == 0u {
             done_threads = atomicLoad(&done_count);
         }
-        if thread < BLOCKS * BATCH_WORDS {
-            atomicStore(&block_splats[thread], 0u);
-        }
         if workgroupUniformLoad(&done_threads) == THREADS {
             break;
         }
-        // Load a batch.
+        // Load a batch. What follows its last splat reaches no block.
         batches++;
         let count = min(range.y - first, RASTER_BATCH);
-        for (var k = thread; k < count; k += THREADS) {
-            let splat = instance_splats[first + k];
-            let shape = shapes[splat];
-            let color = colors[splat];
-            means[k] = shape.mean_px;
-            factors[k] = vec4f(shape.factor, shape.log2_opacity);
-            color_depths[k] = vec4f(color.rgb, color.depth_m);
-            list_in_blocks(k, shape, corner);
+        for (var k = thread; k < RASTER_BATCH; k += THREADS) {
+            var blocks = 0u;
+            if k < count {
+                let splat = instance_splats[first + k];
+                let shape = shapes[splat];
+                let color = colors[splat];
+                mean_factors[k] = vec4f(shape.mean_px, shape.factor.xy);
+                opacities[k] = vec2f(shape.factor.z, shape.log2_opacity);
+                color_depths[k] = vec4f(color.rgb, color.depth_m);
+                blocks = blocks_of(shape, corner);
+            }
+            splat_blocks[k / 4u][k % 4u] = blocks;
         }
         workgroupBarrier();
-        if thread < BLOCKS * BATCH_WORDS {
-            let pairs = countOneBits(atomicLoad(&block_splats[thread]));
-            atomicAdd(&block_pairs[thread / BATCH_WORDS], pairs);
+        // Transpose: from one word of blocks per splat to words of splats per block.
+        for (var k = thread; k < BLOCKS * BATCH_WORDS; k += THREADS) {
+            let word = k / BLOCKS;
+            var bits = 0u;
+            for (var four = 0u; four < 8u; four++) {
+                let reached = (splat_blocks[word * 8u + four] >> vec4u(k % BLOCKS)) & vec4u(1u);
+                let nibble = reached.x | (reached.y << 1u) | (reached.z << 2u) | (reached.w << 3u);
+                bits |= nibble << (4u * four);
+            }
+            block_splats[k % BLOCKS * BATCH_WORDS + word] = bits;
+            pairs += countOneBits(bits);
         }
-        // exponent = log2(alpha) = log2(opacity) - (l0 dx + l1 dy)^2 - (l2 dy)^2 at each of four pixels.
+        workgroupBarrier();
+        // Blend it.
         let was_done = done;
         for (var word = 0u; word < BATCH_WORDS && !done; word++) {
-            var rest = atomicLoad(&block_splats[block * BATCH_WORDS + word]);
-            for (; rest != 0u && !done; rest &= rest - 1u) {
-                let k = word * 32u + firstTrailingBit(rest);
-                let factor = factors[k];
-                let d = at_px - means[k];
-                let v = factor.z * d.y;
-                let first_u = fma(factor.x, d.x, factor.y * d.y);
-                let u = fma(vec4f(factor.x), vec4f(0.0, 1.0, 2.0, 3.0), vec4f(first_u));
-                let exponent = fma(-u, u, vec4f(fma(-v, v, factor.w)));
-                let touched = exponent >= vec4f(frame.log2_alpha_cut);
-                if any(touched) {
-                    let alpha =
-                        select(vec4f(0.0), min(exp2(exponent), vec4f(frame.alpha_cap)), touched);
-                    let after = fma(-alpha, running, running);
-                    // The Gaussian that would bring the transmittance to the stop or below is not blended.
-                    let counts = after > vec4f(frame.stop);
-                    let weight = select(vec4f(0.0), alpha * running, counts);
-                    let color_depth = color_depths[k];
-                    sums.red = fma(weight, vec4f(color_depth.r), sums.red);
-                    sums.green = fma(weight, vec4f(color_depth.g), sums.green);
-                    sums.blue = fma(weight, vec4f(color_depth.b), sums.blue);
-                    if DEPTH {
-                        sums.depth = fma(weight, vec4f(color_depth.w), sums.depth);
-                    }
-                    note_owner(first + k, sums.transmittance, after, counts);
-                    sums.transmittance = select(sums.transmittance, after, counts);
-                    running = after;
-                    done = !any(counts);
+            var rest = block_splats[block * BATCH_WORDS + word];
+            while rest != 0u && !done {
+                let a = word * 32u + firstTrailingBit(rest);
+                rest &= rest - 1u;
+                let b = select(NO_SPLAT, word * 32u + firstTrailingBit(rest), rest != 0u);
+                rest &= rest - 1u;
+                let exponent_a = exponents(a, at_px);
+                let exponent_b = exponents(b, at_px);
+                let touched_a = exponent_a >= vec4f(frame.log2_alpha_cut);
+                let touched_b = exponent_b >= vec4f(frame.log2_alpha_cut);
+                if any(touched_a | touched_b) {
+                    let alpha_a = select(vec4f(0.0), alphas(exponent_a), touched_a);
+                    let alpha_b = select(vec4f(0.0), alphas(exponent_b), touched_b);
+                    // In order of depth. A pixel that has stopped stays so, so that the second one decides.
+                    blend(&sums, &running, alpha_a, color_depths[a], first + a);
+                    done = blend(&sums, &running, alpha_b, color_depths[b], first + b);
                 }
             }
         }
@@ -151,47 +159,80 @@ fn main(
             atomicAdd(&done_count, 1u);
         }
     }
+    atomicAdd(&block_pairs[thread % BLOCKS], pairs);
     workgroupBarrier();
     if thread == 0u {
-        var pairs = 0u;
+        var all = 0u;
         var most = 0u;
         for (var k = 0u; k < BLOCKS; k++) {
             let own = atomicLoad(&block_pairs[k]);
-            pairs += own;
+            all += own;
             most = max(most, own);
         }
-        atomicAdd(&counters.block_pairs, pairs);
+        atomicAdd(&counters.block_pairs, all);
         atomicMax(&counters.most_iterations, batches * BATCH_ITERATIONS + most);
     }
     sums = composite(sums, view_index, at_px, thread);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);
 }
 
-// Lists splat `k` of the batch in the blocks that its box reaches, by the test with which `bin.wgsl` finds
-// its tiles. `corner` is the first pixel of the tile.
-fn list_in_blocks(k: u32, shape: SplatShape, corner: vec2u) {
-    let corner_px = vec2f(corner);
-    let first = ceil(shape.mean_px - shape.extent_px - 0.5) - corner_px;
-    let last = floor(shape.mean_px + shape.extent_px - 0.5) - corner_px;
-    let size = f32(BLOCK_PX);
-    let left = first.x < size && last.x >= 0.0;
-    let right = first.x < 2.0 * size && last.x >= size;
-    let upper = first.y < size && last.y >= 0.0;
-    let lower = first.y < 2.0 * size && last.y >= size;
-    let word = k / 32u;
-    let bit = 1u << (k % 32u);
-    if upper && left {
-        atomicOr(&block_splats[word], bit);
+// log2(alpha) = log2(opacity) - (l0 dx + l1 dy)^2 - (l2 dy)^2 of a splat of the batch at four pixels.
+fn exponents(k: u32, at_px: vec2f) -> vec4f {
+    let mean_factor = mean_factors[k];
+    let opacity = opacities[k];
+    let d = at_px - mean_factor.xy;
+    let v = opacity.x * d.y;
+    let first_u = fma(mean_factor.z, d.x, mean_factor.w * d.y);
+    let u = fma(vec4f(mean_factor.z), vec4f(0.0, 1.0, 2.0, 3.0), vec4f(first_u));
+    return fma(-u, u, vec4f(fma(-v, v, opacity.y)));
+}
+
+// Opacities from their base-2 logarithms.
+fn alphas(exponents: vec4f) -> vec4f {
+    return min(exp2(exponents), vec4f(frame.alpha_cap));
+}
+
+// Blends a splat into four pixels. Returns whether all of them have stopped.
+fn blend(
+    sums: ptr<function, Sums>,
+    running: ptr<function, vec4f>,
+    alpha: vec4f,
+    color_depth: vec4f,
+    list_index: u32,
+) -> bool {
+    let after = fma(-alpha, *running, *running);
+    // The Gaussian that would bring the transmittance to the stop or below is not blended.
+    let counts = after > vec4f(frame.stop);
+    let weight = select(vec4f(0.0), alpha * *running, counts);
+    (*sums).red = fma(weight, vec4f(color_depth.r), (*sums).red);
+    (*sums).green = fma(weight, vec4f(color_depth.g), (*sums).green);
+    (*sums).blue = fma(weight, vec4f(color_depth.b), (*sums).blue);
+    if DEPTH {
+        (*sums).depth = fma(weight, vec4f(color_depth.w), (*sums).depth);
     }
-    if upper && right {
-        atomicOr(&block_splats[BATCH_WORDS + word], bit);
+    note_owner(list_index, (*sums).transmittance, after, counts);
+    (*sums).transmittance = select((*sums).transmittance, after, counts);
+    *running = after;
+    return !any(counts);
+}
+
+// Blocks of a tile that the box of a splat reaches, a bit each, row by row, by the test with which `bin.wgsl`
+// finds its tiles. `corner` is the first pixel of the tile.
+fn blocks_of(shape: SplatShape, corner: vec2u) -> u32 {
+    let size = f32(TILE_PX);
+    let first_px = ceil(shape.mean_px - shape.extent_px - 0.5) - vec2f(corner);
+    let last_px = floor(shape.mean_px + shape.extent_px - 0.5) - vec2f(corner);
+    let first = clamp(first_px, vec2f(0.0), vec2f(size));
+    let last = clamp(last_px, vec2f(-1.0), vec2f(size - 1.0));
+    if any(first > last) {
+        return 0u;
     }
-    if lower && left {
-        atomicOr(&block_splats[2u * BATCH_WORDS + word], bit);
-    }
-    if lower && right {
-        atomicOr(&block_splats[3u * BATCH_WORDS + word], bit);
-    }
+    let low = vec2u(first) / BLOCK_PX;
+    let high = vec2u(last) / BLOCK_PX;
+    // A bit per column in each row, and the first bit of each row that is reached.
+    let columns = (2u << high.x) - (1u << low.x);
+    let rows = ((16u << (4u * high.y)) - (1u << (4u * low.y))) & 0x1111u;
+    return columns * rows;
 }
 
 // Index of the view that a tile belongs to.

@@ -69,7 +69,7 @@ fn a_wrong_device_fails() {
         ),
         ("bin", "i - prefix_before(band_index)", "i"),
         ("expand", "next += countOneBits", "next = first + countOneBits"),
-        ("rasterize", "sums.green = fma(weight", "sums.green = fma(1.02 * weight"),
+        ("rasterize", "(*sums).green = fma(weight", "(*sums).green = fma(1.02 * weight"),
     ] {
         let broken = gpu_with(Shaders::default().with_mutation(stage, part, mutation).unwrap());
         let result = self_test(&*broken, &cpu());

@@ -96,10 +96,10 @@ fn three_at_once() {
     let [(before, _), .., (after, _)] = rounds;
     assert!(after <= before + GROWTH_OF_THREADS_BYTES, "{before} B grew to {after} B");
     // The order of the threads decides which scenes share a page, and buffers keep the largest size that
-    // this needed: a later round may need a larger one. A leak would grow in every round.
+    // this needed: a later round may need more or less. A leak would grow in every round.
     let device = rounds.map(|(_, device_bytes)| device_bytes);
     assert!(
-        device.windows(2).any(|two| two[0] == two[1]),
+        device.windows(2).any(|two| two[1] <= two[0]),
         "bytes of the device by round: {device:?}"
     );
 }

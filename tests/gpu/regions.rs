@@ -166,7 +166,7 @@ fn more_splats_in_a_tile_than_software_blends() {
     let target = Target { rgb8: Some(&mut image), ..Target::default() };
     let frame = Frame { scene: &scene, profile: &profile, views: &[view] };
     match gpu().render(&frame, &mut [target], &|_, _| {}) {
-        Err(RenderError::TooMany { limit: 58_112, .. }) => {}
+        Err(RenderError::TooMany { limit: 53_632, .. }) => {}
         drawn => {
             drawn.unwrap();
             let image = render_one(&gpu(), &scene, &profile, view);

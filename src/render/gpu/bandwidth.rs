@@ -35,7 +35,7 @@ pub struct FrameCounts {
     pub touches: u64,
     /// (Splat, tile) pairs.
     pub instances: u64,
-    /// Pairs of a splat and a block of 8 x 8 px of a tile that were blended.
+    /// Pairs of a splat and a block of 4 x 4 px of a tile that were blended.
     pub block_pairs: u64,
 }
 

@@ -37,11 +37,12 @@ pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
-/// Side of the blocks of a tile that blend only the splats which reach them.
-pub const BLOCK_PX: u32 = 8;
-/// Loop iterations of a thread of `rasterize` for each batch, beside those for the splats of its block, with one for the end of
-/// each loop: 1 for the batch, 3 to load two splats, 5 for the four words of its list, 4 for their ends, and 3 to spare.
-pub const BATCH_ITERATIONS: u32 = 16;
+/// Side of the blocks of a tile: four threads of four pixels blend only the splats that reach theirs.
+pub const BLOCK_PX: u32 = 4;
+/// Loop iterations of a thread of `rasterize` for each batch, beside one for each splat of its block. The end of a loop
+/// counts as one, too: 1 for the batch, 3 to load two splats, 11 to transpose a word, 5 for the words of its list, 4 for
+/// their ends, and 4 to spare.
+pub const BATCH_ITERATIONS: u32 = 28;
 /// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
 /// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
 pub const SOA_BLOCK: u32 = 32;
@@ -405,7 +406,7 @@ pub struct Counters {
     pub touches: u32,
     /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,
-    /// Pairs of a splat and a block of 8 x 8 px of a tile that were blended.
+    /// Pairs of a splat and a block of [`BLOCK_PX`] that were blended.
     pub block_pairs: u32,
     /// Most loop iterations of a thread of `rasterize` before the background: one for each pair of its block, and
     /// [`BATCH_ITERATIONS`] for each batch.
