@@ -20,9 +20,9 @@ fn apply_appearance(gathered: Sums, view: u32, at_px: vec2f) -> Sums {
         for (var k = 0u; k < 4u && at.x + k < appearance.overlay_px.x; k++) {
             let index = appearance.first_overlay + at.y * appearance.overlay_px.x + at.x + k;
             let over = unpack4x8unorm(overlays[index]);
-            sums.red[k] = mix(sums.red[k], over.r, over.a);
-            sums.green[k] = mix(sums.green[k], over.g, over.a);
-            sums.blue[k] = mix(sums.blue[k], over.b, over.a);
+            sums.red[k] = fma(over.a, over.r - sums.red[k], sums.red[k]);
+            sums.green[k] = fma(over.a, over.g - sums.green[k], sums.green[k]);
+            sums.blue[k] = fma(over.a, over.b - sums.blue[k], sums.blue[k]);
         }
     }
     return sums;
@@ -30,5 +30,6 @@ fn apply_appearance(gathered: Sums, view: u32, at_px: vec2f) -> Sums {
 
 // One row of the exposure's matrix, applied to four pixels.
 fn expose(row: vec4f, sums: Sums) -> vec4f {
-    return row.x * sums.red + (row.y * sums.green + (row.z * sums.blue + row.w));
+    let blue = fma(vec4f(row.z), sums.blue, vec4f(row.w));
+    return fma(vec4f(row.x), sums.red, fma(vec4f(row.y), sums.green, blue));
 }

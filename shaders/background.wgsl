@@ -27,10 +27,15 @@ fn pinhole_rays(view: u32, at_px: vec2f) -> Rays {
     let x = at_px.x + vec4f(0.0, 1.0, 2.0, 3.0);
     let rows = background.sky_from_pixel[view];
     return Rays(
-        rows[0].x * x + (rows[0].y * at_px.y + rows[0].z),
-        rows[1].x * x + (rows[1].y * at_px.y + rows[1].z),
-        rows[2].x * x + (rows[2].y * at_px.y + rows[2].z),
+        along_row(rows[0], x, at_px.y),
+        along_row(rows[1], x, at_px.y),
+        along_row(rows[2], x, at_px.y),
     );
+}
+
+// One coordinate of the directions at four places of a row of pixels.
+fn along_row(row: vec4f, x: vec4f, y: f32) -> vec4f {
+    return fma(vec4f(row.x), x, vec4f(fma(row.y, y, row.z)));
 }
 
 // Four directions, not normalised.

@@ -2,9 +2,9 @@
 // of depth. One workgroup per batch of 1,024 touches of a macro tile: a few macro tiles, where a road
 // meets the horizon, have most of the touches, and one workgroup for each would work long after all others.
 //
-// `batches` counts the batches of each macro tile. `count` counts the touches of each tile in each batch;
-// a prefix sum over the counts of all batches, tile after tile within a macro tile, gives each tile's part
-// of each batch its place. `list` fills the lists: the bit matrix of a batch is transposed from "tiles of a
+// `batches` counts the batches of each macro tile. `count` counts the touches of each tile in each batch; a
+// prefix sum over these counts, in order of macro tile, tile, and batch, gives the index of the first
+// instance of each tile in each batch. `list` fills the lists: the bit matrix of a batch is transposed from "tiles of a
 // splat" to "splats of a tile".
 
 #import constants
@@ -22,7 +22,7 @@ const BATCH_WORDS: u32 = EXPAND_BATCH / 32;
 @group(0) @binding(5) var<storage, read_write> offsets: array<u32>;
 @group(0) @binding(6) var<storage, read> batches_job: Job;
 @group(0) @binding(7) var<storage, read> instances_job: Job;
-@group(0) @binding(8) var<storage, read_write> ranges: array<vec2u>;
+@group(0) @binding(8) var<storage, read_write> ranges: array<u32>;
 @group(0) @binding(9) var<storage, read_write> instance_splats: array<u32>;
 
 @compute @workgroup_size(WORKGROUP)
@@ -147,10 +147,10 @@ fn list(
         }
         let tile = tile_at(own.macro_tile, thread);
         if tile < frame.tiles && own.is_first {
-            ranges[tile].x = first;
+            ranges[2u * tile] = first;
         }
         if tile < frame.tiles && own.is_last {
-            ranges[tile].y = next;
+            ranges[2u * tile + 1u] = next;
         }
     }
     workgroupBarrier();

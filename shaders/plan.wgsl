@@ -52,7 +52,8 @@ fn touches() {
     jobs[TOUCHES_DIGITS].job = job(DIGITS * div_ceil(length, SORT_BLOCK), SCAN_BLOCK);
 }
 
-// Runs after the prefix sum over the batches of all macro tiles.
+// Runs after the prefix sum over the batches of all macro tiles. `Bin::reserve` makes room for the most that the
+// touches can form.
 @compute @workgroup_size(1)
 fn batches() {
     let total = block_sums[div_ceil(jobs[MACRO_TILES].job.length, SCAN_BLOCK)];

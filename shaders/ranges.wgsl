@@ -8,7 +8,7 @@
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> job: Job;
 @group(0) @binding(2) var<storage, read> touch_macro_tiles: array<u32>;
-@group(0) @binding(3) var<storage, read_write> ranges: array<vec2u>;
+@group(0) @binding(3) var<storage, read_write> ranges: array<u32>;
 
 @compute @workgroup_size(WORKGROUP)
 fn main(
@@ -26,9 +26,9 @@ fn main(
         return;
     }
     if i == 0u || touch_macro_tiles[i - 1u] != own {
-        ranges[own].x = i;
+        ranges[2u * own] = i;
     }
     if i + 1u == job.length || touch_macro_tiles[i + 1u] != own {
-        ranges[own].y = i + 1u;
+        ranges[2u * own + 1u] = i + 1u;
     }
 }

@@ -44,12 +44,13 @@ var<workgroup> mean_factors: array<vec4f, RASTER_BATCH + 1>;
 var<workgroup> opacities: array<vec2f, RASTER_BATCH + 1>;
 // Colour, and depth in metres.
 var<workgroup> color_depths: array<vec4f, RASTER_BATCH + 1>;
-// For each splat of the batch, one bit per block that its box reaches; four splats together.
-var<workgroup> splat_blocks: array<vec4u, RASTER_BATCH / 4>;
+// For each two splats of the batch, one bit per block that the box of the first reaches, then one per block
+// that the box of the second reaches.
+var<workgroup> pair_blocks: array<u32, RASTER_BATCH / 2>;
 // For each block, one bit per splat of the batch. Block after block.
 var<workgroup> block_splats: array<u32, BLOCKS * BATCH_WORDS>;
-// For each block, the number of its set bits in all batches.
-var<workgroup> block_pairs: array<atomic<u32>, BLOCKS>;
+// Number of set bits in all batches.
+var<workgroup> block_pairs: atomic<u32>;
 var<workgroup> done_count: atomic<u32>;
 var<workgroup> done_threads: u32;
 
@@ -74,12 +75,10 @@ fn main(
 
     if thread == 0u {
         atomicStore(&done_count, 0u);
+        atomicStore(&block_pairs, 0u);
         mean_factors[NO_SPLAT] = vec4f(0.0);
         opacities[NO_SPLAT] = vec2f(0.0, -1e30);
         color_depths[NO_SPLAT] = vec4f(0.0);
-    }
-    if thread < BLOCKS {
-        atomicStore(&block_pairs[thread], 0u);
     }
     workgroupBarrier();
     var sums = Sums(vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(0.0), vec4f(1.0));
@@ -103,11 +102,16 @@ fn main(
         if workgroupUniformLoad(&done_threads) == THREADS {
             break;
         }
-        // Load a batch. What follows its last splat reaches no block.
+        // More than a software device can blend: the host refuses the frame.
         batches++;
+        if batches > frame.batch_limit {
+            break;
+        }
+        // Load a batch, two splats by each thread. Places after the last splat reach no block.
         let count = min(range.y - first, RASTER_BATCH);
-        for (var k = thread; k < RASTER_BATCH; k += THREADS) {
-            var blocks = 0u;
+        var blocks = 0u;
+        for (var i = 0u; i < 2u; i++) {
+            let k = 2u * thread + i;
             if k < count {
                 let splat = instance_splats[first + k];
                 let shape = shapes[splat];
@@ -115,32 +119,29 @@ fn main(
                 mean_factors[k] = vec4f(shape.mean_px, shape.factor.xy);
                 opacities[k] = vec2f(shape.factor.z, shape.log2_opacity);
                 color_depths[k] = vec4f(color.rgb, color.depth_m);
-                blocks = blocks_of(shape, corner);
+                blocks |= blocks_of(shape, corner) << (i * BLOCKS);
             }
-            splat_blocks[k / 4u][k % 4u] = blocks;
         }
+        pair_blocks[thread] = blocks;
         workgroupBarrier();
-        // Transpose: from one word of blocks per splat to words of splats per block.
-        for (var k = thread; k < BLOCKS * BATCH_WORDS; k += THREADS) {
-            let word = k / BLOCKS;
-            var bits = 0u;
-            for (var four = 0u; four < 8u; four++) {
-                let reached = (splat_blocks[word * 8u + four] >> vec4u(k % BLOCKS)) & vec4u(1u);
-                let nibble = reached.x | (reached.y << 1u) | (reached.z << 2u) | (reached.w << 3u);
-                bits |= nibble << (4u * four);
-            }
-            block_splats[k % BLOCKS * BATCH_WORDS + word] = bits;
-            pairs += countOneBits(bits);
+        // Transpose: from bits of blocks per splat to words of splats per block, one by each thread.
+        let word = thread / BLOCKS;
+        var bits = 0u;
+        for (var i = 0u; i < 16u; i++) {
+            let two = pair_blocks[16u * word + i] >> (thread % BLOCKS);
+            bits |= ((two & 1u) | ((two >> BLOCKS) & 1u) << 1u) << (2u * i);
         }
+        block_splats[thread % BLOCKS * BATCH_WORDS + word] = bits;
+        pairs += countOneBits(bits);
         workgroupBarrier();
         // Blend it.
         let was_done = done;
-        for (var word = 0u; word < BATCH_WORDS && !done; word++) {
-            var rest = block_splats[block * BATCH_WORDS + word];
+        for (var k = 0u; k < BATCH_WORDS && !done; k++) {
+            var rest = block_splats[block * BATCH_WORDS + k];
             while rest != 0u && !done {
-                let a = word * 32u + firstTrailingBit(rest);
+                let a = k * 32u + firstTrailingBit(rest);
                 rest &= rest - 1u;
-                let b = select(NO_SPLAT, word * 32u + firstTrailingBit(rest), rest != 0u);
+                let b = select(NO_SPLAT, k * 32u + firstTrailingBit(rest), rest != 0u);
                 rest &= rest - 1u;
                 let exponent_a = exponents(a, at_px);
                 let exponent_b = exponents(b, at_px);
@@ -149,7 +150,7 @@ fn main(
                 if any(touched_a | touched_b) {
                     let alpha_a = select(vec4f(0.0), alphas(exponent_a), touched_a);
                     let alpha_b = select(vec4f(0.0), alphas(exponent_b), touched_b);
-                    // In order of depth. A pixel that has stopped stays so, so that the second one decides.
+                    // In order of depth. A stopped pixel stays stopped, so the result of the second call covers both.
                     blend(&sums, &running, alpha_a, color_depths[a], first + a);
                     done = blend(&sums, &running, alpha_b, color_depths[b], first + b);
                 }
@@ -159,18 +160,11 @@ fn main(
             atomicAdd(&done_count, 1u);
         }
     }
-    atomicAdd(&block_pairs[thread % BLOCKS], pairs);
+    atomicAdd(&block_pairs, pairs);
     workgroupBarrier();
     if thread == 0u {
-        var all = 0u;
-        var most = 0u;
-        for (var k = 0u; k < BLOCKS; k++) {
-            let own = atomicLoad(&block_pairs[k]);
-            all += own;
-            most = max(most, own);
-        }
-        atomicAdd(&counters.block_pairs, all);
-        atomicMax(&counters.most_iterations, batches * BATCH_ITERATIONS + most);
+        atomicAdd(&counters.block_pairs, atomicLoad(&block_pairs));
+        atomicMax(&counters.most_batches, batches);
     }
     sums = composite(sums, view_index, at_px, thread);
     resolve(index, first_pixel.y * TILE_PX + first_pixel.x, sums);

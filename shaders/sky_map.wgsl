@@ -32,23 +32,29 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     let down = select(select(-rays.y, select(-rays.z, rays.z, north), is_y), -rays.y, is_x);
     let ahead = select(select(az, ay, is_y), ax, is_x);
     let half = 0.5 * background.scale;
-    let u = right / ahead * half + (half + background.offset);
-    let v = down / ahead * half + (half + background.offset);
+    let middle = vec4f(half + background.offset);
+    let u = fma(right / ahead, vec4f(half), middle);
+    let v = fma(down / ahead, vec4f(half), middle);
     let last = vec4f(f32(background.edge - 2u));
     let column = clamp(floor(u), zero, last);
     let row = clamp(floor(v), zero, last);
     let index = (face * background.edge + vec4u(row)) * background.edge + vec4u(column);
     var rgb = array<vec4f, 3>(zero, zero, zero);
     for (var k = 0u; k < 4u; k++) {
-        let upper = mix(texel(index[k]), texel(index[k] + 1u), u[k] - column[k]);
+        let upper = between(texel(index[k]), texel(index[k] + 1u), u[k] - column[k]);
         let below = index[k] + background.edge;
-        let lower = mix(texel(below), texel(below + 1u), u[k] - column[k]);
-        let colour = mix(upper, lower, v[k] - row[k]);
+        let lower = between(texel(below), texel(below + 1u), u[k] - column[k]);
+        let colour = between(upper, lower, v[k] - row[k]);
         rgb[0][k] = colour.r;
         rgb[1][k] = colour.g;
         rgb[2][k] = colour.b;
     }
     return rgb;
+}
+
+// Linear interpolation.
+fn between(a: vec3f, b: vec3f, part: f32) -> vec3f {
+    return fma(vec3f(part), b - a, a);
 }
 
 fn texel(index: u32) -> vec3f {

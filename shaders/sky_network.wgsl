@@ -34,7 +34,7 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
             is_wanted = u32(wanted);
             if wanted {
                 let rays = sky_rays(view, at_px);
-                let scale = inverseSqrt(rays.x * rays.x + rays.y * rays.y + rays.z * rays.z);
+                let scale = inverseSqrt(fma(rays.x, rays.x, fma(rays.y, rays.y, rays.z * rays.z)));
                 directions = array<vec4f, 3>(rays.x * scale, rays.y * scale, rays.z * scale);
             }
         }
@@ -91,8 +91,10 @@ fn output(at: u32, source: u32, inputs: u32, own: u32) -> vec4f {
     for (var input = 0u; input < inputs; input += 4u) {
         let weight = weights[row + 1u + input / 4u];
         let index = source + input;
-        sum += weight.x * values[index] + weight.y * values[index + 1u];
-        sum += weight.z * values[index + 2u] + weight.w * values[index + 3u];
+        sum = fma(vec4f(weight.x), values[index], sum);
+        sum = fma(vec4f(weight.y), values[index + 1u], sum);
+        sum = fma(vec4f(weight.z), values[index + 2u], sum);
+        sum = fma(vec4f(weight.w), values[index + 3u], sum);
     }
     return sum;
 }

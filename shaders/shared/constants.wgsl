@@ -29,4 +29,3 @@ const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 const EXPAND_BATCH: u32 = 1024;
 const RASTER_BATCH: u32 = 128;
 const BLOCK_PX: u32 = 4;
-const BATCH_ITERATIONS: u32 = 28;

@@ -25,6 +25,10 @@ struct Frame {
     alpha_cap: f32,
     log2_alpha_cut: f32,
     stop: f32,
+    batch_limit: u32,
+    pad0: u32,
+    pad1: u32,
+    pad2: u32,
     view: array<FrameView, MAX_VIEWS>,
 }
 
@@ -128,7 +132,7 @@ struct Counters {
     touches: u32,
     instances: u32,
     block_pairs: atomic<u32>,
-    most_iterations: atomic<u32>,
+    most_batches: atomic<u32>,
 }
 
 struct SplatShape {

@@ -1,5 +1,11 @@
 //! Limits and defaults of the command line, with the arithmetic behind each.
 
+use std::time::Duration;
+
+/// How long a program whose server has stopped waits for its tasks. The last of them drops the backend, and a
+/// GPU's driver crashes if the process exits meanwhile.
+pub(super) const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
+
 /// URL of the server, unless the user gives another one.
 pub(super) const SERVER_URL: &str = "http://127.0.0.1:8080";
 

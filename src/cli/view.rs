@@ -67,7 +67,7 @@ pub(super) fn serve(config: Config, twin: Option<&str>, open: bool) -> anyhow::R
         running.stop().await;
         Ok(())
     });
-    runtime.shutdown_background();
+    runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
     served
 }
 

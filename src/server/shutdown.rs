@@ -16,7 +16,7 @@ use crate::reload::reload;
 use crate::state::ServerState;
 use crate::tls::Tls;
 
-/// A server that listens. Dropping it stops it without waiting.
+/// A server that listens. Dropping it stops it without waiting, but for frames that are being rendered.
 pub struct Running {
     state: Arc<ServerState>,
     address: SocketAddr,

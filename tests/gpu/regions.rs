@@ -150,27 +150,36 @@ fn exceeds_lavapipe(scene: &Scene, view: View) {
 /// refused, not drawn without them.
 #[test]
 fn more_splats_in_a_tile_than_software_blends() {
-    let mut fog = Gaussians::with_capacity(0, 70_000);
-    for i in 0..70_000 {
-        fog.means_m.push([0.0, 0.0, 5.0 + 1e-4 * f64::from(i)]);
-        fog.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
-        fog.ln_scales.push([0.0; 3]);
-        // Alpha is 2^-8, above the cut of 1/255; 70,000 times four in a thousand is opaque by far.
-        fog.logit_opacities.push(-5.53);
-        fog.sh.extend([0.5; 3]);
-    }
-    let scene = Scene::from_gaussians(&fog);
     let view = view_along([16, 16], 4.0, DVec3::ZERO, DVec3::Z, DVec3::Y);
     let profile = RenderProfile { stop: 1e-300, ..RenderProfile::default() };
-    let mut image = vec![77; 3 * 256];
-    let target = Target { rgb8: Some(&mut image), ..Target::default() };
-    let frame = Frame { scene: &scene, profile: &profile, views: &[view] };
-    match gpu().render(&frame, &mut [target], &|_, _| {}) {
-        Err(RenderError::TooMany { limit: 53_632, .. }) => {}
-        drawn => {
-            drawn.unwrap();
-            let image = render_one(&gpu(), &scene, &profile, view);
-            agree(&image, &render_one(&cpu(), &scene, &profile, view)).unwrap();
+    for (count, is_refused) in [(83_000, false), (120_000, true)] {
+        // All of them in the third block of 4 x 4 px of the second row: it has every splat of every batch.
+        let mut dust = Gaussians::with_capacity(0, count);
+        for i in 0..count {
+            let depth_m = 5.0 + 1e-5 * i as f64;
+            let at = |px: usize| (px as f64 - 7.5) / 4.0 * depth_m;
+            dust.means_m.push([at(8 + i % 4), at(4 + i / 4 % 4), depth_m]);
+            dust.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            dust.ln_scales.push([-3.0; 3]);
+            // Alpha is 1/200, above the cut of 1/255: a pixel keeps 1e-12 after 5,000 of them.
+            dust.logit_opacities.push(-4.6);
+            dust.sh.extend([0.5; 3]);
+        }
+        let scene = Scene::from_gaussians(&dust);
+        let backend = gpu();
+        let mut image = vec![77; 3 * 256];
+        let target = Target { rgb8: Some(&mut image), ..Target::default() };
+        let frame = Frame { scene: &scene, profile: &profile, views: &[view] };
+        match backend.render(&frame, &mut [target], &|_, _| {}) {
+            Err(RenderError::TooMany { limit, .. }) => {
+                assert!(is_refused && limit >= 83_000, "{count}: at most {limit}");
+            }
+            drawn => {
+                drawn.unwrap();
+                assert!(!is_refused || !backend.detail().contains("llvmpipe"), "{count} are drawn");
+                let image = render_one(&backend, &scene, &profile, view);
+                agree(&image, &render_one(&cpu(), &scene, &profile, view)).unwrap();
+            }
         }
     }
 }

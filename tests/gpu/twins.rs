@@ -24,6 +24,7 @@ fn shared() -> Module {
 fn constants_are_the_same() {
     let rust = BTreeMap::from([
         ("TILE_PX", Literal::U32(constants::TILE_PX)),
+        ("BLOCK_PX", Literal::U32(constants::BLOCK_PX)),
         ("EXTENT_SLACK_PX", Literal::F32(constants::EXTENT_SLACK_PX)),
         ("MAX_SIGMA_PX", Literal::F32(constants::MAX_SIGMA_PX)),
         ("DEPTH_BITS", Literal::U32(constants::DEPTH_BITS)),
@@ -43,8 +44,6 @@ fn constants_are_the_same() {
         ("DIGITS", Literal::U32(layout::DIGITS)),
         ("MAX_GROUPS", Literal::U32(layout::MAX_GROUPS)),
         ("RASTER_BATCH", Literal::U32(layout::RASTER_BATCH)),
-        ("BLOCK_PX", Literal::U32(layout::BLOCK_PX)),
-        ("BATCH_ITERATIONS", Literal::U32(layout::BATCH_ITERATIONS)),
         ("MACRO_COLUMNS", Literal::U32(layout::MACRO_COLUMNS)),
         ("MACRO_ROWS", Literal::U32(layout::MACRO_ROWS)),
         ("LARGE_SPLAT_MACRO_TILES", Literal::U32(layout::LARGE_SPLAT_MACRO_TILES)),
@@ -87,7 +86,7 @@ fn layouts_are_the_same() {
         }
         Frame {
             splat_capacity, touch_capacity, instance_capacity, views, tiles, macro_tiles, near_m, far_m,
-            antialiased, alpha_cap, log2_alpha_cut, stop, view,
+            antialiased, alpha_cap, log2_alpha_cut, stop, batch_limit, pad0, pad1, pad2, view,
         }
         Background {
             scale, offset, edge, width, octaves, encoded, identity, skip, sky_from_pixel,
@@ -108,7 +107,7 @@ fn layouts_are_the_same() {
         Span { first, count }
         Job { length, groups }
         JobSlot { job, pad }
-        Counters { splats, touches, instances, block_pairs, most_iterations }
+        Counters { splats, touches, instances, block_pairs, most_batches }
         SplatShape { mean_px, extent_px, factor, log2_opacity }
         SplatColor { rgb, depth_m }
     };

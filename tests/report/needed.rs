@@ -22,7 +22,7 @@ use crate::streets::street;
 
 /// Pipelines that the base scene compiles, and dispatches of a step. One more would be one that it does not
 /// need.
-const BASE: [u64; 2] = [26, 45];
+const BASE: [u64; 2] = [28, 50];
 
 #[test]
 fn a_report_has_the_device_memory_of_each_setting() {

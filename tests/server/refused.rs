@@ -359,7 +359,7 @@ async fn a_frame_with_too_much_to_draw_is_refused() {
 
 #[tokio::test]
 async fn pings_are_answered_and_count_as_life() {
-    // Longer than a busy machine keeps this test waiting between two pings.
+    // A busy machine may delay a ping by a second.
     let idle = Duration::from_secs(2);
     let server = TestServer::with(Limits { idle, ..Limits::default() }).await;
     let mut agent = server.driver("a").await;

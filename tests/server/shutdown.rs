@@ -55,6 +55,7 @@ fn the_backend_is_dropped_before_the_program_ends() {
         server.running.stop().await;
         server.painter
     });
-    drop(runtime);
+    // As the program does.
+    runtime.shutdown_timeout(Duration::from_secs(5));
     assert_eq!(Arc::strong_count(&painter), 1);
 }

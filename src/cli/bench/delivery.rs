@@ -77,7 +77,7 @@ impl Delivery {
             running.stop().await;
             costs
         });
-        runtime.shutdown_background();
+        runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
         print(&mut io::stdout().lock(), &costs?)?;
         Ok(())
     }

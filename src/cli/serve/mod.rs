@@ -256,8 +256,8 @@ impl Serve {
             running.stop().await;
             Ok(())
         });
-        // A push that still writes is abandoned: a commit that is killed at any point leaves nothing.
-        runtime.shutdown_background();
+        // A push that writes for longer is abandoned: a commit that is killed at any point leaves nothing.
+        runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
         served
     }
 }

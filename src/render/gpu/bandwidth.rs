@@ -2,13 +2,13 @@
 //! the memory side of the stage's roofline.
 
 use super::layout::{
-    BLOCK_PX, Counters, DIGITS, EXPAND_BATCH, Frame as GpuFrame, GEOMETRY_WORDS, MACRO_COLUMNS,
-    MACRO_ROWS, SOA_BLOCK, SORT_BLOCK,
+    Counters, DIGITS, EXPAND_BATCH, Frame as GpuFrame, GEOMETRY_WORDS, MACRO_COLUMNS, MACRO_ROWS,
+    SOA_BLOCK, SORT_BLOCK,
 };
 use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
 use crate::Frame;
-use crate::constants::{DEPTH_BITS, TILE_PX};
+use crate::constants::{BLOCK_PX, DEPTH_BITS, TILE_PX};
 use wildcity_scene::chunk::CLUSTER;
 use wildcity_scene::sh;
 
@@ -35,7 +35,7 @@ pub struct FrameCounts {
     pub touches: u64,
     /// (Splat, tile) pairs.
     pub instances: u64,
-    /// Pairs of a splat and a block of 4 x 4 px of a tile that were blended.
+    /// Pairs of a splat and a block of 4 x 4 px that its box reaches, in all loaded batches.
     pub block_pairs: u64,
 }
 
@@ -76,7 +76,8 @@ impl FrameCounts {
     /// | expand | touch | macro tile 4, mask 8, splat 4 |
     /// | | instance | splat 4 |
     /// | | tile of a batch of touches | offset and its prefix sum 20 |
-    /// | | tile, macro tile | range 8, written once; a macro tile's is read three times |
+    /// | | tile | range 8 |
+    /// | | macro tile | range 8, written once and read three times; number of batches, its prefix sum, and two reads of it 24 |
     /// | rasterize | visible pair | shape and colour 48, once: neighbouring tiles find them in the cache |
     /// | | instance, tile, pixel | splat 4; range 8; 4 for each requested value |
     pub fn stage_bytes(&self) -> [(&'static str, u64); 6] {
@@ -93,7 +94,7 @@ impl FrameCounts {
             u64::from(bits.div_ceil(DIGIT_BITS)) * pass
         };
         let scanned = 4 + 12 + 4;
-        let batches = touches.div_ceil(EXPAND_BATCH.into()).max(macro_tiles);
+        let batches = touches.div_ceil(EXPAND_BATCH.into());
         let batch_tiles = batches * u64::from(MACRO_COLUMNS * MACRO_ROWS);
         let bits = |number: u64| u64::BITS - number.leading_zeros();
         let depth_bits = DEPTH_BITS + bits(u64::from(self.views.max(1) - 1));
@@ -108,22 +109,22 @@ impl FrameCounts {
             ("tile sort", sorted(touches, bits(macro_tiles), 2)),
             (
                 "expand",
-                touches * 16 + instances * 4 + batch_tiles * scanned + tiles * 8 + macro_tiles * 32,
+                touches * 16 + instances * 4 + batch_tiles * scanned + tiles * 8 + macro_tiles * 56,
             ),
             ("rasterize", splats * 48 + instances * 4 + tiles * 8 + self.pixels * 4 * self.planes),
         ]
     }
 
     /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels that have stopped
-    /// are counted too.
+    /// count too.
     pub fn evaluations(&self) -> u64 {
         self.block_pairs * u64::from(BLOCK_PX * BLOCK_PX)
     }
 
-    /// Fewest multiply-adds, or instructions of the same cost, of stage rasterize: five for each evaluation, for
-    /// `d`, `u` (two), the exponent, and its comparison. Pixels that a splat touches take ten more; these are not
-    /// counted.
+    /// About how many multiply-adds, or instructions of the same cost, stage rasterize takes: 18 for four evaluations,
+    /// of which six are shared by the four pixels. Pixels that a splat touches take ten more each, and pixels that have
+    /// stopped take none; neither is considered.
     pub fn rasterize_operations(&self) -> u64 {
-        5 * self.evaluations()
+        self.evaluations() * 9 / 2
     }
 }

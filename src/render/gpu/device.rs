@@ -5,7 +5,7 @@
 //!
 //! The backend is tested on Mesa's software device, lavapipe. Such devices leave a shader's loops,
 //! without an error, after 65,535 iterations of all of its loops together. The limits
-//! [`Device::max_tile_iterations`] and [`Device::max_view_tiles`] keep each shader below that number: frames are
+//! [`Device::max_tile_batches`] and [`Device::max_view_tiles`] keep each shader below that number: frames are
 //! split into more regions, or refused. Other devices have no such limit.
 
 use std::ops::RangeInclusive;
@@ -312,11 +312,15 @@ impl Device {
         self.device.generate_allocator_report().map(|report| report.total_allocated_bytes)
     }
 
-    /// Most loop iterations of a thread of `rasterize` for the splats of its tile, if the background takes
-    /// `background_iterations`. A thread finds its view among 16, and sums four blocks: 32 iterations with some to spare.
-    pub(super) fn max_tile_iterations(&self, background_iterations: u64) -> u64 {
-        let left = |most: u64| most.saturating_sub(background_iterations + 32);
-        self.loop_iterations().map_or(u64::MAX, left)
+    /// Most batches of splats that a tile can blend, if the background takes `background_iterations` loop iterations of a
+    /// thread of `rasterize`.
+    ///
+    /// The end of a loop counts as an iteration, too. A batch takes at most 96: 1, 3 to load two splats, 17 to
+    /// transpose a word, 5 for four words, and 17 for the 32 splats of each, two at a time. Beside them a thread finds
+    /// its view among 16, and the owners of four pixels by binary search: 160 are enough for 2^32 owners.
+    pub(super) fn max_tile_batches(&self, background_iterations: u64) -> u32 {
+        let batches = |most: u64| most.saturating_sub(160 + background_iterations) / 96;
+        self.loop_iterations().map_or(u32::MAX, |most| batches(most) as u32)
     }
 
     /// Most tiles of a view that can be binned at once, even if all 256 splats of a workgroup of `emit`

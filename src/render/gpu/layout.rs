@@ -37,12 +37,6 @@ pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
 pub const EXPAND_BATCH: u32 = 1024;
 /// Splats that a tile loads into workgroup memory and blends at a time.
 pub const RASTER_BATCH: u32 = 128;
-/// Side of the blocks of a tile: four threads of four pixels blend only the splats that reach theirs.
-pub const BLOCK_PX: u32 = 4;
-/// Loop iterations of a thread of `rasterize` for each batch, beside one for each splat of its block. The end of a loop
-/// counts as one, too: 1 for the batch, 3 to load two splats, 11 to transpose a word, 5 for the words of its list, 4 for
-/// their ends, and 4 to spare.
-pub const BATCH_ITERATIONS: u32 = 28;
 /// Gaussians of a structure-of-arrays block of the mirror, and 32-bit words of one of its lines: 128 B,
 /// which a warp reads in one transaction. A cluster's header is one line, of which three words are used.
 pub const SOA_BLOCK: u32 = 32;
@@ -73,7 +67,7 @@ pub struct FrameView {
     pub total_px2: [f32; 2],
 }
 
-/// Parameters of a frame that all stages read (816 bytes).
+/// Parameters of a frame that all stages read (832 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Frame {
@@ -101,6 +95,14 @@ pub struct Frame {
     pub log2_alpha_cut: f32,
     /// Transmittance at which a pixel stops.
     pub stop: f32,
+    /// Most batches of [`RASTER_BATCH`] splats that a tile blends.
+    pub batch_limit: u32,
+    /// Zero.
+    pub pad0: u32,
+    /// Zero.
+    pub pad1: u32,
+    /// Zero.
+    pub pad2: u32,
     /// The views, in order.
     pub view: [FrameView; MAX_VIEWS],
 }
@@ -406,11 +408,11 @@ pub struct Counters {
     pub touches: u32,
     /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,
-    /// Pairs of a splat and a block of [`BLOCK_PX`] that were blended.
+    /// Pairs of a splat and a block of [`constants::BLOCK_PX`] that its box reaches, in all loaded batches. Blocks that have
+    /// stopped count too.
     pub block_pairs: u32,
-    /// Most loop iterations of a thread of `rasterize` before the background: one for each pair of its block, and
-    /// [`BATCH_ITERATIONS`] for each batch.
-    pub most_iterations: u32,
+    /// Most batches of [`RASTER_BATCH`] splats of one tile; above [`Frame::batch_limit`] if a tile has more.
+    pub most_batches: u32,
 }
 
 /// Shape of a splat (32 bytes): [`crate::layout::Splat`] without its colour.

@@ -45,7 +45,7 @@ pub(super) struct Gpu {
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Frames to time, after two or a second that are not timed.
+    /// Frames to time. Before them come at least two frames, and one second of frames, that are not timed.
     #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 
@@ -66,7 +66,7 @@ Examples:
 
 /// Frames before those that are timed: the first one uploads the scene and allocates buffers.
 const WARM_UP: u32 = 2;
-/// They take at least this long: a graphics card that was idle needs hundreds of milliseconds to raise its clock.
+/// The frames before take at least this long: a graphics card that was idle needs hundreds of milliseconds to raise its clock.
 const WARM_UP_TIME: Duration = Duration::from_secs(1);
 
 impl Gpu {

@@ -116,7 +116,7 @@ impl Soak {
             running.stop().await;
             result
         });
-        runtime.shutdown_background();
+        runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
         result
     }
 

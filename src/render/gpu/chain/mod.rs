@@ -18,7 +18,7 @@ use super::bin::{Bin, BinCapacity, BinSizes};
 use super::device::Device;
 use super::growable_buffer::GrowableBuffer;
 use super::kernel::{TIMESTAMP_BYTES, timestamps};
-use super::layout::{BATCH_ITERATIONS, BLOCK_PX, Counters, Frame as GpuFrame, RASTER_BATCH};
+use super::layout::{Counters, Frame as GpuFrame, RASTER_BATCH};
 use super::lens::Lenses;
 use super::mirror::Mirror;
 use super::partition::{Capacity, PartitionCache, PartitionKey, Region, TileRows};
@@ -30,6 +30,7 @@ use super::resolve::{Outputs, Planes};
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::actor_views::ActorViews;
+use crate::constants::BLOCK_PX;
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
 
@@ -282,6 +283,8 @@ impl Chain {
     ) -> Result<Capacity, RenderError> {
         let tiles_per_page = current.read_back.tiles_per_page;
         let output = TileOutput { planes: current.planes, tiles, tiles_per_page };
+        let background_iterations = self.rasterize.background_iterations();
+        current.parameters.batch_limit = self.device.max_tile_batches(background_iterations);
         loop {
             // Submit, and wait.
             let start = Instant::now();
@@ -298,12 +301,10 @@ impl Chain {
             // Check whether it fitted.
             let (needs, fits) = self.evaluate(&counters, &current.parameters);
             if fits {
-                let most = self.device.max_tile_iterations(self.rasterize.background_iterations());
-                if u64::from(counters.most_iterations) > most {
-                    // So many are drawn wherever they are in the tile.
-                    let batches = most / u64::from(RASTER_BATCH + BATCH_ITERATIONS);
-                    let limit = batches * u64::from(RASTER_BATCH);
+                let most = current.parameters.batch_limit;
+                if counters.most_batches > most {
                     let what = "visible splats in one tile (on a software device)";
+                    let limit = u64::from(most) * u64::from(RASTER_BATCH);
                     return Err(RenderError::TooMany { what, limit });
                 }
                 add_counts(&mut current.stats, &counters);
@@ -340,7 +341,7 @@ impl Chain {
 
     /// Makes room for the largest needs so far, and writes the capacities to the frame's parameters.
     fn reserve(&mut self, parameters: &mut GpuFrame, cluster_views: u32) {
-        let Capacity { splats, touches, instances, .. } = self.high_water;
+        let Capacity { splats, touches, instances } = self.high_water;
         let device = &self.device;
         parameters.splat_capacity = self.splats.reserve(device, splats);
         let splats = u64::from(parameters.splat_capacity);

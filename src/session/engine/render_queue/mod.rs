@@ -40,8 +40,8 @@ struct Job {
     work: Box<dyn FnOnce(&mut Scratch) + Send>,
 }
 
-/// The queue. When it is dropped, it waits for its render threads to end: the last of them would otherwise drop the
-/// backend while the process ends, and a GPU's driver crashes if the process ends meanwhile.
+/// The queue. On drop it waits for its render threads. Otherwise the last of them might drop the backend while the process
+/// exits, and NVIDIA's driver crashes then.
 pub(crate) struct RenderQueue {
     shared: Arc<Shared>,
 }
@@ -150,12 +150,15 @@ impl Drop for RenderQueue {
         let threads = std::mem::take(&mut state.threads);
         drop(state);
         self.shared.changed.notify_all();
-        // A driver that hangs must not keep the process. A job that holds the queue may drop it in a render thread.
-        let deadline = Instant::now() + limits::LAST_FRAME;
-        let is_other = |thread: &JoinHandle<()>| thread.thread().id() != thread::current().id();
-        for thread in threads.into_iter().filter(is_other) {
+        // A driver that hangs must not keep the process alive.
+        let deadline = Instant::now() + limits::LAST_FRAME_TIMEOUT;
+        for thread in threads {
             while !thread.is_finished() && Instant::now() < deadline {
                 thread::sleep(Duration::from_millis(1));
+            }
+            if thread.is_finished() {
+                // A panic of a frame was caught in the thread.
+                let _ = thread.join();
             }
         }
     }
