@@ -45,17 +45,24 @@ async fn running_steps_are_answered_and_waiting_clients_notified() {
 #[test]
 fn the_backend_is_dropped_before_the_program_ends() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let painter = runtime.block_on(async {
+    let (painter, ending) = runtime.block_on(async {
         let server = TestServer::start().await;
         let mut agent = server.agent().await;
         agent.open(json!({ "deadline_ms": 100, "outputs": { "encoding": "raw" } })).await;
-        server.painter.slow_ms.store(1000, Ordering::SeqCst);
+        server.painter.held.store(true, Ordering::SeqCst);
         let late = agent.ask(json!({ "type": "step", "pose": pose(1.0) })).await;
         refused(&late, "deadline_exceeded");
+        drop(agent);
+        // The frame ends while the program does.
+        let painter = server.painter.clone();
+        let ending = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(500));
+            painter.held.store(false, Ordering::SeqCst);
+        });
         server.running.stop().await;
-        server.painter
+        (server.painter, ending)
     });
-    // As the program does.
     runtime.shutdown_timeout(Duration::from_secs(5));
+    ending.join().unwrap();
     assert_eq!(Arc::strong_count(&painter), 1);
 }
