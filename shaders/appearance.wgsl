@@ -20,12 +20,17 @@ fn apply_appearance(gathered: Sums, view: u32, at_px: vec2f) -> Sums {
         for (var k = 0u; k < 4u && at.x + k < appearance.overlay_px.x; k++) {
             let index = appearance.first_overlay + at.y * appearance.overlay_px.x + at.x + k;
             let over = unpack4x8unorm(overlays[index]);
-            sums.red[k] = fma(over.a, over.r - sums.red[k], sums.red[k]);
-            sums.green[k] = fma(over.a, over.g - sums.green[k], sums.green[k]);
-            sums.blue[k] = fma(over.a, over.b - sums.blue[k], sums.blue[k]);
+            sums.red[k] = covered(sums.red[k], over.r, over.a);
+            sums.green[k] = covered(sums.green[k], over.g, over.a);
+            sums.blue[k] = covered(sums.blue[k], over.b, over.a);
         }
     }
     return sums;
+}
+
+// A value behind an overlay. It is exact if the overlay is opaque.
+fn covered(behind: f32, over: f32, alpha: f32) -> f32 {
+    return fma(alpha, over, fma(-alpha, behind, behind));
 }
 
 // One row of the exposure's matrix, applied to four pixels.

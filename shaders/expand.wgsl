@@ -1,8 +1,9 @@
 // Stage bin, last part: distributes the touches of each macro tile to the lists of its tiles, in order
-// of depth. One workgroup per batch of 1,024 touches of a macro tile: a few macro tiles, where a road
-// meets the horizon, have most of the touches, and one workgroup for each would work long after all others.
+// of depth. One workgroup per batch of 1,024 touches of a macro tile: a few macro tiles, where a road meets
+// the horizon, have most of the touches; with one workgroup per macro tile, theirs would work long after all
+// others.
 //
-// `batches` counts the batches of each macro tile. `count` counts the touches of each tile in each batch; a
+// `batches` counts the batches of each macro tile. `count` counts the instances of each tile in each batch; a
 // prefix sum over these counts, in order of macro tile, tile, and batch, gives the index of the first
 // instance of each tile in each batch. `list` fills the lists: the bit matrix of a batch is transposed from "tiles of a
 // splat" to "splats of a tile".
@@ -44,14 +45,14 @@ struct Batch {
     // Its touches.
     first: u32,
     end: u32,
-    // Index of its count of the macro tile's first tile, and distance to the count of the next tile.
+    // `offsets[offset + k * stride]` is its count for tile k of the macro tile.
     offset: u32,
     stride: u32,
     is_first: bool,
     is_last: bool,
 }
 
-// Batch `number` of the frame, by a search for the last macro tile that does not begin after it.
+// Batch `number` of the frame: a search for the last macro tile whose first batch is at most `number`.
 fn batch(number: u32) -> Batch {
     var macro_tile = 0u;
     var end = frame.macro_tiles;

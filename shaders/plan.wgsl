@@ -52,8 +52,8 @@ fn touches() {
     jobs[TOUCHES_DIGITS].job = job(DIGITS * div_ceil(length, SORT_BLOCK), SCAN_BLOCK);
 }
 
-// Runs after the prefix sum over the batches of all macro tiles. `Bin::reserve` makes room for the most that the
-// touches can form.
+// Runs after the prefix sum over the batches of all macro tiles. `Bin::reserve` makes room for the most
+// batches that the touches can have.
 @compute @workgroup_size(1)
 fn batches() {
     let total = block_sums[div_ceil(jobs[MACRO_TILES].job.length, SCAN_BLOCK)];
@@ -61,7 +61,7 @@ fn batches() {
     jobs[BATCH_TILES].job = job(MACRO_COLUMNS * MACRO_ROWS * total, SCAN_BLOCK);
 }
 
-// Runs after the prefix sum over the splats of all tiles in all batches.
+// Runs after the prefix sum over the instances of all tiles in all batches.
 @compute @workgroup_size(1)
 fn instances() {
     let total = block_sums[div_ceil(jobs[BATCH_TILES].job.length, SCAN_BLOCK)];

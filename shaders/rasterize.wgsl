@@ -5,10 +5,11 @@
 // blend only those in its list.
 //
 // A tile where a road meets the horizon has hundreds of times the splats of others, and the device waits for
-// it. So a thread evaluates two splats at a time: neither waits for the other.
+// it. So a thread evaluates two splats at a time: the instructions of one do not depend on the other.
 //
-// Products and sums are written as `fma` where a compiler could contract them: it may do so in one variant
-// of this shader and not in another, and a pixel's bytes must not depend on what else is requested.
+// Products and sums are written as `fma` where a compiler could contract them, here and in the imported files but for
+// those of lenses: it may do so in one variant of this shader and not in another, and a pixel's bytes must not
+// depend on what else is requested.
 //
 // `BACKGROUND` stands for `background.wgsl` or `no_background.wgsl`, and `INSTANCES` for `instances.wgsl` or
 // `no_instances.wgsl`. Twin of
@@ -44,12 +45,12 @@ var<workgroup> mean_factors: array<vec4f, RASTER_BATCH + 1>;
 var<workgroup> opacities: array<vec2f, RASTER_BATCH + 1>;
 // Colour, and depth in metres.
 var<workgroup> color_depths: array<vec4f, RASTER_BATCH + 1>;
-// For each two splats of the batch, one bit per block that the box of the first reaches, then one per block
-// that the box of the second reaches.
-var<workgroup> pair_blocks: array<u32, RASTER_BATCH / 2>;
+// For each two splats of the batch: in the low half one bit per block that the box of the first reaches, in
+// the high half those of the second.
+var<workgroup> blocks_of_two: array<u32, RASTER_BATCH / 2>;
 // For each block, one bit per splat of the batch. Block after block.
 var<workgroup> block_splats: array<u32, BLOCKS * BATCH_WORDS>;
-// Number of set bits in all batches.
+// Number of (splat, block) pairs in all loaded batches.
 var<workgroup> block_pairs: atomic<u32>;
 var<workgroup> done_count: atomic<u32>;
 var<workgroup> done_threads: u32;
@@ -122,14 +123,14 @@ fn main(
                 blocks |= blocks_of(shape, corner) << (i * BLOCKS);
             }
         }
-        pair_blocks[thread] = blocks;
+        blocks_of_two[thread] = blocks;
         workgroupBarrier();
         // Transpose: from bits of blocks per splat to words of splats per block, one by each thread.
         let word = thread / BLOCKS;
         var bits = 0u;
         for (var i = 0u; i < 16u; i++) {
-            let two = pair_blocks[16u * word + i] >> (thread % BLOCKS);
-            bits |= ((two & 1u) | ((two >> BLOCKS) & 1u) << 1u) << (2u * i);
+            let two = blocks_of_two[16u * word + i] >> (thread % BLOCKS);
+            bits |= ((two & 1u) | ((two >> (BLOCKS - 1u)) & 2u)) << (2u * i);
         }
         block_splats[thread % BLOCKS * BATCH_WORDS + word] = bits;
         pairs += countOneBits(bits);

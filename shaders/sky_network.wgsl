@@ -27,16 +27,19 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     let joined = width + select(0u, encoded, background.skip != 0u);
     let second = width * (1u + encoded / 4u);
     let third = second + width * (1u + joined / 4u);
+    // Before the turns: a lens would otherwise be inverted in each of them.
+    var own: array<vec4f, 3>;
+    if wanted {
+        let rays = sky_rays(view, at_px);
+        let scale = inverseSqrt(fma(rays.x, rays.x, fma(rays.y, rays.y, rays.z * rays.z)));
+        own = array<vec4f, 3>(rays.x * scale, rays.y * scale, rays.z * scale);
+    }
     var rgb: array<vec4f, 3>;
     // Thread after thread, the pixels of each.
     for (var turn = 0u; turn < THREADS; turn++) {
         if thread == turn {
             is_wanted = u32(wanted);
-            if wanted {
-                let rays = sky_rays(view, at_px);
-                let scale = inverseSqrt(fma(rays.x, rays.x, fma(rays.y, rays.y, rays.z * rays.z)));
-                directions = array<vec4f, 3>(rays.x * scale, rays.y * scale, rays.z * scale);
-            }
+            directions = own;
         }
         if workgroupUniformLoad(&is_wanted) == 0u {
             continue;

@@ -28,16 +28,16 @@ fn arc_sine(x: f32) -> f32 {
 // `src/scene/sky/inference.rs`.
 //
 // Range reduction to [-pi/2, pi/2] by Cody and Waite: pi is subtracted in three parts. The products
-// with the first two parts are exact, so a compiler may fuse the multiplication and the subtraction
-// without changing the result.
+// with the first two parts are exact.
 fn sine(x: vec4f, quarter: f32) -> vec4f {
-    let whole = floor(x * 0.31830988618 + (0.5 - quarter));
+    let whole = floor(fma(x, vec4f(0.31830988618), vec4f(0.5 - quarter)));
     let turns = whole + quarter;
-    let r = ((x - turns * 3.140625) - turns * 9.6774101257e-4) + turns * 8.742278e-8;
+    let near = fma(-turns, vec4f(9.6774101257e-4), fma(-turns, vec4f(3.140625), x));
+    let r = fma(turns, vec4f(8.742278e-8), near);
     let square = r * r;
-    let fit = ((2.6000546e-6 * square - 1.9806615e-4) * square + 8.333017e-3) * square
-        - 1.6666657e-1;
-    let value = r + fit * square * r;
+    let cubic = fma(fma(vec4f(2.6000546e-6), square, vec4f(-1.9806615e-4)), square, vec4f(8.333017e-3));
+    let fit = fma(cubic, square, vec4f(-1.6666657e-1));
+    let value = fma(fit * square, r, r);
     let odd = (vec4i(whole) + i32(2.0 * quarter)) & vec4i(1);
     return select(value, -value, odd != vec4i(0));
 }

@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
-/// How long a program whose server has stopped waits for its tasks. The last of them drops the backend, and a
-/// GPU's driver crashes if the process exits meanwhile.
-pub(super) const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(5);
+/// How long a program whose server has stopped waits for its tasks. The last of them may drop the render queue, which
+/// waits for its frames; a GPU's driver crashes if the process exits meanwhile.
+pub(super) const SHUTDOWN_TIMEOUT: Duration =
+    wildcity_session::limits::LAST_FRAME_TIMEOUT.saturating_add(Duration::from_secs(1));
 
 /// URL of the server, unless the user gives another one.
 pub(super) const SERVER_URL: &str = "http://127.0.0.1:8080";

@@ -3,8 +3,9 @@
 /// Edge of a tile, in pixels. On a street a splat touches ten rows of a tile on average.
 pub const TILE_PX: u32 = 16;
 
-/// Edge of a block, in pixels: its 4 x 4 pixels are the 16 lanes of one vector, and four threads of four pixels of a GPU. A block fits a small splat
-/// more tightly than a row of 16 pixels does, which saves a third of the evaluations on a street.
+/// Edge of a block, in pixels. Its 4 x 4 pixels are the 16 lanes of a vector on the CPU, and four threads with four
+/// pixels each on a GPU. A block fits a small splat more tightly than a row of 16 pixels does, which saves a third of the
+/// evaluations on a street.
 pub const BLOCK_PX: u32 = 4;
 
 /// Most (Gaussian, tile) pairs of a frame. On the gpu backend it is the most of each region of a frame, and

@@ -16,7 +16,8 @@ use crate::reload::reload;
 use crate::state::ServerState;
 use crate::tls::Tls;
 
-/// A server that listens. Dropping it stops it without waiting, but for frames that are being rendered.
+/// A server that listens. Dropping it stops it without waiting; the last of its tasks to end waits for the frames that are
+/// being rendered.
 pub struct Running {
     state: Arc<ServerState>,
     address: SocketAddr,

@@ -57,8 +57,9 @@ pub const SESSIONS: usize = 256;
 /// Most steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of 64 bytes until the plan's end.
 pub const PLAN_STEPS: usize = 1_000;
 
-/// How long a render queue that is dropped waits for the frames that are being rendered: 128 megapixels at the 10 ns
-/// per pixel of two cores take 1.3 s. A frame that takes longer, as with a GPU's driver that hangs, is abandoned.
+/// How long a render queue that is dropped waits for the frames that are being rendered. 128 Mi pixels at 15 ns each
+/// (two cores, BENCHMARKS.md) take 2.0 s. A frame that takes longer is abandoned: on a GPU in software, or if a driver
+/// hangs.
 pub const LAST_FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Longest plan, in microseconds: as long as the longest trajectory.

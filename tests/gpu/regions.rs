@@ -161,7 +161,7 @@ fn more_splats_in_a_tile_than_software_blends() {
             dust.means_m.push([at(8 + i % 4), at(4 + i / 4 % 4), depth_m]);
             dust.quats_wxyz.push([1.0, 0.0, 0.0, 0.0]);
             dust.ln_scales.push([-3.0; 3]);
-            // Alpha is 1/200, above the cut of 1/255: a pixel keeps 1e-12 after 5,000 of them.
+            // Alpha is 1/100, above the cut of 1/255: a pixel keeps 2e-22 after 5,000 of them.
             dust.logit_opacities.push(-4.6);
             dust.sh.extend([0.5; 3]);
         }

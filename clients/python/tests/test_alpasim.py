@@ -395,7 +395,7 @@ def test_a_server_that_stops_answers_unavailable(tmp_path: Path) -> None:
             with grpc.insecure_channel(address, [("grpc.enable_retries", 0)]) as channel:
                 stub = Stub(channel)
                 # The reference backend takes seconds for it.
-                running = stub.render_rgb.future(request(resolution_w=640, resolution_h=480))
+                running = stub.render_rgb.future(request(resolution_w=1920, resolution_h=1440))
                 time.sleep(0.5)
                 process.terminate()
                 assert running.exception(timeout=20).code() == grpc.StatusCode.UNAVAILABLE

@@ -256,7 +256,7 @@ impl Serve {
             running.stop().await;
             Ok(())
         });
-        // A push that writes for longer is abandoned: a commit that is killed at any point leaves nothing.
+        // A push that still writes after that is abandoned: a commit that is killed at any point leaves nothing.
         runtime.shutdown_timeout(crate::cli::limits::SHUTDOWN_TIMEOUT);
         served
     }

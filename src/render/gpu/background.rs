@@ -180,25 +180,26 @@ impl Background {
         ]
     }
 
-    /// Most loop iterations that the background takes of a thread.
+    /// Most loop iterations that the background takes of a thread. The end of a loop counts as one, and so does a loop that
+    /// no thread of a vector enters.
     ///
-    /// Inverting a lens takes up to 40 and 26 for each of four pixels. A network is evaluated by all
-    /// threads for each of the tile's 64 groups of four pixels; a layer takes an iteration for each four
-    /// of its inputs, and one for each 64 of its outputs.
+    /// Inverting a lens takes up to 504 for each of four pixels, and an overlay 5. A network is evaluated by all threads
+    /// for each of the tile's 64 groups of four pixels; a layer takes an iteration for each four of its inputs, and
+    /// one for each 64 of its outputs.
     pub(super) fn iterations(&self) -> u64 {
-        let rays = if self.has_lenses { 4 * (1 + 40 + 26) } else { 0 };
+        let rays = if self.has_lenses { 4 * 504 + 6 } else { 0 };
+        let overlay = 5;
         let sky = match &self.sky {
             Some(DrawableSky::Network(network)) => {
                 let width = network.width() as u64;
                 let encoded = network.encoded() as u64;
                 let outputs_per_thread = width.div_ceil(64);
-                let inputs = 2 + encoded.div_ceil(4) + (width + encoded).div_ceil(4);
-                let hidden = outputs_per_thread * inputs;
-                64 * (1 + hidden + width / 4 + 3)
+                let inputs = encoded.div_ceil(4) + (width + encoded).div_ceil(4);
+                64 * (10 + outputs_per_thread * (4 + inputs) + width / 4) + 7
             }
-            _ => 4,
+            _ => 5,
         };
-        rays + sky
+        rays + sky + overlay
     }
 
     fn has_network(&self) -> bool {

@@ -122,8 +122,8 @@ impl FrameCounts {
     }
 
     /// About how many multiply-adds, or instructions of the same cost, stage rasterize takes: 18 for four evaluations,
-    /// of which six are shared by the four pixels. Pixels that a splat touches take ten more each, and pixels that have
-    /// stopped take none; neither is considered.
+    /// of which six are shared by the four pixels. Pixels that have stopped are counted although they take none, and the
+    /// ten more of each blended pixel are not: an estimate, not a bound.
     pub fn rasterize_operations(&self) -> u64 {
         self.evaluations() * 9 / 2
     }

@@ -201,7 +201,7 @@ impl Bin {
         scan.run(device, pass, plan.job(job::MACRO_TILES), self.first_batches.buffer());
         plan.set_batches(device, pass, scan.block_sums());
 
-        // The number of splats of each tile in each batch.
+        // The number of instances of each tile in each batch.
         let batches = plan.job(job::BATCHES);
         let batch = [
             (2, self.touch_masks[sorted].bind()),

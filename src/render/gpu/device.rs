@@ -315,9 +315,10 @@ impl Device {
     /// Most batches of splats that a tile can blend, if the background takes `background_iterations` loop iterations of a
     /// thread of `rasterize`.
     ///
-    /// The end of a loop counts as an iteration, too. A batch takes at most 96: 1, 3 to load two splats, 17 to
-    /// transpose a word, 5 for four words, and 17 for the 32 splats of each, two at a time. Beside them a thread finds
-    /// its view among 16, and the owners of four pixels by binary search: 160 are enough for 2^32 owners.
+    /// The end of a loop counts as an iteration, and so does a loop that no thread of a vector enters. A batch takes at most
+    /// 95: 1, 3 to load two splats, 17 to transpose a word, 5 for four words, 17 for the 32 splats of each word (two at a
+    /// time), and 1 at their end; 96 leaves one to spare. Besides, a thread takes 17 to find its view among 16, 5 at the
+    /// end of the batches, and 4 x 33 for the owners of four pixels among 2^32: 154 of 160.
     pub(super) fn max_tile_batches(&self, background_iterations: u64) -> u32 {
         let batches = |most: u64| most.saturating_sub(160 + background_iterations) / 96;
         self.loop_iterations().map_or(u32::MAX, |most| batches(most) as u32)

@@ -95,7 +95,7 @@ pub struct Frame {
     pub log2_alpha_cut: f32,
     /// Transmittance at which a pixel stops.
     pub stop: f32,
-    /// Most batches of [`RASTER_BATCH`] splats that a tile blends.
+    /// Most batches of [`RASTER_BATCH`] splats that a tile may load.
     pub batch_limit: u32,
     /// Zero.
     pub pad0: u32,
@@ -411,7 +411,7 @@ pub struct Counters {
     /// Pairs of a splat and a block of [`constants::BLOCK_PX`] that its box reaches, in all loaded batches. Blocks that have
     /// stopped count too.
     pub block_pairs: u32,
-    /// Most batches of [`RASTER_BATCH`] splats of one tile; above [`Frame::batch_limit`] if a tile has more.
+    /// Most batches of [`RASTER_BATCH`] splats that a tile loaded; [`Frame::batch_limit`] + 1 if a tile needed more.
     pub most_batches: u32,
 }
 

@@ -18,7 +18,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::{RenderProfile, Rig, Scene};
 
 /// Measure a device: the time of each stage of a step with six full cameras, in streets of several
-/// sizes, next to the limits of the device's memory and arithmetic (its roofline).
+/// sizes, next to the limit of the device's memory and an estimate of its arithmetic (its roofline).
 ///
 /// Prints tables in Markdown. The streets are generated in memory and are the same on every machine up to
 /// rounding. Times of stages are device time, by the device's clock. Rows marked "host" are host time; the
