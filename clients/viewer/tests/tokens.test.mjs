@@ -24,7 +24,12 @@ async function give(page, token) {
   await page.click("text=Continue");
 }
 
-const actions = (page) => page.$$eval("td.actions a", (links) => links.map(({ textContent }) => textContent));
+/** What the table of twins offers, once it is there. */
+async function actions(page) {
+  await page.waitForSelector("td.actions a");
+  return page.$$eval("td.actions a", (links) => links.map(({ textContent }) => textContent));
+}
+
 const refused = (status) => new RegExp(`^Failed to load resource: the server responded with a status of ${status} `);
 
 /** Chromium logs each refused request: these, and nothing else. */
