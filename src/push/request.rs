@@ -37,7 +37,7 @@ pub struct PushRequest {
     pub profile: Vec<String>,
     /// Description of the version, for people.
     pub note: Option<String>,
-    /// `world_from_rig` of the poses of the preview; some along its trajectories if there are none.
+    /// `world_from_rig` of the poses of the preview; some along the twin's trajectories if there are none.
     pub preview_poses: Option<Vec<Pose>>,
     /// The push is refused if the images of a pose differ by more than this PSNR, in dB.
     pub min_psnr_db: Option<f64>,

@@ -8,7 +8,7 @@ use super::layout::{
 use super::resolve::Planes;
 use super::sort::DIGIT_BITS;
 use crate::Frame;
-use crate::constants::{BLOCK_PX, DEPTH_BITS, TILE_PX};
+use crate::constants::{DEPTH_BITS, TILE_PX};
 use wildcity_scene::chunk::CLUSTER;
 use wildcity_scene::sh;
 
@@ -35,8 +35,8 @@ pub struct FrameCounts {
     pub touches: u64,
     /// (Splat, tile) pairs.
     pub instances: u64,
-    /// Pairs of a splat and a block of 4 x 4 px that its box reaches, in all loaded batches.
-    pub block_pairs: u64,
+    /// Evaluations of a splat at a pixel.
+    pub evaluations: u64,
 }
 
 impl FrameCounts {
@@ -59,7 +59,7 @@ impl FrameCounts {
         self.splats += u64::from(counters.splats);
         self.touches += u64::from(counters.touches);
         self.instances += u64::from(counters.instances);
-        self.block_pairs += u64::from(counters.block_pairs);
+        self.evaluations += counters.evaluations();
     }
 
     /// Name and bytes of each stage: what it reads and writes if each kernel reads and writes every array
@@ -115,16 +115,10 @@ impl FrameCounts {
         ]
     }
 
-    /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels that have stopped
-    /// count too.
-    pub fn evaluations(&self) -> u64 {
-        self.block_pairs * u64::from(BLOCK_PX * BLOCK_PX)
-    }
-
     /// About how many multiply-adds, or instructions of the same cost, stage rasterize takes: 18 for four evaluations,
     /// of which six are shared by the four pixels. Pixels that have stopped are counted although they take none, and the
     /// ten more of each blended pixel are not: an estimate, not a bound.
     pub fn rasterize_operations(&self) -> u64 {
-        self.evaluations() * 9 / 2
+        self.evaluations * 9 / 2
     }
 }

@@ -415,6 +415,13 @@ pub struct Counters {
     pub most_batches: u32,
 }
 
+impl Counters {
+    /// Evaluations of a splat at a pixel: all pixels of the blocks that its box reaches. Pixels that have stopped count too.
+    pub(super) fn evaluations(&self) -> u64 {
+        u64::from(self.block_pairs) * u64::from(constants::BLOCK_PX * constants::BLOCK_PX)
+    }
+}
+
 /// Shape of a splat (32 bytes): [`crate::layout::Splat`] without its colour.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]

@@ -24,9 +24,14 @@ pub(super) struct Pixel {
 /// twentieth of the time.
 pub(super) fn row(splats: &[Splat], row: u32, width: usize, profile: &RenderProfile) -> Vec<Pixel> {
     let y_px = f64::from(row) + 0.5;
-    let near_row = |splat: &&Splat| (splat.mean_px.y - y_px).abs() <= splat.reach_px.y + 1e-6;
+    let near_row = |splat: &&Splat| reaches(splat.mean_px.y - y_px, splat.reach_px.y);
     let here: Vec<Splat> = splats.iter().filter(near_row).copied().collect();
     (0..width).map(|column| pixel(&here, DVec2::new(column as f64 + 0.5, y_px), profile)).collect()
+}
+
+/// Whether a splat may reach alpha_cut at this distance along one axis.
+fn reaches(distance_px: f64, reach_px: f64) -> bool {
+    distance_px.abs() <= reach_px + 1e-6
 }
 
 /// One pixel: Kerbl et al. 2023, eq. 3, with the cap, the cut and the stop of the profile.
@@ -35,7 +40,7 @@ fn pixel(splats: &[Splat], at_px: DVec2, profile: &RenderProfile) -> Pixel {
     for splat in splats {
         let d = at_px - splat.mean_px;
         // As in the row: the image is the same, and most exponential functions are left out.
-        if d.x.abs() > splat.reach_px.x + 1e-6 {
+        if !reaches(d.x, splat.reach_px.x) {
             continue;
         }
         let power = -0.5 * (splat.conic.x * d.x * d.x + splat.conic.z * d.y * d.y)

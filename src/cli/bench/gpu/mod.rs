@@ -45,7 +45,7 @@ pub(super) struct Gpu {
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Frames to time. Before them come at least two frames, and one second of frames, that are not timed.
+    /// Frames to time. At least two frames, and frames for a second, are rendered before and not timed.
     #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 

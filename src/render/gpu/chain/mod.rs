@@ -30,7 +30,6 @@ use super::resolve::{Outputs, Planes};
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::actor_views::ActorViews;
-use crate::constants::BLOCK_PX;
 use crate::stage::{Stage, StageOutputs};
 use crate::{Frame, FrameStats, RenderError};
 
@@ -257,7 +256,9 @@ impl Chain {
         let planes = outputs.planes;
         self.lenses.upload(&self.device, frame, actors);
         self.rasterize.upload_background(&self.device, frame, &outputs.appearances)?;
-        let parameters = GpuFrame::new(frame.views, frame.profile);
+        let mut parameters = GpuFrame::new(frame.views, frame.profile);
+        let background_iterations = self.rasterize.background_iterations();
+        parameters.batch_limit = self.device.max_tile_batches(background_iterations);
         let tiles_per_page = self.rasterize.reserve(&self.device, planes, parameters.tiles);
         let mut read_back = self.read_backs.take().unwrap_or_else(|| ReadBack::new(&self.device));
         read_back.reserve(&self.device, planes, parameters.tiles, tiles_per_page);
@@ -283,8 +284,6 @@ impl Chain {
     ) -> Result<Capacity, RenderError> {
         let tiles_per_page = current.read_back.tiles_per_page;
         let output = TileOutput { planes: current.planes, tiles, tiles_per_page };
-        let background_iterations = self.rasterize.background_iterations();
-        current.parameters.batch_limit = self.device.max_tile_batches(background_iterations);
         loop {
             // Submit, and wait.
             let start = Instant::now();
@@ -386,5 +385,5 @@ fn add_time(stats: &mut FrameStats, stage: &'static str, time: Duration) {
 fn add_counts(stats: &mut FrameStats, counters: &Counters) {
     stats.visible_pairs += u64::from(counters.splats);
     stats.instances += u64::from(counters.instances);
-    stats.evaluations += u64::from(counters.block_pairs) * u64::from(BLOCK_PX * BLOCK_PX);
+    stats.evaluations += counters.evaluations();
 }
