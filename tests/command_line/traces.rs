@@ -14,9 +14,9 @@ mod with_otlp {
     use std::io::{BufRead, BufReader, Read, Write};
     use std::net::{TcpListener, TcpStream};
     use std::sync::mpsc::{self, Sender};
-    use std::time::Duration;
 
     use crate::served::Served;
+    use crate::support::TEST_TIMEOUT;
     use crate::wildcity;
 
     /// Reads one request after the other from a connection, and passes on its path and its body.
@@ -79,7 +79,7 @@ mod with_otlp {
             bytes.windows(text.len()).filter(|window| *window == text.as_bytes()).count()
         };
         while wanted.iter().any(|(name, least)| count(&bytes, name) < *least) {
-            let Ok((start, body)) = requests.recv_timeout(Duration::from_secs(5)) else { break };
+            let Ok((start, body)) = requests.recv_timeout(TEST_TIMEOUT) else { break };
             assert!(start.starts_with("POST /v1/traces "), "{start}");
             bytes.extend(body);
         }

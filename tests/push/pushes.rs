@@ -414,9 +414,10 @@ async fn a_slow_push_delays_no_other_twin_and_can_be_cancelled() {
 /// A push that takes too long to check is refused, and the next one has its turn.
 #[tokio::test]
 async fn a_push_has_a_time_limit() {
-    let limits = Limits { push: Duration::from_secs(3), ..Limits::default() };
+    // The last push must be this fast, also on a busy machine.
+    let limits = Limits { push: Duration::from_secs(5), ..Limits::default() };
     let server = TestServer::with(limits).await;
-    server.painter.slow_ms.store(4_000, Ordering::SeqCst);
+    server.painter.slow_ms.store(6_000, Ordering::SeqCst);
     let refused = push(&server, &in_cell([0, 0], 40, 1), |_| {}).await;
     assert_eq!(refused.state, PushState::Refused);
     let reason = refused.error.unwrap().message;

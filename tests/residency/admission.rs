@@ -162,8 +162,7 @@ fn the_end_of_a_frame_makes_room_at_once() {
     assert!(limit_bytes < bytes(0.0) + bytes(500.0));
     let cache = Cache::limited(demo().catalog(), Some(limit_bytes));
     let resident = cache.open("demo", None).unwrap();
-    let mut slowest = Duration::ZERO;
-    for _ in 0..5 {
+    let waits = (0..5).map(|_| {
         let first = resident.scene(&frame(0.0), &PROFILE).unwrap();
         let (tell, told) = channel();
         let other = resident.clone();
@@ -182,11 +181,15 @@ fn the_end_of_a_frame_makes_room_at_once() {
         std::thread::sleep(wildcity_twin::limits::ROOM_POLL / 4);
         let dropped = Instant::now();
         drop(first);
-        slowest = slowest.max(told.recv_timeout(TEST_TIMEOUT).unwrap() - dropped);
+        let waited = told.recv_timeout(TEST_TIMEOUT).unwrap() - dropped;
         waiting.join().unwrap();
-    }
-    // Without a notice the loader would sleep for three quarters of that time.
-    assert!(slowest < wildcity_twin::limits::ROOM_POLL / 2, "{slowest:?}");
+        waited
+    });
+    let mut waits: Vec<Duration> = waits.collect();
+    waits.sort();
+    // Without a notice the loader would sleep for three quarters of that time. Other tests run beside this one, and may
+    // delay a loader that was notified: most of the five count.
+    assert!(waits[2] < wildcity_twin::limits::ROOM_POLL / 2, "{waits:?}");
 }
 
 /// Starts threads that each draw forty frames at different places.

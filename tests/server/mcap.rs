@@ -208,7 +208,7 @@ async fn a_server_that_stops_finishes_its_exports() {
     let mut agent = server.driver("a").await;
     agent.step(1.0).await;
     let TestServer { running, episodes, .. } = server;
-    timeout(Duration::from_secs(20), running.stop()).await.unwrap();
+    timeout(TEST_TIMEOUT, running.stop()).await.unwrap();
     assert_eq!(names(episodes.path()), ["a-1.jsonl", "a-1.mcap"]);
 }
 

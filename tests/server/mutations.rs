@@ -238,7 +238,6 @@ async fn mutated_requests_lose_no_session() {
     }
     let took = began.elapsed();
     eprintln!("{REQUESTS} requests in {took:.1?}: {counts:?}");
-    assert!(took.as_secs() < 60, "{took:?}");
     assert!(
         counts["observation"] > 500 && counts["many"] > 100 && counts["invalid_request"] > 5_000,
         "{counts:?}"

@@ -67,8 +67,9 @@ async fn an_agent_killed_in_mid_step_finds_its_answer() {
         let mut agent = server.driver(name).await;
         agent.step(1.0).await;
         server.painter.slow_ms.store(300, Ordering::SeqCst);
+        let begun = server.painter.begun.load(Ordering::SeqCst);
         agent.send(json!({ "type": "step", "pose": pose(2.0) })).await;
-        tokio::time::sleep(Duration::from_millis(100)).await;
+        server.painter.begins(begun + 1).await;
         let last_seq = agent.seq - 2;
         if reset {
             // What the kernel does for a killed process that left bytes unread.
@@ -141,8 +142,7 @@ async fn last_seq_is_the_number_that_the_server_counts_by() {
 /// A client that did not get the answer to `close` resumes and repeats it, as with any other request.
 #[tokio::test]
 async fn a_lost_answer_to_close_can_be_repeated() {
-    let resume_grace = Duration::from_millis(1500);
-    let server = TestServer::with(Limits { resume_grace, ..Limits::default() }).await;
+    let server = TestServer::start().await;
     let mut agent = server.driver("a").await;
     agent.step(1.0).await;
     let closed = agent.ask(json!({ "type": "close" })).await;
@@ -160,13 +160,19 @@ async fn a_lost_answer_to_close_can_be_repeated() {
         agent.open(json!({ "session": "b" })).await;
         agent.ask(json!({ "type": "close" })).await;
     }
-    // Not for ever, and not after the name is used again.
+    // Not after the name is used again.
     let mut again = server.driver("a").await;
     refused(&resume(&server, "a", 9).await.1, "seq_out_of_order");
     let Reply::Text(told) = again.receive().await else { panic!("no notification") };
     refused(&told, "session_state");
+
+    // Not for ever.
+    let resume_grace = Duration::from_millis(200);
+    let server = TestServer::with(Limits { resume_grace, ..Limits::default() }).await;
+    let mut agent = server.driver("a").await;
+    agent.ask(json!({ "type": "close" })).await;
     tokio::time::sleep(2 * resume_grace).await;
-    refused(&resume(&server, "b", 1).await.1, "unknown_session");
+    refused(&resume(&server, "a", 1).await.1, "unknown_session");
 }
 
 /// After a network failure the client reconnects before the server notices the failure.
@@ -209,8 +215,7 @@ async fn a_session_that_is_not_resumed_ends() {
     drop(agent);
     server.sessions_become(0).await;
     refused(&resume(&server, "a", 2).await.1, "unknown_session");
-    let text = std::fs::read_to_string(&server.recorded()[0]).unwrap();
-    assert!(text.lines().last().unwrap().contains("agent_lost"), "{text}");
+    server.record_ends_with("agent_lost").await;
 }
 
 impl Agent {

@@ -6,7 +6,9 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use crate::support::{Agent, Reply, TestServer, pose, refused};
+use wildcity_server::Limits;
+
+use crate::support::{Agent, Reply, TEST_TIMEOUT, TestServer, pose, refused};
 
 async fn is_notified(agent: &mut Agent) {
     let Reply::Text(answer) = agent.receive().await else { panic!("no notification") };
@@ -17,23 +19,27 @@ async fn is_notified(agent: &mut Agent) {
 
 #[tokio::test]
 async fn running_steps_are_answered_and_waiting_clients_notified() {
-    let server = TestServer::start().await;
+    // The server would wait for a client for longer than the test does.
+    let limits = Limits { drain: 3 * TEST_TIMEOUT, ..Limits::default() };
+    let server = TestServer::with(limits).await;
     let mut waiting = server.driver("waiting").await;
     waiting.step(1.0).await;
     let mut running = server.driver("running").await;
     let mut parked = server.driver("parked").await;
     parked.step(1.0).await;
     drop(parked);
-    server.painter.slow_ms.store(300, Ordering::SeqCst);
+    server.painter.held.store(true, Ordering::SeqCst);
+    let begun = server.painter.begun.load(Ordering::SeqCst);
     running.send(json!({ "type": "step", "pose": pose(1.0) })).await;
-    tokio::time::sleep(Duration::from_millis(100)).await;
+    server.painter.begins(begun + 1).await;
 
-    let TestServer { running: server, episodes, .. } = server;
+    let TestServer { running: server, painter, episodes, .. } = server;
     let stopping = tokio::spawn(server.stop());
+    is_notified(&mut waiting).await;
+    painter.held.store(false, Ordering::SeqCst);
     assert_eq!(running.seen().await.meta["step"], 1);
     is_notified(&mut running).await;
-    is_notified(&mut waiting).await;
-    tokio::time::timeout(Duration::from_secs(8), stopping).await.expect("stopped").unwrap();
+    tokio::time::timeout(TEST_TIMEOUT, stopping).await.expect("stopped").unwrap();
     for name in ["waiting", "running", "parked"] {
         let text =
             std::fs::read_to_string(episodes.path().join(format!("{name}-1.jsonl"))).unwrap();
@@ -62,7 +68,7 @@ fn the_backend_is_dropped_before_the_program_ends() {
         server.running.stop().await;
         (server.painter, ending)
     });
-    runtime.shutdown_timeout(Duration::from_secs(5));
+    runtime.shutdown_timeout(TEST_TIMEOUT);
     ending.join().unwrap();
     assert_eq!(Arc::strong_count(&painter), 1);
 }

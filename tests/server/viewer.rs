@@ -1,14 +1,13 @@
 //! The viewer's files, tickets, watching, and recorded episodes over HTTP.
 
 use std::net::SocketAddr;
-use std::time::Duration;
 
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
-use wildcity_server::{Origins, Tokens};
+use wildcity_server::{Limits, Origins, Tokens};
 
 use crate::http::request;
-use crate::support::{Agent, Reply, Seen, TestServer, client_limits};
+use crate::support::{Agent, Reply, Seen, TEST_TIMEOUT, TestServer, client_limits};
 
 const DRIVER: &str = "driver-driver-driver";
 const RIVAL: &str = "rival-rival-rival";
@@ -189,11 +188,13 @@ async fn a_session_is_watched_by_its_token_and_by_administrators() {
 
 #[tokio::test]
 async fn a_server_with_watchers_stops() {
-    let server = TestServer::start().await;
+    // The server would wait for the watcher for longer than the test does.
+    let limits = Limits { drain: 3 * TEST_TIMEOUT, ..Limits::default() };
+    let server = TestServer::with(limits).await;
     let _agent = server.driver("a").await;
     let mut watcher =
         connect(server.address(), "/v1/sessions/a/watch", WATCH, None).await.ok().unwrap();
-    let stopped = tokio::time::timeout(Duration::from_secs(5), server.running.stop()).await;
+    let stopped = tokio::time::timeout(TEST_TIMEOUT, server.running.stop()).await;
     assert!(stopped.is_ok(), "the watcher kept the server");
     assert!(matches!(watcher.receive().await, Reply::Closed));
 }

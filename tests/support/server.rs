@@ -254,6 +254,19 @@ impl TestServer {
         paths
     }
 
+    /// Waits until the first recorded episode has an end of this outcome: a moment after its session has ended.
+    pub(crate) async fn record_ends_with(&self, outcome: &str) {
+        let record = self.recorded()[0].clone();
+        let text = || std::fs::read_to_string(&record).expect("a record");
+        let ending = async {
+            while !text().lines().last().is_some_and(|line| line.contains(outcome)) {
+                tokio::time::sleep(Duration::from_millis(5)).await;
+            }
+        };
+        let waited = tokio::time::timeout(TEST_TIMEOUT, ending).await;
+        assert!(waited.is_ok(), "no end of outcome {outcome}: {}", text());
+    }
+
     /// Waits until the server holds that many sessions.
     pub(crate) async fn sessions_become(&self, count: usize) {
         let reached = async {

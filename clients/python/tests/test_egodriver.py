@@ -127,7 +127,7 @@ class Broken(BaseDriver):
         elif self.fault == "ends":
             return DriveResult(trajectory_in_rig=straight(ctx), terminate_session=True)
         elif self.fault == "sleeps":
-            time.sleep(3)
+            time.sleep(5)
         return DriveResult(trajectory_in_rig=plan)
 
 
@@ -138,12 +138,12 @@ class Broken(BaseDriver):
         ("empty", "agent_error", "has no pose after"),
         ("nan", "agent_error", "finite"),
         ("short", "agent_error", "ends 50000 us from now"),
-        ("sleeps", "agent_timeout", "did not answer drive within 1 s"),
+        ("sleeps", "agent_timeout", "did not answer drive within 3 s"),
     ],
 )
 def test_a_broken_driver_ends_its_episode(server: Server, fault: str, outcome: str, reason: str) -> None:
     with driver(Broken(fault)) as address:
-        status, (report,), errors = drive(server, address, "--drive-timeout-ms", "1000")
+        status, (report,), errors = drive(server, address, "--drive-timeout-ms", "3000")
     expected = 124 if outcome == "agent_timeout" else 1
     assert (status, report["outcome"], report["steps"]) == (expected, outcome, 2), report
     assert reason in report["reason"]
