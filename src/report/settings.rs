@@ -328,11 +328,10 @@ fn stop_change(stop: f64) -> String {
 impl TwinFeatures {
     /// The features of a version of a twin, with its sky and with the cameras of the report.
     pub fn new(manifest: &Manifest, sky: Option<&Sky>, views: &[View]) -> Self {
-        let mut sections = manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
         Self {
             profile: manifest.profile,
             record: manifest.record,
-            has_levels: sections.any(|section| section.level > 0),
+            has_levels: manifest.has_levels(),
             background: match sky.map(Sky::model) {
                 None => BackgroundKind::Plain,
                 Some(SkyModel::Network(..)) => BackgroundKind::Network,

@@ -208,6 +208,12 @@ impl Manifest {
         self.chunks.iter().map(|chunk| chunk.count).sum()
     }
 
+    /// Whether any section is coarser than full detail.
+    pub fn has_levels(&self) -> bool {
+        let mut sections = self.chunks.iter().flat_map(|chunk| &chunk.sections);
+        sections.any(|section| !section.is_full_detail())
+    }
+
     /// Size of all objects without the manifest itself, in bytes.
     pub fn stored_bytes(&self) -> u64 {
         let sky = self.sky.as_ref().map_or(0, |sky| sky.bytes);
@@ -221,7 +227,19 @@ impl Manifest {
     }
 }
 
+impl Section {
+    /// Whether it is at level 0, the finest.
+    pub fn is_full_detail(&self) -> bool {
+        self.level == 0
+    }
+}
+
 impl ChunkEntry {
+    /// The sections at full detail: one of each block, which together have all Gaussians of the cell.
+    pub fn full_detail(&self) -> impl Iterator<Item = &Section> {
+        self.sections.iter().filter(|section| section.is_full_detail())
+    }
+
     /// Union of a section's 3-sigma boxes in the world, in metres.
     pub fn section_bounds(&self, section: &Section) -> Bounds {
         let world_m = |corner: [f32; 3]| self.origin_m + DVec3::from_array(corner.map(f64::from));

@@ -10,9 +10,9 @@ use wildcity_render::{Frame, RenderError, Target, View};
 use wildcity_scene::chunk::cell_at;
 use wildcity_scene::geometry::{Camera, Pose};
 use wildcity_scene::rig::RigCamera;
-use wildcity_scene::{Chunk, Gaussians, RenderProfile, Rig, Scene};
+use wildcity_scene::{Chunk, Gaussians, RenderProfile, Rig, Scene, Sky};
 use wildcity_session::{Engine, FrameCost, PUSHES, SessionError, viewpoints};
-use wildcity_twin::residency::{SectionRef, demand};
+use wildcity_twin::residency::{SectionRef, Viewpoint, demand};
 use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::blocking::run_blocking;
@@ -39,9 +39,6 @@ pub(crate) struct ProposedChange {
     /// The render profile after the change.
     pub(crate) profile: RenderProfile,
 }
-
-/// Sections that were read for earlier poses, by chunk and section.
-type LoadedSections = BTreeMap<SectionRef, Arc<Chunk>>;
 
 /// Renders small images of a version before and after a proposed change, and compares them. The frames wait
 /// in the render queue with those of the sessions, until the deadline. It may be later than that of a step, because no
@@ -71,50 +68,38 @@ pub(crate) async fn preview_psnr(
         return Ok(Vec::new());
     }
 
-    let gaussians = change.gaussians.clone();
-    let mut new_scene = run_blocking(move || Ok(Scene::from_gaussians(&gaussians))).await?;
     let resident = engine.open_version(manifest.twin.clone(), Some(change.before.number)).await?;
     for profile in [manifest.profile, change.profile] {
         Engine::bake_sky(resident.clone(), profile).await?;
     }
 
-    let mut loaded = LoadedSections::new();
+    let gaussians = change.gaussians.clone();
+    let mut reader = SceneReader {
+        catalog: engine.catalog().clone(),
+        version: change.before.clone(),
+        profile: change.profile,
+        replaced: change.cells,
+        new: run_blocking(move || Ok(Scene::from_gaussians(&gaussians))).await?,
+        sky: resident.sky().cloned(),
+        loaded: BTreeMap::new(),
+    };
     let mut previews = Vec::new();
     let total = poses.len() as u64;
     for (done, world_from_rig) in (0..).zip(poses) {
         progress(done, total);
         let views = View::of_rig(&cameras, world_from_rig);
-
-        // Read both scenes on a blocking thread, which gets the new Gaussians and the sections read so far.
-        let scenes = {
-            let mut reader = SceneReader {
-                catalog: engine.catalog().clone(),
-                version: change.before.clone(),
-                profile: change.profile,
-                loaded,
-            };
-            let views = views.clone();
-            let cells = change.cells.clone();
-            let sky = resident.sky().cloned();
-            run_blocking(move || {
-                let kept = reader.kept(&cells, &views)?;
-                let before = merged(kept.clone(), &reader.in_full_detail(&cells)?);
-                let after = merged(kept, &new_scene);
-                Ok(BothScenes {
-                    before: Scene { sky: sky.clone(), ..before },
-                    after: Scene { sky, ..after },
-                    new_scene,
-                    loaded: reader.loaded,
-                })
-            })
-            .await?
-        };
-        new_scene = scenes.new_scene;
-        loaded = scenes.loaded;
-
+        let viewpoints = viewpoints(&views);
+        let scenes;
+        // A blocking thread has the reader while it reads.
+        (reader, scenes) = run_blocking(move || {
+            let scenes = reader.scenes(&viewpoints)?;
+            Ok((reader, scenes))
+        })
+        .await?;
+        let BothScenes { before, after } = scenes;
         let before =
-            render_small(engine, scenes.before, manifest.profile, views.clone(), deadline).await?;
-        let after = render_small(engine, scenes.after, change.profile, views, deadline).await?;
+            render_small(engine, before, manifest.profile, views.clone(), deadline).await?;
+        let after = render_small(engine, after, change.profile, views, deadline).await?;
         if before.sees_any || after.sees_any {
             let psnr_db = psnr_db_u8(before.rgb8.iter().zip(&after.rgb8));
             previews.push(PsnrPreview { world_from_rig, psnr_db });
@@ -163,38 +148,52 @@ async fn render_small(
     Ok(images.map_err(|error: RenderError| SessionError::from(error))?)
 }
 
-/// The scenes before and after the change at one pose, and what the next pose reuses.
+/// The scenes before and after the change, as they are seen from one pose.
 struct BothScenes {
     before: Scene,
     after: Scene,
-    new_scene: Scene,
-    loaded: LoadedSections,
 }
 
-/// Reads what a frame shows of a version.
+/// Reads the scenes before and after a change.
 struct SceneReader {
     catalog: Catalog,
+    /// The version before the change.
     version: Arc<Version>,
     profile: RenderProfile,
-    loaded: LoadedSections,
+    /// The replaced cells.
+    replaced: BTreeSet<[i32; 2]>,
+    /// What they have after the change.
+    new: Scene,
+    sky: Option<Arc<Sky>>,
+    /// Sections that were read for earlier poses.
+    loaded: BTreeMap<SectionRef, Arc<Chunk>>,
 }
 
 impl SceneReader {
-    /// The part of the version that the views show, without the replaced cells.
-    fn kept(&mut self, replaced: &BTreeSet<[i32; 2]>, views: &[View]) -> Result<Scene, StoreError> {
+    /// Both scenes, as far as they are seen from some viewpoints.
+    fn scenes(&mut self, viewpoints: &[Viewpoint]) -> Result<BothScenes, StoreError> {
+        let kept = self.kept(viewpoints)?;
+        let old = self.replaced_in_full_detail()?;
+        let with = |cells: &Scene| Scene { sky: self.sky.clone(), ..merged(kept.clone(), cells) };
+        Ok(BothScenes { before: with(&old), after: with(&self.new) })
+    }
+
+    /// The part of the version that is seen, without the replaced cells.
+    fn kept(&mut self, viewpoints: &[Viewpoint]) -> Result<Scene, StoreError> {
         let manifest = &self.version.manifest;
-        let mut sections = demand(manifest, &viewpoints(views), &self.profile);
-        sections.retain(|section| !replaced.contains(&manifest.chunks[section.chunk].cell));
+        let mut sections = demand(manifest, viewpoints, &self.profile);
+        sections.retain(|section| !self.replaced.contains(&manifest.chunks[section.chunk].cell));
         self.read(sections)
     }
 
-    /// All of the replaced cells, as a push has them: each block at its finest level.
-    fn in_full_detail(&mut self, replaced: &BTreeSet<[i32; 2]>) -> Result<Scene, StoreError> {
+    /// All of the replaced cells before the change, as a push has them: each block at full detail.
+    fn replaced_in_full_detail(&mut self) -> Result<Scene, StoreError> {
         let mut sections = Vec::new();
         for (chunk, entry) in self.version.manifest.chunks.iter().enumerate() {
-            if replaced.contains(&entry.cell) {
-                let finest = (0..).zip(&entry.sections).filter(|(_, section)| section.level == 0);
-                sections.extend(finest.map(|(section, _)| SectionRef { chunk, section }));
+            if self.replaced.contains(&entry.cell) {
+                let all = (0..).zip(&entry.sections);
+                let full_detail = all.filter(|(_, section)| section.is_full_detail());
+                sections.extend(full_detail.map(|(section, _)| SectionRef { chunk, section }));
             }
         }
         self.read(sections)

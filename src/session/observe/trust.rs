@@ -104,7 +104,7 @@ impl TrainingCoverage {
         let boxes = BoxIndex::new(&keyframes.iter().map(point).collect::<Vec<_>>());
         let mut heights_m: HashMap<[i64; 2], [f64; 2]> = HashMap::new();
         for chunk in &manifest.chunks {
-            for section in chunk.sections.iter().filter(|section| section.level == 0) {
+            for section in chunk.full_detail() {
                 let bounds = chunk.section_bounds(section);
                 // A cell of 64 m has 4 x 4 blocks.
                 let block_in_cell = [section.block % 4, section.block / 4].map(i64::from);

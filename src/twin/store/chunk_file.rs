@@ -184,7 +184,7 @@ pub(super) fn write(
         out.write_all(&[0; PAGE_BYTES][..(row.offset_bytes - written) as usize])?;
         out.write_all(&packed.bytes)?;
         written = row.offset_bytes + u64::from(row.bytes);
-        if packed.section.level == 0 {
+        if packed.section.is_full_detail() {
             bounds = bounds.union(&packed.bounds);
         }
     }
@@ -300,8 +300,7 @@ pub(super) fn fill(
             return Err(format!("it differs from the manifest in cell {:?}", chunk.cell));
         }
         chunk.sections = contents.in_order();
-        let full = chunk.sections.iter().filter(|section| section.level == 0);
-        let count: u64 = full.map(|section| u64::from(section.count)).sum();
+        let count: u64 = chunk.full_detail().map(|section| u64::from(section.count)).sum();
         if count != chunk.count {
             return Err(format!("it has {count} Gaussians of {} in {:?}", chunk.count, chunk.cell));
         }

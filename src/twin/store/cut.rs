@@ -100,8 +100,7 @@ impl Catalog {
         if cut.is_empty() {
             return Err(StoreError::NothingToCut { cell: None });
         }
-        let levels = manifest.chunks.iter().flat_map(|chunk| &chunk.sections).any(|s| s.level > 0);
-        let storage = StorageOptions { record: manifest.record, levels };
+        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         commit.put(&staying, Some(&cells), &mut |_, _| {})?;
         let mut provenance = manifest.provenance.of_edit();
@@ -114,7 +113,7 @@ impl Catalog {
     fn full_detail(&self, version: &Version, chunk: &ChunkEntry) -> Result<Gaussians, StoreError> {
         let sh_degree = version.manifest.sh_degree;
         let mut all = Gaussians { sh_degree, ..Gaussians::default() };
-        for section in chunk.sections.iter().filter(|section| section.level == 0) {
+        for section in chunk.full_detail() {
             all.append(&self.section(version, chunk, section)?.to_gaussians());
         }
         Ok(all)

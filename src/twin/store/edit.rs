@@ -51,8 +51,7 @@ impl Catalog {
         let is_kept = |drive: &Trajectory| new.iter().all(|other| other.name != drive.name);
         trajectories.retain(is_kept);
         trajectories.extend(new);
-        let levels = manifest.chunks.iter().flat_map(|chunk| &chunk.sections).any(|s| s.level > 0);
-        let storage = StorageOptions { record: manifest.record, levels };
+        let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(&manifest.twin, CommitKind::Import, storage)?;
         if !is_aligned {
             let trajectories = Some(trajectories);

@@ -18,7 +18,7 @@ impl Catalog {
         visit: &mut dyn FnMut(Gaussians),
     ) -> Result<(), StoreError> {
         for chunk in version.manifest.chunks.iter().filter(|chunk| is_wanted(&chunk.bounds)) {
-            for section in chunk.sections.iter().filter(|section| section.level == 0) {
+            for section in chunk.full_detail() {
                 if is_wanted(&chunk.section_bounds(section)) {
                     visit(self.section(version, chunk, section)?.to_gaussians());
                 }
