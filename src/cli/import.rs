@@ -16,6 +16,7 @@ use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 use super::directories::Twins;
 use super::input_files::read_trajectories;
 use super::output;
+use super::packed_folder::scene_file;
 use super::profile_options::ProfileOptions;
 use super::progress;
 use super::rig::rig_of;
@@ -26,6 +27,9 @@ use super::sky_source::SkySource;
 /// The format of SRC is detected from its content, not from its extension; the formats are listed below.
 /// Every Gaussian is checked before anything is written. An import that fails leaves nothing behind.
 ///
+/// A new version of an existing twin has the Gaussians of SRC alone. What was pushed to the twin before is in its earlier
+/// versions (`wildcity twin log`).
+///
 /// Prints how long each phase took: reading and checking the file, sorting Gaussians into cells, packing cells with
 /// their levels of detail, and publishing.
 ///
@@ -34,7 +38,7 @@ use super::sky_source::SkySource;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
-    /// The scene file. For a scene in a folder: its meta.json, lod-meta.json or .gltf.
+    /// The scene file. For a scene in a folder: a SOG's folder, or the .gltf in it.
     #[arg(value_name = "SRC")]
     source: PathBuf,
 
@@ -102,8 +106,8 @@ Formats, and their usual axes. Files of one format differ, so render the twin to
   .ksplat             mkkellogg, levels 0 to 2                              y-down-z-forward
   SPZ 2, 3, 4         Niantic; by its specification right, up, back, but    y-up-z-back
                       some tools keep the axes of the PLY
-  SOG 1 and 2         PlayCanvas; meta.json, or one .sog or .zip            y-down-z-forward
-  streamed SOG        lod-meta.json, or one .zip; the finest level is read  y-down-z-forward
+  SOG 1 and 2         PlayCanvas; a folder, or one .sog or .zip             y-down-z-forward
+  streamed SOG        a folder, or one .zip; the finest level is read       y-down-z-forward
   glTF, GLB           KHR_gaussian_splatting, with the transforms of its    '-1 0 0 0 0 1 0 1 0'
                       nodes; the standard has x left, y up, z to the front
   glTF, GLB of        triangles are covered with 200,000 flat Gaussians     the same
@@ -140,17 +144,18 @@ impl Import {
         let rig = self.rig.as_deref().map(rig_of).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = self.twins.catalog()?;
+        let source = scene_file(self.source)?;
 
         // 2. The scene.
-        let cannot = || format!("cannot import {}", self.source.display());
+        let cannot = || format!("cannot import {}", source.display());
         let mut phases = Phases::start();
         let bar = progress::bytes("reading");
-        let read = read_scene(&self.source, &axes, &mut progress::show(&bar));
+        let read = read_scene(&source, &axes, &mut progress::show(&bar));
         let SourceScene { gaussians, hash, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
         phases.end("read");
         if gaussians.is_empty() {
-            let source = self.source.display();
+            let source = source.display();
             writeln!(
                 std::io::stderr(),
                 "warning: {source} holds no Gaussians: the twin will be empty"

@@ -36,15 +36,7 @@ impl PackedFolder {
 pub(super) fn pack(path: &Path, is_only: bool) -> anyhow::Result<Option<PackedFolder>> {
     let described = path.file_name().and_then(|name| SOG_DESCRIPTIONS.iter().find(|d| name == **d));
     let (folder, description) = if path.is_dir() {
-        let found = SOG_DESCRIPTIONS.iter().find(|name| path.join(name).is_file());
-        let found = found.with_context(|| {
-            let names = SOG_DESCRIPTIONS.join(" or ");
-            let folder = path.display();
-            format!(
-                "{folder} is a folder without {names}: give a scene file, and the files that it names"
-            )
-        })?;
-        (path, *found)
+        (path, description_in(path)?)
     } else if let Some(name) = described.filter(|_| is_only && path.is_file()) {
         let folder = path.parent().filter(|folder| *folder != "").unwrap_or(Path::new("."));
         (folder, *name)
@@ -53,6 +45,25 @@ pub(super) fn pack(path: &Path, is_only: bool) -> anyhow::Result<Option<PackedFo
     };
     let packed = write(folder, description);
     Ok(Some(packed.with_context(|| format!("cannot pack {}", folder.display()))?))
+}
+
+/// The scene file at a path. If a folder is there, it is the description of the SOG in it.
+///
+/// # Errors
+/// The folder has no SOG.
+pub(super) fn scene_file(path: PathBuf) -> anyhow::Result<PathBuf> {
+    if path.is_dir() { Ok(path.join(description_in(&path)?)) } else { Ok(path) }
+}
+
+fn description_in(folder: &Path) -> anyhow::Result<&'static str> {
+    let found = SOG_DESCRIPTIONS.iter().find(|name| folder.join(name).is_file());
+    found.copied().with_context(|| {
+        let names = SOG_DESCRIPTIONS.join(" or ");
+        let folder = folder.display();
+        format!(
+            "{folder} is a folder without {names}: give a scene file, and the files that it names"
+        )
+    })
 }
 
 fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {

@@ -280,7 +280,7 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         let before: u64 = report.cells.iter().map(|cell| cell.before).sum();
         let after: u64 = report.cells.iter().map(|cell| cell.after).sum();
         let cells = report.cells.len();
-        writeln!(out, "cells       {cells} replaced: {before} Gaussians before, {after} after")?;
+        writeln!(out, "cells       {cells}: {before} Gaussians before, {after} after")?;
     }
     if report.left_out > 0 {
         writeln!(out, "left out    {} Gaussians in other cells", report.left_out)?;

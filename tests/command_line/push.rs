@@ -31,7 +31,7 @@ async fn a_file_is_pushed_and_reported() {
     assert!(done.status.success(), "{out}{err}");
     for line in [
         "block.ply: 40 Gaussians",
-        "1 replaced: 32 Gaussians before, 40 after",
+        "cells       1: 32 Gaussians before, 40 after",
         "version 2 is ready",
     ] {
         assert!(out.contains(line), "no {line:?} in {out}");
@@ -131,6 +131,11 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
         }
     }
     assert_eq!(pushed[0], pushed[1], "the same archive: what is not named is no part");
+    // The command line reads the folder itself.
+    let twins = dir.path().join("twins");
+    let import = ["import", folder.to_str().unwrap(), "--twin", "sog", "--twins"];
+    let (ok, said) = wildcity(&[&import[..], &[twins.to_str().unwrap()]].concat());
+    assert!(ok && said.contains("twin sog version 1: 50 Gaussians"), "{said}");
     // One block alone.
     let block = folder.join("0/meta.json");
     let (ok, said) =

@@ -155,7 +155,7 @@ fn devices_pipes_and_files_for_directories_are_refused_at_once() {
     fs::write(&file, b"").unwrap();
     for (arguments, code, wanted) in [
         (vec!["import", "/dev/zero", "--twin", "a"], 1, "not a regular file but a pipe, a socket"),
-        (vec!["import", "/", "--twin", "a"], 1, "a folder; give a file in it"),
+        (vec!["import", "/", "--twin", "a"], 1, "/ is a folder without lod-meta.json or meta.json"),
         (vec!["serve", "--twins", &file], 1, "is not a directory"),
         (vec!["serve", "--listen", "localhost:0"], 2, "an address and a port, as 127.0.0.1:8080"),
     ] {
@@ -239,7 +239,7 @@ fn help_has_examples() {
     for (command, wanted) in [
         ("import", "wildcity import skull.ply --twin skull --axes y-down-z-forward"),
         ("import", "Memory: twice the uncompressed scene"),
-        ("import", "streamed SOG        lod-meta.json, or one .zip"),
+        ("import", "streamed SOG        a folder, or one .zip"),
         ("inspect", "wildcity inspect street@2"),
         ("twin fsck", "wildcity twin fsck street"),
         ("twin gc", "wildcity twin gc street --keep 20 --dry-run"),

@@ -19,6 +19,7 @@ use wildcity_twin::store::{Catalog, StoredActor};
 use super::asset_options::{AssetOptions, name_from};
 use super::summary::Summary;
 use crate::cli::directories::Twins;
+use crate::cli::packed_folder::scene_file;
 use crate::cli::progress;
 
 /// Make an asset of an actor from a file: Gaussians of any format that `wildcity import` reads, or a glTF mesh.
@@ -28,7 +29,7 @@ use crate::cli::progress;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
-    /// The file. For a scene in a folder: its meta.json, lod-meta.json or .gltf.
+    /// The file. For a scene in a folder: a SOG's folder, or the .gltf in it.
     #[arg(value_name = "FILE")]
     source: PathBuf,
 
@@ -52,8 +53,9 @@ Examples:
   wildcity actor import drive.usdz --tracked --name log7";
 
 impl Import {
-    pub(super) fn run(self) -> anyhow::Result<()> {
+    pub(super) fn run(mut self) -> anyhow::Result<()> {
         let settings = self.options.settings(&self.source)?;
+        self.source = scene_file(self.source)?;
         let axes = self.options.source_axes()?;
         let catalog = self.twins.catalog()?;
 
