@@ -28,7 +28,7 @@ pub struct ExtrapolatedView {
 pub struct ViewScores {
     /// The view brought back onto the real image.
     pub reprojection: Reprojection,
-    /// [`super::flicker()`] against the view a step before it on the same line.
+    /// [Flicker](wildcity_render::compare::flicker::flicker) against the view a step before it on the same line.
     #[serde(serialize_with = "serialize_number")]
     pub flicker: f64,
 }

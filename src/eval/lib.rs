@@ -8,7 +8,6 @@
 //! boxes           boxes around what moves, and the pixels that they hide
 //! lidar           points of a LiDAR in the world, and rendered depth against them
 //! reprojection    a view beside the drive, brought back onto a real image
-//! flicker         what changes from one view to the next
 //! extrapolation   the views at one distance from the drive
 //! kid             the distance of two sets of images by features of a network
 //! evaluated_image the scores of one image
@@ -28,7 +27,6 @@ mod evaluated_image;
 mod evaluation;
 mod exposure;
 mod extrapolation;
-mod flicker;
 mod kid;
 mod lidar;
 mod mean;
@@ -44,7 +42,6 @@ pub use evaluated_image::EvaluatedImage;
 pub use evaluation::{BoxesSubject, Evaluation, LidarSubject, RepairSubject, Subject};
 pub use exposure::Exposure;
 pub use extrapolation::{ExtrapolatedView, Extrapolation, ViewMeans, ViewScores};
-pub use flicker::flicker;
 pub use kid::{Kid, KidError, KidScores};
 pub use lidar::{
     BINS_M, DepthMap, LidarBin, LidarDepth, LidarError, LidarMeans, LidarPoints, NO_LIDAR_POINT,

@@ -2,12 +2,12 @@
 
 use crate::error::PushError;
 
-/// Runs `work` on one of tokio's blocking threads and waits for its result.
+/// As [`wildcity_session::run_blocking`], with the errors of a push.
 ///
 /// # Errors
 /// That of `work`, or [`PushError::Crashed`] if `work` panicked.
 pub(crate) async fn run_blocking<T: Send + 'static>(
     work: impl FnOnce() -> Result<T, PushError> + Send + 'static,
 ) -> Result<T, PushError> {
-    tokio::task::spawn_blocking(work).await.map_err(|_| PushError::Crashed)?
+    wildcity_session::run_blocking(work).await.map_err(|_| PushError::Crashed)?
 }

@@ -10,8 +10,8 @@ where
     T: Send + 'static,
     F: Into<Fault> + Send + 'static,
 {
-    let joined = tokio::task::spawn_blocking(work).await;
-    let done = joined
+    let done = wildcity_session::run_blocking(work)
+        .await
         .map_err(|_| Fault::Internal("a task crashed; the server's log says where".to_owned()))?;
     done.map_err(Into::into)
 }

@@ -8,7 +8,7 @@ use crate::error::SessionError;
 ///
 /// # Errors
 /// [`SessionError::Crashed`] if `work` panicked.
-pub(crate) async fn run_blocking<T: Send + 'static>(
+pub async fn run_blocking<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, SessionError> {
     let span = Span::current();

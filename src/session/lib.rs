@@ -40,6 +40,7 @@ mod state;
 mod stills;
 mod viewpoint;
 
+pub use blocking::run_blocking;
 pub use engine::answer_budget::BudgetShare;
 pub use engine::render_queue::{FrameCost, Scratch};
 pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};

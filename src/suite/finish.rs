@@ -3,8 +3,12 @@
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
+use serde::Deserialize as _;
+use serde::de::IntoDeserializer as _;
+use serde::de::value::Error as ValueError;
 
 use wildcity_episode::{EndLine, EpisodeFile, EpisodeResult, result};
+use wildcity_session::{Outcome, run_blocking};
 
 use crate::case::Case;
 use crate::technical::Technical;
@@ -27,11 +31,8 @@ pub(crate) struct Finished {
 /// Judges an episode from its record.
 pub(crate) async fn finish(case: &Case, record: PathBuf) -> Result<Finished, Technical> {
     let case = case.clone();
-    let finished = tokio::task::spawn_blocking(move || finish_file(&case, &record));
-    match finished.await {
-        Ok(finished) => finished,
-        Err(error) => Err(Technical::server(error.to_string())),
-    }
+    let finished = run_blocking(move || finish_file(&case, &record)).await;
+    finished.unwrap_or_else(|error| Err(Technical::server(error.to_string())))
 }
 
 fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
@@ -40,12 +41,14 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     check(case, &episode)?;
     let end = episode.end.clone();
     let end = end.ok_or_else(|| Technical::new("agent_lost", "the record has no end"))?;
-    let kind = match end.outcome.as_str() {
-        "completed" | "off_model" | "driving_failure" => None,
-        "agent_error" => Some("agent_error"),
-        "agent_timeout" => Some("agent_timeout"),
-        "agent_lost" => Some("agent_lost"),
-        _ => Some("server_error"),
+    let outcome = Outcome::deserialize(end.outcome.as_str().into_deserializer());
+    let outcome = outcome.map_err(|error: ValueError| Technical::server(error.to_string()))?;
+    let kind = match outcome {
+        Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure => None,
+        Outcome::AgentError => Some("agent_error"),
+        Outcome::AgentTimeout => Some("agent_timeout"),
+        Outcome::AgentLost => Some("agent_lost"),
+        Outcome::ServerError => Some("server_error"),
     };
     if let Some(kind) = kind {
         return Err(Technical::new(kind, format!("the session ended as {}", end.outcome)));

@@ -6,13 +6,14 @@ use glam::DVec3;
 use serde_json::{Value, json};
 use wildcity_generate::Spoil;
 use wildcity_render::View;
+use wildcity_render::compare::flicker::flicker;
 use wildcity_render::compare::images::render_images;
 use wildcity_render::compare::psnr::psnr_db_u8;
 use wildcity_repair::Model;
 use wildcity_repair::reference::ReferenceCache;
 use wildcity_report::ReportError;
 use wildcity_report::repair::{
-    FRAME_M, ImageKind, RepairBenchmark, RepairReport, RepairRow, RepairSampling, flicker, measure,
+    FRAME_M, ImageKind, RepairBenchmark, RepairReport, RepairRow, RepairSampling, measure,
 };
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::manifest::Provenance;

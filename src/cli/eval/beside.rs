@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use wildcity_eval::{ExtrapolatedView, Extrapolation, Reprojection, ViewScores, flicker, jpeg};
+use wildcity_eval::{ExtrapolatedView, Extrapolation, Reprojection, ViewScores, jpeg};
 use wildcity_render::View;
+use wildcity_render::compare::flicker::flicker;
 use wildcity_repair::Image;
 use wildcity_repair::reference::{
     Projection, Rays, Reference, WarpTarget, Warped, opaque_depth, warp,
@@ -163,7 +164,7 @@ impl Line {
         let onto_now = |of: &dyn Fn(&Drawn) -> Vec<u8>| match &before {
             Some(before) => {
                 let back = into(lens, &now.view, &now.rendered, before, of(before));
-                flicker(&of(&now), &back.image.rgb8, &back.valid)
+                flicker(&of(&now), &back.image.rgb8, &back.valid).unwrap_or(f64::NAN)
             }
             None => f64::NAN,
         };

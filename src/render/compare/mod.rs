@@ -6,11 +6,13 @@
 //! | [`images`] | all images of a view by a backend, parts of images, and [`agree`](images::agree): whether two backends drew the same |
 //! | [`psnr`], [`ssim`], [`flip`] | measures of one pair of images, as other packages compute them |
 //! | [`errors`] | PSNR, SSIM, largest errors and depth errors over many images |
+//! | [`flicker`] | change from one image to the next |
 //! | [`heat`] | colours of error maps |
 //! | [`reprojection`] | how far known points are from their pixels |
 //! | [`json_numbers`] | numbers that JSON lacks (infinity, NaN) |
 
 pub mod errors;
+pub mod flicker;
 pub mod flip;
 pub mod gaussians;
 pub mod heat;

@@ -19,7 +19,6 @@ mod row;
 mod stations;
 
 pub use below::{Below, BelowError, Gains, RecommendedBelow, recommend_below};
-pub use flicker::flicker;
 pub use measure::{RepairBenchmark, RepairSubject, Truth, measure};
 pub use page::section;
 pub use row::{ImageKind, RepairMs, RepairRow, RepairedModel, Sample};

@@ -59,7 +59,7 @@ pub struct Sample {
     pub gain_db: Option<f64>,
     /// Mean FLIP.
     pub flip: Option<f64>,
-    /// [`super::flicker`]; none if the earlier image shows nothing of this one.
+    /// [`wildcity_render::compare::flicker::flicker`]; none if the earlier image shows nothing of this one.
     pub flicker: Option<f64>,
     /// That of the true images.
     pub true_flicker: Option<f64>,

@@ -10,6 +10,8 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
 use wildcity_scene::{Manifest, Trajectory};
+use wildcity_sim::contact::Solids;
+use wildcity_sim::scenario::Scenario;
 use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urgency};
 
 use super::Session;
@@ -20,7 +22,9 @@ use crate::limits;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::schedule::Schedule;
 use crate::observe::trust::TrainingCoverage;
-use crate::options::{ImagePart, Outputs, RandomStart, RigChoice, SessionOptions, Start};
+use crate::options::{
+    ImagePart, Outputs, RandomStart, RigChoice, ScenarioOptions, SessionOptions, Start,
+};
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::repair::references::ReferenceViews;
@@ -50,45 +54,17 @@ impl Session {
         let resident = engine.open_version(options.twin.clone(), options.version).await?;
         let manifest = &resident.version.manifest;
 
-        // The scenario, whose ego section fills in what the request leaves open.
-        let scenario = options.scenario.take();
-        let tells_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
-        let mut loaded = None;
-        let mut solids = None;
-        let scenario = match scenario {
-            None => None,
+        // Read the scenario, whose ego section fills in what the request leaves open.
+        let opened = match options.scenario.take() {
             Some(asked) => {
-                let engine = engine.clone();
-                let version = resident.version.clone();
-                let seed = options.seed;
-                let gives_start = options.start.is_none();
-                let (asked, scenario, found, found_solids) = run_blocking(move || {
-                    let scenarios = engine.scenarios().clone();
-                    let read =
-                        SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start);
-                    let mut scenario = read?;
-                    let found = scenario.of_episode(seed, &version, engine.cache())?;
-                    scenario.pin_assets(&found.loaded);
-                    let catalog = engine.cache().catalog();
-                    let solids = solids_of(&found.loaded.scenario, catalog, &version)?;
-                    Ok::<_, SessionError>((asked, scenario, found, solids))
-                })
-                .await??;
-                let resolved = &found.loaded.scenario;
-                options.start = options.start.or_else(|| scenario.start_of(&found.loaded));
-                if let (true, Some(dynamics)) = (asked.dynamics, resolved.dynamics) {
-                    options.dynamics = dynamics;
-                }
-                if let (true, Some(warm_up_us)) = (asked.warm_up, resolved.warm_up_us) {
-                    options.warm_up_us = warm_up_us;
-                }
-                loaded = Some(found);
-                solids = found_solids;
+                let scenario = OpenedScenario::read(&engine, &resident, asked, &options).await?;
+                scenario.complete(&mut options);
                 Some(scenario)
             }
+            None => None,
         };
 
-        // The cameras. Scaling their overlays takes a second at worst.
+        // Select the cameras. Scaling their overlays takes a second at worst.
         let outputs = options.outputs;
         let rig = {
             let resident = resident.clone();
@@ -101,8 +77,9 @@ impl Session {
             .await??
         };
         let overlays = engine.answer_budget().reserve(overlay_bytes(&rig.cameras))?;
+        let extent = rig_extent(&rig.cameras);
 
-        // The repair of the images. Loading a model takes seconds.
+        // Load the repair model, which takes seconds.
         let repair = match options.repair {
             None => None,
             Some(asked) => {
@@ -114,9 +91,8 @@ impl Session {
                 Some(Arc::new(run_blocking(open).await??))
             }
         };
-        let extent = rig_extent(&rig.cameras);
 
-        // Which images an observation holds, and how they lie in its message.
+        // Decide which images an observation holds, and how they lie in its message.
         let schedule = Schedule::new(
             &rig.cameras,
             dt_us,
@@ -135,42 +111,33 @@ impl Session {
         if let Some(sensors) = options.sensors.and_then(Sensors::used) {
             layout.add_sensors(sensors, dt_us)?;
         }
-        if let Some(found) = &loaded {
-            let actors = found.loaded.scenario.traffic.actors.len();
-            layout.reserve_header(if tells_actors { actors } else { 0 })?;
+        if let Some(opened) = &opened {
+            let actors = opened.resolved().traffic.actors.len();
+            layout.reserve_header(if opened.asked.actors { actors } else { 0 })?;
         }
 
-        // Where episodes start, and the recorded drive that the ego may follow from there.
+        // Find where episodes start, and the recorded drive that the ego may follow from there.
         let start = EpisodeStart::resolve(
             manifest,
             options.start.as_ref(),
             options.warm_up_us,
             options.dynamics,
             options.seed,
-            loaded.as_ref().and_then(|found| found.loaded.lanes()),
+            opened.as_ref().and_then(|opened| opened.episode.loaded.lanes()),
         )?;
         let drive = drive_to_follow(&manifest.trajectories, options.start.as_ref());
         let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
 
-        // The render profile, and the sky map that it requires.
-        let profile = options.profile.apply(manifest.profile)?;
-        engine.check_profile(&profile)?;
-        Engine::bake_sky(resident.clone(), profile).await?;
-
-        // Where the twin was recorded, for the trust of images, by which repair selects them.
-        let coverage = match (outputs.trust, &repair) {
-            (true, _) => Some(training_coverage(&resident, "outputs.trust").await?),
-            (false, Some(_)) => Some(training_coverage(&resident, "repair").await?),
-            (false, None) => None,
-        };
-
-        // The memory for the worst frame anywhere in the twin.
-        let frame = frame_bytes(&engine, &layout, coverage.is_some());
-        let reservation = Engine::reserve(resident.clone(), extent, profile, frame).await?;
-
         let episode = start
             .episode(options.seed, options.dynamics, dt_us)
             .with_sensors(layout.episode_sensors());
+        let tells_actors = opened.as_ref().is_some_and(|opened| opened.asked.actors);
+        let (scenario, loaded, solids) = match opened {
+            Some(OpenedScenario { scenario, episode, solids, .. }) => {
+                (Some(scenario), Some(episode), solids)
+            }
+            None => (None, None, None),
+        };
         let settings = SessionSettings {
             profile_overrides: options.profile,
             rig_name: rig.name,
@@ -190,15 +157,18 @@ impl Session {
             tells_actors,
             repair,
         };
-        let references = match &settings.repair {
-            Some(repair) => {
-                references_of(&engine, &resident, repair, settings.layout.clone()).await?
-            }
-            None => None,
+
+        // Prepare the version for its frames, and reserve the memory for the worst frame anywhere in the twin.
+        let coverage_for = match (outputs.trust, &settings.repair) {
+            (true, _) => Some("outputs.trust"),
+            (false, Some(_)) => Some("repair"),
+            (false, None) => None,
         };
-        let version = PinnedVersion::new(resident, profile, coverage)
-            .with_solids(solids)
-            .with_references(references);
+        let version = prepare(&engine, resident.clone(), &settings, coverage_for).await?;
+        let version = version.with_solids(solids);
+        let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        let reservation = Engine::reserve(resident, extent, version.profile, frame).await?;
+
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
@@ -258,14 +228,9 @@ impl Session {
             return Ok(());
         }
         let extent = rig_extent(self.settings.layout.cameras());
-        let overrides = &self.settings.profile_overrides;
-        let profile = overrides.apply(resident.version.manifest.profile)?;
-        Engine::bake_sky(resident.clone(), profile).await?;
-        let bytes = Engine::worst_case_bytes(resident.clone(), extent, profile).await?;
-        let coverage = match &self.version.coverage {
-            Some(_) => Some(training_coverage(&resident, "outputs.trust").await?),
-            None => None,
-        };
+        let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
+        let version = prepare(&self.engine, resident.clone(), &self.settings, coverage_for).await?;
+        let bytes = Engine::worst_case_bytes(resident.clone(), extent, version.profile).await?;
         let solids = match &self.state.traffic {
             None => None,
             Some(traffic) => {
@@ -276,18 +241,9 @@ impl Session {
                 run_blocking(find).await??
             }
         };
-        let references = match &self.settings.repair {
-            Some(repair) => {
-                let layout = self.settings.layout.clone();
-                references_of(&self.engine, &resident, repair, layout).await?
-            }
-            None => None,
-        };
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
-        self.reservation.exchange(resident.clone(), bytes)?;
-        self.version = PinnedVersion::new(resident, profile, coverage)
-            .with_solids(solids.clone())
-            .with_references(references);
+        self.reservation.exchange(resident, bytes)?;
+        self.version = version.with_solids(solids.clone());
         if let Some(traffic) = self.state.traffic.take() {
             self.state.traffic = Some(traffic.with_solids(solids, self.state.episode.ego()));
         }
@@ -297,6 +253,79 @@ impl Session {
         self.prefetch_at(places);
         Ok(())
     }
+}
+
+/// The scenario that a session asks for, and its first episode.
+struct OpenedScenario {
+    asked: ScenarioOptions,
+    scenario: SessionScenario,
+    episode: EpisodeScenario,
+    /// The solid Gaussians beside its route; only if a contact with them ends an episode.
+    solids: Option<Arc<Solids>>,
+}
+
+impl OpenedScenario {
+    async fn read(
+        engine: &Arc<Engine>,
+        resident: &Arc<Resident>,
+        asked: ScenarioOptions,
+        options: &SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let engine = engine.clone();
+        let version = resident.version.clone();
+        let seed = options.seed;
+        let gives_start = options.start.is_none();
+        run_blocking(move || {
+            let scenarios = engine.scenarios().clone();
+            let mut scenario =
+                SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start)?;
+            let episode = scenario.of_episode(seed, &version, engine.cache())?;
+            scenario.pin_assets(&episode.loaded);
+            let catalog = engine.cache().catalog();
+            let solids = solids_of(&episode.loaded.scenario, catalog, &version)?;
+            Ok(Self { asked, scenario, episode, solids })
+        })
+        .await?
+    }
+
+    fn resolved(&self) -> &Scenario {
+        &self.episode.loaded.scenario
+    }
+
+    /// Adds what the ego section says to what the request leaves open.
+    fn complete(&self, options: &mut SessionOptions) {
+        if options.start.is_none() {
+            options.start = self.scenario.start_of(&self.episode.loaded);
+        }
+        if let (true, Some(dynamics)) = (self.asked.dynamics, self.resolved().dynamics) {
+            options.dynamics = dynamics;
+        }
+        if let (true, Some(warm_up_us)) = (self.asked.warm_up, self.resolved().warm_up_us) {
+            options.warm_up_us = warm_up_us;
+        }
+    }
+}
+
+/// Prepares a version for the frames of a session: bakes its sky, and reads where it was trained and the images that the
+/// repair model compares with. `coverage_for` is the field of the request that needs to know where it was trained.
+async fn prepare(
+    engine: &Arc<Engine>,
+    resident: Arc<Resident>,
+    settings: &SessionSettings,
+    coverage_for: Option<&'static str>,
+) -> Result<PinnedVersion, SessionError> {
+    let profile = settings.profile_overrides.apply(resident.version.manifest.profile)?;
+    engine.check_profile(&profile)?;
+    Engine::bake_sky(resident.clone(), profile).await?;
+    let coverage = match coverage_for {
+        Some(field) => Some(training_coverage(&resident, field).await?),
+        None => None,
+    };
+    let references = match &settings.repair {
+        Some(repair) => references_of(engine, &resident, repair, settings.layout.clone()).await?,
+        None => None,
+    };
+    Ok(PinnedVersion::new(resident, profile, coverage).with_references(references))
 }
 
 fn check_dt(dt_us: Option<i64>) -> Result<i64, SessionError> {
