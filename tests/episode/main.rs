@@ -2,6 +2,8 @@
 
 #[path = "../support/root.rs"]
 mod root;
+#[path = "../support/thread_time.rs"]
+mod thread_time;
 
 mod calibration;
 mod diff;

@@ -5,6 +5,8 @@
 mod data;
 #[path = "../support/root.rs"]
 mod root;
+#[path = "../support/thread_time.rs"]
+mod thread_time;
 #[path = "../support/vectors.rs"]
 mod vectors;
 
