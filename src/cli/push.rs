@@ -130,6 +130,14 @@ impl Push {
             (PushState::Ready, Some(version), _) => {
                 let hash = pushed.version_hash.unwrap_or_default();
                 writeln!(out, "twin {} version {version} is ready\nblake3 {hash}", pushed.twin)?;
+                if self.frame.is_none() && pushed.report.is_some_and(|report| report.aligned) {
+                    let twin = pushed.twin;
+                    writeln!(
+                        io::stderr(),
+                        "warning: twin {twin} was aligned, and the files were taken to be in its axes: give --frame \
+                         twin if they are, or --frame capture if they are in those of its capture"
+                    )?;
+                }
                 Ok(())
             }
             (state, _, error) => {

@@ -11,12 +11,12 @@ from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as connect_websocket
 from websockets.exceptions import WebSocketException
 
+from .authorization import authorization_headers
 from .session_protocol import (
     CONNECT_OPTIONS,
     Exchange,
     Message,
     SessionProtocol,
-    authorization_headers,
     can_reuse_connection,
     connect_failed,
     translate_error,
@@ -63,7 +63,7 @@ async def connect(
     """Connects to `ws://HOST:PORT/v1/session` or `wss://HOST/v1/session` and sends `hello`.
 
     `name` appears in the server's log. `timeout` is how long an answer may take, in seconds; the server's own
-    limits are shorter. `token` is for a server that was started with tokens.
+    limits are shorter. `token` is for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
 
     With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must run
     on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are

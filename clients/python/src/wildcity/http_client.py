@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import http.client
 import json
-import os
 import time
 import urllib.parse
 from collections.abc import Iterator
 from typing import Any
 
+from .authorization import authorization_headers
 from .errors import ConnectFailed, ProtocolError, Refused
 from .protocol import to_json
 
@@ -32,7 +32,7 @@ class HttpClient:
         self._host = parts.hostname
         self._port = parts.port
         self._timeout = timeout
-        self._token = token or os.environ.get("WILDCITY_TOKEN")
+        self._headers = authorization_headers(token)
 
     def json_with_retries(self, method: str, path: str, body: Any) -> Any:
         """As `json`, and repeats the request up to `ATTEMPTS` times if no answer comes."""
@@ -51,9 +51,7 @@ class HttpClient:
         headers: dict[str, str] | None = None,
     ) -> Any:
         """Sends JSON or bytes, and returns the JSON of the answer."""
-        sent = dict(headers or {})
-        if self._token:
-            sent["Authorization"] = f"Bearer {self._token}"
+        sent = {**self._headers, **(headers or {})}
         content = to_json(body).encode() if isinstance(body, dict) else body
         connection = self._connection_type(self._host, self._port, timeout=self._timeout)
         try:

@@ -8,6 +8,7 @@ import os
 import time
 import urllib.parse
 import uuid
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,7 +124,14 @@ def push(
         counts = answer["progress"]
         report(PushProgress(answer["state"], counts["done"], counts["total"]))
         if answer["state"] in ("ready", "refused", "failed"):
-            return _finished_push(answer)
+            push = _finished_push(answer)
+            if frame is None and push.report.get("aligned"):
+                warnings.warn(
+                    f"twin {twin} was aligned, and the files were taken to be in its axes: "
+                    'give frame="twin" if they are, or frame="capture" if they are in those of its capture',
+                    stacklevel=2,
+                )
+            return push
         time.sleep(POLL_INTERVAL_S)
         try:
             answer = http_client.json_with_retries("GET", f"{path}/{answer['id']}", None)

@@ -14,7 +14,7 @@ from collections.abc import Generator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, TypeVar
 
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Subprotocol
 
 from .errors import ConnectFailed, Disconnected, ProtocolError, Refused, TimedOut, WildCityError
@@ -315,16 +315,21 @@ CONNECT_OPTIONS: dict[str, Any] = {
 """Options with which both clients connect."""
 
 
-def authorization_headers(token: str | None) -> dict[str, str]:
-    """Additional headers of the WebSocket upgrade request."""
-    return {} if token is None else {"Authorization": f"Bearer {token}"}
-
-
 def connect_failed(url: str, error: Exception) -> ConnectFailed:
     """Why there is no connection; and what an address looks like, if this one does not look so."""
     is_session = url.startswith(("ws://", "wss://")) and url.endswith("/v1/session")
     hint = "" if is_session else "; the address of a server is ws://HOST:PORT/v1/session"
-    return ConnectFailed(f"cannot connect to {url}: {error}{hint}")
+    reason = refusal_of(error) if isinstance(error, InvalidStatus) else None
+    return ConnectFailed(f"cannot connect to {url}: {reason or error}{hint}")
+
+
+def refusal_of(error: InvalidStatus) -> str | None:
+    """The code and the message with which the server refused the upgrade to WebSocket, if it gave some."""
+    try:
+        refusal = json.loads(error.response.body or b"")
+        return f"{refusal['code']}: {refusal['message']}"
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def can_reuse_connection(error: BaseException) -> bool:
