@@ -19,7 +19,7 @@ pub(super) const GC_KEEP: u32 = 50;
 /// How long garbage is kept by default: longer than the preparation of any commit takes.
 pub(super) const GC_GRACE: &str = "24h";
 
-/// Largest rig or trajectory file: what fits into a manifest.
+/// Largest rig or trajectory file: as much as fits into a manifest.
 pub(super) const SETTINGS_FILE_BYTES: u64 = wildcity_twin::limits::MANIFEST_BYTES;
 
 /// Largest profile file. A profile has twelve fields of about 40 B; the rest is room for white space.
@@ -34,5 +34,5 @@ pub(super) const REPORT_WINDOW_PX: i64 = 256;
 /// Most Gaussians of a street of `wildcity bench gpu`: each takes 200 B while the street is made.
 pub(super) const BENCH_GAUSSIANS: i64 = 100_000_000;
 
-/// Largest file of boxes or LiDAR points: an hour of a LiDAR of 64 rows is 20 GB, of which one reads some minutes.
+/// Largest file of boxes or LiDAR points. An hour of a LiDAR with 64 rows has 20 GB: give some minutes of it.
 pub(super) const LABEL_BYTES: u64 = 4 << 30;

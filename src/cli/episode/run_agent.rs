@@ -8,23 +8,23 @@ use wildcity_suite::{AGENTS, AgentChoice, BuiltIn, ExitCode};
 
 use super::{bad_input, exit};
 
-/// How an agent is called that is a driver of AlpaSim.
+/// Prefix of an agent that is a driver of AlpaSim.
 const EGODRIVER: &str = "egodriver:";
 
 /// How long one attempt to connect may take, and the time between two.
 const ATTEMPT: Duration = Duration::from_secs(2);
 const RETRY: Duration = Duration::from_millis(200);
 
-/// An agent by what the command line or the suite says.
+/// The agent that the command line or the suite names.
 ///
 /// # Errors
-/// It is empty, or the address of a driver is none; exit code 2.
+/// It is empty, or has an invalid address of a driver; exit code 2.
 pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
     if let Some(built_in) = BuiltIn::named(agent) {
         return Ok(AgentChoice::BuiltIn(built_in));
     }
     let line = match agent.strip_prefix(EGODRIVER) {
-        // This program is the bridge. The address is an argument of its own for the shell.
+        // This program is the bridge. The address is an argument of its own in the shell.
         Some(address) => {
             check_address(address).map_err(|reason| {
                 bad_input(format!("{agent:?} is no agent: expected egodriver:HOST:PORT; {reason}"))
@@ -60,8 +60,8 @@ fn check_address(address: &str) -> Result<(), &'static str> {
     }
 }
 
-/// Waits until the driver of AlpaSim listens, if the agent is one. The bridge of each episode would wait as long, and say
-/// nothing.
+/// Waits until the driver of AlpaSim listens, if the agent is one. Otherwise the bridge of each episode would wait for
+/// the same time, without a message.
 ///
 /// # Errors
 /// Nothing listens in the time that a driver may take to start; exit code 3.

@@ -10,7 +10,7 @@ use wildcity_episode::{EpisodeFile, EpisodeResult, result};
 
 use crate::cli::directories::Episodes;
 
-/// Score recorded episodes, from their records alone: no renderer, no twin.
+/// Score recorded episodes from their records only, without a renderer or a twin.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Score {

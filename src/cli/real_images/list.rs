@@ -18,7 +18,7 @@ pub(in crate::cli) struct RealImage {
     pub(in crate::cli) file: PathBuf,
     pub(in crate::cli) mask: Option<PathBuf>,
     pub(in crate::cli) camera: Camera,
-    /// In the axes and unit of the list.
+    /// Pose in the axes and unit of the list.
     pub(in crate::cli) world_from_camera: Pose,
     /// The smallest z that it draws, if the list says one, in units of the scene.
     pub(in crate::cli) near: Option<f64>,
@@ -90,7 +90,7 @@ impl ImageList {
         Ok(Self { images: found, is_in_scene_axes })
     }
 
-    /// Every `step`-th image, beginning with the first.
+    /// Every `step`-th image, starting with the first.
     pub(in crate::cli) fn every(&self, step: usize) -> Vec<&RealImage> {
         self.images.iter().step_by(step).collect()
     }

@@ -1,4 +1,4 @@
-//! What `wildcity doctor --config` looks at in the configuration of a server.
+//! The checks of a server's configuration that `wildcity doctor --config` makes.
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
@@ -12,7 +12,7 @@ use crate::cli::directories::ServerDirectories;
 
 use super::{Serve, config_file};
 
-/// What was looked at, and what was found: good, or what is wrong.
+/// The subject of a check, and its result: what is good, or what is wrong.
 pub(in crate::cli) type Check = (&'static str, Result<String, String>);
 
 impl Serve {
