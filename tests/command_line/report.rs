@@ -38,7 +38,7 @@ fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
     }
 }
 
-/// What is enough where the numbers of a report do not matter.
+/// The smallest sampling, for tests in which the numbers of a report do not matter.
 const SMALLEST: [&str; 4] = ["--stations", "2", "--window", "16"];
 
 /// The command's report of the street in a directory, in its folder `report`.

@@ -64,7 +64,7 @@ fn a_scenario_is_checked_and_shown_with_its_map() {
     fs::write(at.join("two.json"), shown["scenario"].to_string()).unwrap();
     assert_eq!(show(&["--seed", "9"]), shown);
 
-    // A map that changed is another one, unless the user accepts it.
+    // A changed map is a different map, unless the user accepts it.
     let map = fs::read_to_string(at.join("test.map.json")).unwrap();
     fs::write(at.join("test.map.json"), format!("{map}\n")).unwrap();
     let error = refused(&[&["scenario", "check", "two.json"][..], &twins].concat(), at);

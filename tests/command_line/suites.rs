@@ -140,7 +140,7 @@ fn a_run_against_another_is_one_command() {
     }
     assert!(bench.out("worse/report.html").contains("Exit code 1: of 2 episodes 2 failed"));
 
-    // What failed before may fail now; what JUnit says does not change.
+    // Episodes that failed before may fail again; the content of junit.xml does not change.
     let kept = bench.run("stand", "kept", &["--against", "stand"]);
     let (out, _) = ends(&kept, 0);
     assert!(

@@ -13,7 +13,7 @@ use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{render, view_along};
 use crate::streets::{street, turning_views};
 
-/// Most bytes per resident Gaussian of SH degree 1.
+/// Largest number of bytes per resident Gaussian of SH degree 1.
 const BYTES: f64 = 64.0;
 
 /// The demo street in blocks of 16 m as in a twin, for each focal length. Each block is at the coarsest level of detail

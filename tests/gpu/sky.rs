@@ -111,7 +111,7 @@ fn a_sky_behind_lenses_and_shutters() {
 
 #[test]
 fn images_and_a_background() {
-    // A colour for every direction, so that edges of faces are no seams.
+    // A colour for every direction, so that edges of faces are not seams.
     let mut rgb8 = Vec::new();
     for face in 0..6 {
         for k in 0..81 {
@@ -148,7 +148,7 @@ fn a_sky_behind_gaussians() {
     for (image, truth) in images.iter().zip(&truths) {
         agree(image, truth).unwrap();
     }
-    // In parts, the same bytes.
+    // A frame that is drawn in parts has the same bytes.
     let small = gpu_with_limits(bindings(2 << 20));
     let at_once = render(&gpu, &scene, &RenderProfile::DEFAULT, &street_views());
     assert!(render(&small, &scene, &RenderProfile::DEFAULT, &street_views()) == at_once);

@@ -43,7 +43,7 @@ struct Truth {
     pixels: OnceLock<Vec<Image>>,
 }
 
-/// One for all tests.
+/// The same instance for all tests.
 static TRUTH: LazyLock<Truth> = LazyLock::new(|| Truth::new(&cpu(), 7_000, wide_views(), 0.0));
 
 /// The same street with every lens and with rolling shutters.

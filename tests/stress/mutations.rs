@@ -456,7 +456,7 @@ fn every_check_of_moving_actors_fails_under_a_mutation() {
     for number in ["T29", "T30"] {
         let sound = case(number).checks(&backend).unwrap();
         assert!(sound.iter().all(Check::holds), "{number}: {sound:?}");
-        // What is finite is T16's.
+        // T16 checks that values are finite.
         let mut unfailed: Vec<&str> = sound.iter().map(|check| &*check.what).collect();
         unfailed.retain(|what| !what.ends_with("every value is finite"));
         assert!(unfailed.len() >= 4, "{number}: {unfailed:?}");

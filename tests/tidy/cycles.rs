@@ -60,7 +60,7 @@ fn edges(files: &BTreeMap<String, String>) -> Edges {
     edges
 }
 
-/// Groups of files each of which reaches each other, sorted.
+/// Groups of files that all reach each other, sorted.
 fn cycles_of(edges: &Edges) -> Vec<Vec<String>> {
     let reached: BTreeMap<&String, BTreeSet<&String>> =
         edges.keys().map(|file| (file, reached_from(edges, file))).collect();
