@@ -19,7 +19,7 @@ use super::serve::Serve;
 
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
 ///
-/// Prints one line for each check. A line that begins with `bad` says what to do; then the exit code is 1. `note` is
+/// Prints one line for each check. A line that starts with `bad` says what to do; then the exit code is 1. `note` is
 /// for information only. Nothing is changed: the check whether a directory can be written creates an unnamed file in it
 /// and removes it.
 #[derive(Debug, clap::Args)]
@@ -53,7 +53,7 @@ Examples:
 const LITTLE_MEMORY_BYTES: u64 = 2 << 30;
 /// Free space below which a push or a day of records may fail.
 const LITTLE_DISK_BYTES: u64 = 5 << 30;
-/// Files of a full server: 1,024 connections, 512 newcomers, and what it reads.
+/// Open files of a full server: 1,024 connections, 512 unauthenticated ones, and the files that it reads.
 const FILES: u64 = 4096;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -177,7 +177,7 @@ fn devices_found() -> Finding {
         None => {
             let found = match devices.is_empty() {
                 true => "no Vulkan device",
-                false => "no Vulkan device but software",
+                false => "no Vulkan device except software",
             };
             let text = format!(
                 "{found}: the server renders on the CPU. For a GPU install its driver with Vulkan, and in a \
@@ -199,7 +199,7 @@ fn memory() -> Finding {
     match bytes >= LITTLE_MEMORY_BYTES {
         true => Finding::new(Level::Good, "memory", text),
         false => {
-            Finding::new(Level::Note, "memory", format!("{text}: enough for small twins alone"))
+            Finding::new(Level::Note, "memory", format!("{text}: enough for small twins only"))
         }
     }
 }

@@ -67,7 +67,7 @@ pub(super) struct Drive {
     #[arg(long, value_name = "NAME")]
     rig: Option<String>,
 
-    /// Cameras that the driver sees [default: all of the rig]
+    /// Cameras whose images the driver receives [default: all of the rig]
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     cameras: Option<Vec<String>>,
 
@@ -214,7 +214,7 @@ fn asked(name: &str) -> anyhow::Result<String> {
 }
 
 fn number(name: &str) -> anyhow::Result<u64> {
-    asked(name)?.parse().with_context(|| format!("{name} is no number"))
+    asked(name)?.parse().with_context(|| format!("{name} is not a number"))
 }
 
 fn line(report: &EpisodeReport) -> serde_json::Value {
@@ -235,7 +235,7 @@ fn line(report: &EpisodeReport) -> serde_json::Value {
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
-    let refused = || format!("{text:?} is no size; expected WIDTHxHEIGHT in pixels, as 576x320");
+    let refused = || format!("{text:?} is not a size; expected WIDTHxHEIGHT in pixels, as 576x320");
     let (width, height) = text.split_once('x').ok_or_else(refused)?;
     Ok([width.parse().map_err(|_| refused())?, height.parse().map_err(|_| refused())?])
 }

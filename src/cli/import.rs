@@ -215,7 +215,7 @@ impl Import {
     }
 }
 
-/// How long each phase of an import took.
+/// The time of each phase of an import.
 struct Phases {
     began: Instant,
     ended: Vec<(&'static str, Duration)>,
@@ -226,7 +226,7 @@ impl Phases {
         Self { began: Instant::now(), ended: Vec::new() }
     }
 
-    /// The phase `name` ends, and the next one begins.
+    /// Ends the phase `name` and starts the next one.
     fn end(&mut self, name: &'static str) {
         let now = Instant::now();
         self.ended.push((name, now - self.began));

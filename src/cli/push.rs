@@ -112,7 +112,7 @@ impl Push {
             [all] if all == "all" => Some(CellSelection::All(AllCells::All)),
             cells if cells.iter().any(|cell| cell == "all") => {
                 anyhow::bail!(
-                    "--cells all replaces all cells: give it once, and no cells beside it"
+                    "--cells all replaces all cells: give it once, without other cells"
                 )
             }
             cells => Some(CellSelection::Listed(

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use wildcity_repair::{LoadOptions, Models, RepairError};
 
-/// Most threads of a model.
+/// Largest number of threads of a model.
 const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 
 /// The models that repair images.

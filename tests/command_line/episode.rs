@@ -42,7 +42,7 @@ fn a_suite_is_driven_and_its_records_are_read() {
     let stand = run("stand", "stand");
     assert_eq!(stand.status.code(), Some(1), "{}", stdout(&stand));
     assert!(stdout(&stand).contains("progress"), "{}", stdout(&stand));
-    // A verdict is no error of the program.
+    // A verdict is not an error of the program.
     let verdict = String::from_utf8(stand.stderr).unwrap();
     assert!(verdict.starts_with("of 1 episodes 1 failed, "), "{verdict}");
     let wanted = ["run", "short.json", "--twins", twins, "--at-least", "0.9", "--out", "wanted"];

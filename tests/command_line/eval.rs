@@ -270,7 +270,7 @@ fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
         let numbers = [&image["psnr_db"], &image["ssim"], &image["flip"], &image["counted"]];
         assert_eq!(numbers, [&json!("inf"), &json!(1.0), &json!(0.0), &json!(0.5)]);
     }
-    // Names of transforms.json begin with the folder of the images; masks need not be in a folder of that name.
+    // Names of transforms.json start with the folder of the images; masks need not be in a folder of that name.
     let frames = transforms(&json!({})).replace("front/", "images/front/");
     fs::write(at.join("transforms.json"), frames).unwrap();
     mask.save(at.join("masks/front/b.png")).unwrap();

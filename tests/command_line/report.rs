@@ -1,4 +1,4 @@
-//! `wildcity report`, and what `serve` loads.
+//! `wildcity report`, and the libraries that `serve` loads.
 
 use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
@@ -189,7 +189,7 @@ fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
     );
     assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
     assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
-    // Nor is a profile left if there is no goal.
+    // The old profile is also removed if there is no goal.
     an_earlier_one();
     assert!(report_of(dir.path(), SMALLEST, &[]).status.success() && !file.exists());
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();

@@ -60,7 +60,7 @@ fn a_scenario_is_checked_and_shown_with_its_map() {
     assert_eq!(shown["scenario"]["actors"][0]["idm"]["speed"], 2.0);
     assert_eq!(shown["scenario"]["twin"]["version_hash"].as_str().unwrap().len(), 64);
     assert_ne!(shown["hash"], show(&["--seed", "0", "--value", "v=2"])["hash"]);
-    // What is shown is a scenario, and the same episode.
+    // The output is a scenario, and the same episode.
     fs::write(at.join("two.json"), shown["scenario"].to_string()).unwrap();
     assert_eq!(show(&["--seed", "9"]), shown);
 

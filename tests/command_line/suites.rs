@@ -1,4 +1,4 @@
-//! `wildcity episode run` and `compare` in CI: what is refused, what is compared, and with which exit code.
+//! `wildcity episode run` and `compare` in CI: refused input, comparisons, and exit codes.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -307,7 +307,7 @@ fn records_are_found_in_a_run_and_named() {
         "{}",
         text(&missing.stderr)
     );
-    // A name with a dot is no file name.
+    // A name with a dot is not a file name.
     let episodes = bench.path().join("main/episodes");
     std::fs::rename(episodes.join("short-1-1.jsonl"), episodes.join("short-1.2-1.jsonl")).unwrap();
     ends(&bench.episode(&["show", "short-1.2-1", "--episodes", "main"]).output().unwrap(), 0);

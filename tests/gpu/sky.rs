@@ -84,7 +84,7 @@ fn a_sky_behind_lenses_and_shutters() {
     let half = |view: View| View { camera: view.camera.scaled(80, 50).unwrap(), ..view };
     let mut views: Vec<View> = lens_views().into_iter().map(half).collect();
     views.push(half(street_views()[1]));
-    // Where Newton's steps alone, from the middle or the end, would lead nowhere.
+    // Newton's steps alone do not converge here, neither from the middle nor from the end.
     let far = OpenCv::new([0.75, -0.27, -0.096, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: 33.0, fy: 33.0, cx: 50.0, cy: 50.0 };
     let far = Camera { lens: Lens::opencv(far), ..Camera::from_pinhole(100, 100, pinhole) };

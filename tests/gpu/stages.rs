@@ -1,4 +1,4 @@
-//! Each stage alone, on the outputs of the cpu backend's previous stage: gpu against cpu and against f64.
+//! Each stage by itself, on the outputs of the cpu backend's previous stage: gpu against cpu and against f64.
 //! Mutation tests check that each comparison can fail, and that it distinguishes the wrong stage from the
 //! right ones.
 

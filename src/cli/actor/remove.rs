@@ -20,7 +20,7 @@ pub(super) struct Remove {
     #[arg(value_name = "ACTOR")]
     actor: String,
 
-    /// Only print what would be done.
+    /// Only print what would be removed.
     #[arg(long)]
     dry_run: bool,
 

@@ -275,7 +275,7 @@ impl Augment {
         }
     }
 
-    /// Writes transforms.json, the COLMAP model and augment.json, and says what was made.
+    /// Writes transforms.json, the COLMAP model and augment.json, and prints a summary.
     fn finish(
         &self,
         catalog: &Catalog,

@@ -12,7 +12,7 @@ use wildcity_twin::store::Version;
 
 use crate::cli::repair_options::runtime_library;
 
-/// Most threads of a model.
+/// Largest number of threads of a model.
 const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 /// The rig of a twin without one, as in a session.
 const DEFAULT_RIG: &str = "vehicle6";
@@ -95,7 +95,7 @@ fn sized(camera: Camera, side_px: Option<u32>) -> anyhow::Result<Camera> {
 pub(super) fn metres(text: &str) -> Result<f64, String> {
     let text = text.trim();
     let number = text.strip_suffix('m').unwrap_or(text).trim_end();
-    number.parse().map_err(|_| format!("{text:?} is no number of metres, such as 2 or 2m"))
+    number.parse().map_err(|_| format!("{text:?} is not a number of metres, such as 2 or 2m"))
 }
 
 fn trust(text: &str) -> Result<f64, String> {

@@ -86,12 +86,12 @@ fn unreadable(error: ReadError) -> anyhow::Error {
     ))
 }
 
-/// The end of a command for a mistake in what it was given: exit code 2.
+/// The error of a command for a mistake in its input: exit code 2.
 fn bad_input(message: impl std::fmt::Display) -> anyhow::Error {
     exit(ExitCode::Usage, message)
 }
 
-/// The end of a command that could not do what it should.
+/// The error of a command that failed, with an exit code.
 fn exit(code: ExitCode, message: impl std::fmt::Display) -> anyhow::Error {
     Exit::error(code as u8, format!("{message:#}")).into()
 }

@@ -58,11 +58,11 @@ pub(super) struct Run {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
     jobs: u16,
 
-    /// How often an episode that failed for technical reasons is driven again.
+    /// Largest number of times that an episode is driven again after a technical failure.
     #[arg(long, value_name = "N", default_value_t = 1)]
     retries: u32,
 
-    /// How long a command may take for an episode, in seconds.
+    /// Time limit of a command for an episode, in seconds.
     #[arg(long, value_name = "S", default_value_t = wildcity_suite::limits::AGENT_TIMEOUT.as_secs())]
     agent_timeout_s: u64,
 

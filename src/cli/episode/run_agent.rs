@@ -27,7 +27,7 @@ pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
         // This program is the bridge. The address is an argument of its own in the shell.
         Some(address) => {
             check_address(address).map_err(|reason| {
-                bad_input(format!("{agent:?} is no agent: expected egodriver:HOST:PORT; {reason}"))
+                bad_input(format!("{agent:?} is not an agent: expected egodriver:HOST:PORT; {reason}"))
             })?;
             let program = std::env::current_exe().map_err(bad_input)?;
             format!("'{}' drive --egodriver '{address}'", program.display())
@@ -40,11 +40,11 @@ pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
     Ok(AgentChoice::Command { name: agent.to_owned(), line })
 }
 
-/// Checks that an address is HOST:PORT, of characters that a shell leaves alone.
+/// Checks that an address is HOST:PORT, without characters that have a meaning in a shell.
 fn check_address(address: &str) -> Result<(), &'static str> {
     let is_allowed = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
     if !address.chars().all(is_allowed) {
-        return Err("an address has letters, digits and -._:[] alone");
+        return Err("an address has only letters, digits and -._:[]");
     }
     let Some((host, port)) = address.rsplit_once(':') else { return Err("there is no port") };
     let is_ipv6 = host.starts_with('[') && host.ends_with(']');

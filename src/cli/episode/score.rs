@@ -18,7 +18,7 @@ pub(super) struct Score {
     #[arg(value_name = "EPISODE", required = true)]
     episodes_to_score: Vec<PathBuf>,
 
-    /// Print one JSON object per episode, with what each score was computed from.
+    /// Print one JSON object per episode, with the values from which each score was computed.
     #[arg(long)]
     json: bool,
 

@@ -41,10 +41,11 @@ impl NetworkOptions {
         let load = |option: &str, path: &Path, compares: bool| {
             let about = || format!("{option} {}", path.display());
             let network = Network::load(path, options).with_context(about)?;
-            let roles = if compares { "\"image\" and \"truth\"" } else { "\"image\" alone" };
+            let roles =
+                if compares { "roles \"image\" and \"truth\"" } else { "role \"image\" only" };
             ensure!(
                 network.manifest().compares() == compares,
-                "{}: inputs: {option} takes a network with the roles {roles}",
+                "{}: inputs: {option} takes a network with the {roles}",
                 path.display()
             );
             Ok(network)

@@ -20,7 +20,7 @@ use crate::cli::directories::Twins;
 use crate::cli::repair_options::runtime_library;
 use crate::cli::scene_source::Source;
 
-/// Most threads of a network.
+/// Largest number of threads of a network.
 const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 
 /// `--repair` and the runtime of networks.

@@ -44,7 +44,7 @@ impl Import {
             false => {
                 anyhow::ensure!(
                     self.origin.is_none(),
-                    "--origin is for GeoJSON; {} is none",
+                    "--origin is for GeoJSON; {} is not GeoJSON",
                     self.file.display()
                 );
                 let imported = opendrive::read(&bytes).with_context(context)?;

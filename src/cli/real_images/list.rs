@@ -47,7 +47,7 @@ struct ListedImage {
 /// A list before its files are looked for.
 struct Listed {
     images: Vec<ListedImage>,
-    /// The folder that names are in, unless another one is given.
+    /// The folder that names are in, unless the user gives a different one.
     folder: PathBuf,
     /// As [`ImageList::is_in_scene_axes`].
     is_in_scene_axes: bool,
@@ -174,8 +174,9 @@ fn image_file(folder: &Path, name: &str) -> anyhow::Result<PathBuf> {
     })
 }
 
-/// The mask of an image: with its name, with .png in place of its extension, or behind it, as COLMAP names masks. Names of
-/// transforms.json begin with the folder of the images, such as `images` or `images_4`, and those of masks need not.
+/// The mask of an image: with the image's name, with .png in place of its extension, or with .png appended, as COLMAP
+/// names masks. Names of transforms.json start with the folder of the images, such as `images` or `images_4`; those of
+/// masks need not.
 fn mask_file(masks: &Path, name: &str) -> anyhow::Result<PathBuf> {
     let within = name.split_once('/').filter(|(folder, _)| folder.starts_with("images"));
     let names = [Some(name), within.map(|(_, within)| within)].into_iter().flatten();

@@ -17,7 +17,7 @@ pub(super) use self::otlp::Traces;
 #[cfg(not(feature = "otlp"))]
 pub(super) struct Traces;
 
-/// Begins to log to standard error, and to send traces to an endpoint, if there is one.
+/// Starts to log to standard error, and to send traces to an endpoint, if there is one.
 pub(super) fn start(filter: &str, endpoint: Option<&str>) -> anyhow::Result<Option<Traces>> {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(io::stderr)

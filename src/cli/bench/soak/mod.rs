@@ -213,7 +213,7 @@ impl Soak {
         Ok(memory)
     }
 
-    /// Prints what was done.
+    /// Prints the counts.
     ///
     /// # Errors
     /// The memory grew by more than is accepted.

@@ -41,7 +41,7 @@ pub(super) fn copy_twin(from: &Path, to: &Path, twin: &str) -> anyhow::Result<()
     let source = from.join(twin);
     anyhow::ensure!(
         source.is_dir(),
-        "--mixed copies the twin, and {} is no directory: give --twins DIR, not a URL",
+        "--mixed copies the twin, and {} is not a directory: give --twins DIR, not a URL",
         source.display(),
     );
     copy_directory(&source, &to.join(twin)).with_context(|| format!("cannot copy twin {twin:?}"))
