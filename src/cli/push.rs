@@ -111,9 +111,7 @@ impl Push {
             [] => None,
             [all] if all == "all" => Some(CellSelection::All(AllCells::All)),
             cells if cells.iter().any(|cell| cell == "all") => {
-                anyhow::bail!(
-                    "--cells all replaces all cells: give it once, without other cells"
-                )
+                anyhow::bail!("--cells all replaces all cells: give it once, without other cells")
             }
             cells => Some(CellSelection::Listed(
                 cells.iter().map(|text| parse_cell(text)).collect::<Result<_, _>>()?,

@@ -27,7 +27,9 @@ pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
         // This program is the bridge. The address is an argument of its own in the shell.
         Some(address) => {
             check_address(address).map_err(|reason| {
-                bad_input(format!("{agent:?} is not an agent: expected egodriver:HOST:PORT; {reason}"))
+                bad_input(format!(
+                    "{agent:?} is not an agent: expected egodriver:HOST:PORT; {reason}"
+                ))
             })?;
             let program = std::env::current_exe().map_err(bad_input)?;
             format!("'{}' drive --egodriver '{address}'", program.display())
