@@ -1,17 +1,18 @@
 """Trains the model that repairs images: `python scenes/repair.py` writes `scenes/repair.onnx` and `scenes/repair.json`.
 
-It needs `pip install jax onnx onnxruntime blake3 ./clients/python` and the program (`WILDCITY_BIN`, or on the path), and
-about 10 minutes of a free core; no GPU.
+It needs `pip install jax onnx onnxruntime blake3 ./clients/python` and the program (`WILDCITY_BIN`, or in PATH), but no
+GPU. A complete run took 4 minutes on one core, 135 s of it for training.
 
-Three streets are generated twice: as they are, and spoiled as captures are (`wildcity twin generate --spoil`). The
-spoiled one is drawn beside its drive. The model sees that image and `reference_warped`: the true images of the drive,
-brought into the view by the depth of the spoiled street (docs/repair.md). It learns the true image there. Then it is
-measured on a street of another seed.
+Three streets are generated twice: without errors, and with reconstruction errors like those of captures
+(`wildcity twin generate --spoil`). The degraded street is rendered off its drive. The inputs of the model are this
+image and `reference_warped`: the true images of the drive, warped into the view with the depth of the degraded street
+(docs/repair.md). Its target is the true image of the view. Then the model is measured on a street of another seed.
 
-The model is a U-Net of three levels. Of each pixel it tells how much to take of the warped image, and what to add:
-`residual = valid * weight * (warped - rgb) + change`.
+The model is a U-Net of three levels. For each pixel it predicts a blend weight for the warped image, and a change of
+colour: `residual = valid * weight * (warped - rgb) + change`.
 
-Seeds are fixed. Another version of XLA adds in another order and gives other last bits, so the files are kept.
+Seeds are fixed. Another version of XLA adds in a different order, which changes the last bits. So the files are in the
+repository.
 """
 
 import argparse
@@ -26,16 +27,16 @@ import numpy as np
 
 CAMERAS = ("front", "front_left", "front_right")
 SIZE = (360, 232)
-# Of references, metres along the drive from the view; recorded images are 2 m apart.
+# Distances of references from the view, in metres along the drive; recorded images are 2 m apart.
 ALONG_M = (-8.0, -5.5, -3.0, -0.5, 2.0)
 RECORDED_M = 2.0
-# Height and width of the crops that are trained on, in pixels, and how many in a step.
+# Height and width of the training crops, in pixels, and the number of crops in a step.
 CROP, BATCH = 96, 6
 # Channels of the three levels.
 WIDTHS = (12, 24, 40)
-# Seeds of the streets and how much they are spoiled.
+# Seeds of the streets, and the amount of their errors (`--spoil`).
 TRAINED, UNSEEN = {101: 0.3, 102: 0.5, 103: 0.7}, {201: 0.5}
-# To the left, where there is road: on the right are parked cars.
+# Offsets to the left, where there is road: on the right are parked cars.
 OFFSETS_M = (1.0, 3.0, 5.0)
 
 
@@ -56,7 +57,7 @@ def generate(twins, seed, amount):
 
 
 class Image:
-    """What a camera sees: colours, depth (m, 0 for none), focal length and middle (px), world_from_camera."""
+    """The image of a camera: colours, depth (m, 0 for none), focal length and middle (px), world_from_camera."""
 
     def __init__(self, rgb, depth, camera, world_from_rig):
         self.rgb, self.depth = rgb, depth
@@ -78,7 +79,7 @@ def matrix(pose):
 
 
 class Street:
-    """A street as it is and spoiled, drawn by a server."""
+    """A street without and with errors, rendered by a server."""
 
     def __init__(self, server, seed):
         import wildcity
@@ -94,7 +95,7 @@ class Street:
             self.recorded.append(true)
 
     def draw(self, which, poses):
-        """The images of a pose in the order of the cameras, for each pose.
+        """Renders the images of each pose, in the order of the cameras.
 
         Each call has its own connection: a server drops clients that are silent for minutes, while they warp or train.
         """
@@ -139,7 +140,7 @@ class Street:
         return [image for at in chosen for image in self.recorded[at]]
 
     def views(self, stations_m, offsets_m, yaws=None):
-        """Per station and camera (rendered, warped, valid, true) as u8, and the images of the spoiled street."""
+        """Per station and camera (rendered, warped, valid, true) as u8, and the images of the degraded street."""
         yaws = np.zeros(len(stations_m)) if yaws is None else yaws
         poses = [self.beside(*where) for where in zip(stations_m, offsets_m, yaws)]
         arrays, images = [], []
@@ -239,7 +240,7 @@ def residual(parameters, rgb, warped, valid):
 
 
 def train(arrays, steps, rate=1e-3, seed=7):
-    """Adam, falling along a cosine; the loss is `sqrt(error² + 0.01²)`."""
+    """Adam, with a rate that falls along a cosine; the loss is `sqrt(error² + 0.01²)`."""
     import jax
     import jax.numpy as jnp
 
@@ -343,7 +344,7 @@ def write(parameters, out):
     return len(content)
 
 
-# --- What it gains
+# --- Gain
 
 
 def repairer(path):

@@ -1,13 +1,14 @@
-"""Trains the demo twin's sky: `python scenes/sky.py` writes `scenes/sky.safetensors` (numpy alone);
-`python scenes/sky.py truths` writes what `tests/render/sky.rs` compares with.
+"""Trains the demo twin's sky: `python scenes/sky.py` writes `scenes/sky.safetensors` (needs only numpy);
+`python scenes/sky.py truths` writes the values that `tests/render/sky.rs` compares with.
 
-The network is the sky of street reconstructions (OmniRe's SkyModel, Chen et al. 2024): a direction,
-its sines and cosines over octaves and an appearance of 16 numbers, three layers, the input again beside
-the second; half as wide as theirs and an octave less, so that tests bake it at once. What it learns is a
-clear day by formula: haze on the horizon, blue above, fair-weather clouds, and a sun where the street's
-light comes from (`src/generate/light.rs`).
+The network is the sky of street reconstructions (OmniRe's SkyModel, Chen et al. 2024). Its input is a
+direction, its sines and cosines over octaves, and an appearance of 16 numbers. It has three layers, and
+the second one gets the input again. It is half as wide as theirs and has an octave less, so that tests
+bake it quickly. It learns a clear day from a formula: haze on the horizon, blue above, fair-weather
+clouds, and a sun where the street's light comes from (`src/generate/light.rs`).
 
-The seed is fixed; a BLAS that adds in another order gives other last bits, so the file is kept.
+The seed is fixed. A BLAS that adds in a different order changes the last bits, so the file is in the
+repository.
 """
 
 import json
@@ -58,7 +59,7 @@ def day(away):
     rgb = rgb + (np.array([0.97, 0.97, 0.96]) - shade - rgb) * (0.90 * cloud)
     # The sun with its glare, as cameras show it: ten times as wide as it is.
     rgb = rgb + (np.array([1.0, 0.995, 0.97]) - rgb) * np.exp(-((angle / 0.07) ** 2))
-    # Below the horizon no camera looks: the haze goes on, darker.
+    # No camera looks below the horizon: the haze continues there, darker.
     return rgb * (1.0 - 0.35 * smooth((-z - 0.05) / 0.5))
 
 
@@ -104,7 +105,7 @@ def train(steps, batch=4096, seed=7):
         h1 = np.maximum(skip @ w[1].T + b[1], 0.0)
         rgb = 1.0 / (1.0 + np.exp(-(h1 @ w[2].T + b[2])))
         error = rgb - wanted
-        # Mean squared error, back through the layers.
+        # Backpropagation of the mean squared error.
         d2 = (2.0 / error.size) * error * rgb * (1.0 - rgb)
         d1 = (d2 @ w[2]) * (h1 > 0.0)
         d_skip = d1 @ w[1]
@@ -112,7 +113,7 @@ def train(steps, batch=4096, seed=7):
         d_x = d0 @ w[0] + d_skip[:, WIDTH:]
         slopes = [d0.T @ x, d1.T @ skip, d2.T @ h1, d0.sum(0), d1.sum(0), d2.sum(0)]
         slopes.append(share.T @ d_x[:, -EMBEDDING:])
-        # Adam (Kingma and Ba 2014), falling along a cosine.
+        # Adam (Kingma and Ba 2014), with a rate that falls along a cosine.
         rate = 4e-3 * 0.5 * (1.0 + np.cos(np.pi * step / steps)) + 1e-5
         for p, slope, m, v in zip(parameters, slopes, first, second):
             m += 0.1 * (slope - m)
@@ -162,7 +163,7 @@ def read(path):
 
 
 def truths(path):
-    """What `tests/render/sky.json` holds: directions, and their colours as numpy computes them."""
+    """The content of `tests/render/sky.json`: directions, and their colours as numpy computes them."""
     tensors, away = read(path), look(np.random.default_rng(3), 48)
     seen = [[*direction, *colours(tensors, direction[None])[0], *colours(tensors, direction[None], 1)[0]] for direction in away]
     return "[\n" + ",\n".join(json.dumps([float(f"{value:.17g}") for value in row]) for row in seen) + "\n]\n"

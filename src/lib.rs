@@ -15,7 +15,7 @@
 //! | [`wildcity_convert`] | maps and scenarios from OpenDRIVE, GeoJSON and OpenSCENARIO | scene, sim |
 //! | [`wildcity_score`] | scores of driven episodes: other projects', and our verdict | scene, sim |
 //! | [`wildcity_episode`] | recorded episodes: their lines, reading, scoring and comparing them | scene, score, sim |
-//! | [`wildcity_augment`] | views beside a drive as training data: plan, masks, transforms.json, COLMAP, resume | scene |
+//! | [`wildcity_augment`] | views off the drive as training data: plan, masks, transforms.json, COLMAP, resume | scene |
 //! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
@@ -28,11 +28,11 @@
 //! | [`wildcity_suite`] | suites of scenarios: drives, judges and reports them | episode, render, scene, score, server, session, sim, twin |
 //!
 //! Data goes one way: file, twin, render, session, server, agent. An agent's pose or action goes server,
-//! session, sim. Nothing below calls what is above it.
+//! session, sim. No package calls one above it.
 //!
 //! # Invariants
 //!
-//! 1. The wire is known to `protocol`, `client` and `server::convert` only.
+//! 1. Only `protocol`, `client` and `server::convert` use the messages of the wire.
 //! 2. Only `twin::store` opens files of a twin; only `render::gpu` names wgpu; only `server` names axum;
 //!    only `repair::onnx` names the ONNX runtime; only `alpasim` names tonic and prost; only `heap` has `unsafe`.
 //! 3. `scene`, `render` and `sim` are pure: the same input gives the same bytes at any thread count.

@@ -48,8 +48,8 @@ pub(super) struct HardwareOptions {
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// GPU memory for Gaussians, in GiB. If they need more, the least recently drawn ones are evicted.
-    /// Buffers of the render stages come in addition [default: all that the GPU has]
+    /// GPU memory for Gaussians, in GiB. If they need more, the least recently drawn ones are evicted. Buffers of the
+    /// render stages need additional memory [default: all that the GPU has]
     #[arg(long, value_name = "GIB", value_parser = gib)]
     gpu_memory_gib: Option<f64>,
 

@@ -162,8 +162,8 @@ pub(super) struct TwinVersion {
 /// The twin that an edit changes.
 #[derive(Debug, clap::Args)]
 pub(super) struct EditedTwin {
-    /// The twin: NAME, or NAME@NUMBER for the version that the edit is made from [default: the latest]. What later
-    /// versions changed stays; if the edit would overwrite some of it, it is refused.
+    /// The twin: NAME, or NAME@NUMBER for the version that the edit is made from [default: the latest]. Changes of
+    /// later versions are kept; an edit that would overwrite one of them is refused.
     #[arg(value_name = "TWIN")]
     pub(super) twin: TwinVersion,
 }

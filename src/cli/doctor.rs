@@ -19,13 +19,13 @@ use super::serve::Serve;
 
 /// Check that this machine can run the server: devices, memory, open files, disks, twins, clock.
 ///
-/// Prints one line for each check. A line that begins with `bad` says what to do; then the exit code is 1.
-/// `note` is for information only. Nothing is changed: to see whether a directory can be written, a file without a name
-/// in it is created and removed.
+/// Prints one line for each check. A line that starts with `bad` says what to do; then the exit code is 1. `note` is
+/// for information only. Nothing is changed: the check whether a directory can be written creates an unnamed file in it
+/// and removes it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Doctor {
-    /// TOML file of `wildcity serve --config`: check what it names, too: address, tokens, certificate, audit log, scenarios.
+    /// TOML file of `wildcity serve --config`: also check its address, tokens, certificate, audit log and scenarios.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["twins", "episodes", "uploads"])]
     config: Option<PathBuf>,
 
@@ -49,11 +49,11 @@ Examples:
   wildcity doctor --config /etc/wildcity/wildcity.toml
   wildcity doctor --twins s3://city/twins";
 
-/// Memory below which a city of some blocks does not fit.
+/// Memory below which a city of a few blocks does not fit.
 const LITTLE_MEMORY_BYTES: u64 = 2 << 30;
 /// Free space below which a push or a day of records may fail.
 const LITTLE_DISK_BYTES: u64 = 5 << 30;
-/// Files of a full server: 1,024 connections, 512 newcomers, and what it reads.
+/// Open files of a full server: 1,024 connections, 512 unauthenticated ones, and the files that it reads.
 const FILES: u64 = 4096;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -177,7 +177,7 @@ fn devices_found() -> Finding {
         None => {
             let found = match devices.is_empty() {
                 true => "no Vulkan device",
-                false => "no Vulkan device but software",
+                false => "no Vulkan device except software",
             };
             let text = format!(
                 "{found}: the server renders on the CPU. For a GPU install its driver with Vulkan, and in a \
@@ -199,7 +199,7 @@ fn memory() -> Finding {
     match bytes >= LITTLE_MEMORY_BYTES {
         true => Finding::new(Level::Good, "memory", text),
         false => {
-            Finding::new(Level::Note, "memory", format!("{text}: enough for small twins alone"))
+            Finding::new(Level::Note, "memory", format!("{text}: enough for small twins only"))
         }
     }
 }

@@ -15,31 +15,31 @@ use wildcity_client::protocol::message::{Open, RigChoice, ScenarioChoice};
 
 use super::exit::Exit;
 
-/// The driver did not answer in time: the status of `timeout`.
+/// Exit code if the driver did not answer in time: the status of `timeout`.
 const TIMEOUT_EXIT_CODE: u8 = 124;
 
-/// The driver went away: EX_UNAVAILABLE.
+/// Exit code if the connection to the driver was lost: EX_UNAVAILABLE.
 const LOST_EXIT_CODE: u8 = 69;
 
-/// Let a driver of AlpaSim drive in a twin of a running server.
+/// Drive in a twin of a running server with a driver of AlpaSim.
 ///
-/// The driver is a gRPC server of AlpaSim's service egodriver. In each step of 0.1 s it gets the new images, the
-/// ego's poses and the route along a recorded drive or of a scenario, and the ego follows its plan. Prints one line of
-/// JSON for each episode: outcome, steps, distance, and a hash of all frames. The exit code is 1 if an episode did not
-/// complete; for a single episode 124 if the driver did not answer in time, and 69 if it went away. For a server with
-/// tokens, set $WILDCITY_TOKEN.
+/// The driver is a gRPC server of AlpaSim's service egodriver. In each step of 0.1 s it receives the new images, the
+/// ego's poses and the route, which follows a recorded drive or comes from a scenario. The ego then follows the
+/// driver's plan. Prints one line of JSON for each episode: outcome, steps, distance, and a hash of all frames. The
+/// exit code is 1 if an episode did not complete. For a single episode it is 124 if the driver did not answer in time,
+/// and 69 if the connection to it was lost. For a server with tokens, set $WILDCITY_TOKEN.
 ///
-/// Without TWIN it is an agent for `wildcity episode run`, which says what to drive in the environment. `--agent
-/// egodriver:HOST:PORT` starts it with the driver's own cameras; `--agent 'wildcity drive --egodriver HOST:PORT
-/// --cameras front --size 576x320'` with others.
+/// Without TWIN the command is an agent for `wildcity episode run`, which describes the episode in environment
+/// variables. `--agent egodriver:HOST:PORT` starts it with the driver's own cameras; `--agent 'wildcity drive
+/// --egodriver HOST:PORT --cameras front --size 576x320'` starts it with others.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
-    /// The twin to drive in [default: what `wildcity episode run` says]
+    /// The twin to drive in [default: the twin of `wildcity episode run`]
     #[arg(value_name = "TWIN")]
     twin: Option<String>,
 
-    /// Address of the driver; it is waited for, up to 120 s.
+    /// Address of the driver; the command waits up to 120 s for it.
     #[arg(long, value_name = "HOST:PORT")]
     egodriver: String,
 
@@ -67,7 +67,7 @@ pub(super) struct Drive {
     #[arg(long, value_name = "NAME")]
     rig: Option<String>,
 
-    /// Cameras that the driver sees [default: all of the rig]
+    /// Cameras whose images the driver receives [default: all of the rig]
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     cameras: Option<Vec<String>>,
 
@@ -83,27 +83,28 @@ pub(super) struct Drive {
     #[arg(long, value_name = "M_S")]
     speed: Option<f64>,
 
-    /// Recorded drive before the start, in microseconds: Alpamayo's driver needs 1.5 s of poses and four frames
+    /// Duration of the recorded drive before the start, in microseconds: Alpamayo's driver needs 1.5 s of poses and
+    /// four frames
     #[arg(long, value_name = "US", default_value_t = 1_700_000)]
     warm_up_us: i64,
 
-    /// Steps of an episode
+    /// Number of steps of an episode
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..))]
     steps: u64,
 
-    /// Seed of the first episode; the next ones have the next numbers
+    /// Seed of the first episode; each later episode has the next number
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
 
-    /// Episodes
+    /// Number of episodes
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=10_000))]
     episodes: u64,
 
-    /// Episodes at once
+    /// Number of episodes at a time
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
     parallel: u64,
 
-    /// How long the driver may take for one answer, in milliseconds
+    /// Time limit for one answer of the driver, in milliseconds
     #[arg(long, value_name = "MS", default_value_t = limits::DRIVER_ANSWER.as_millis() as u64)]
     drive_timeout_ms: u64,
 }
@@ -196,7 +197,7 @@ impl Drive {
     }
 }
 
-/// What `wildcity episode run` wants opened.
+/// The request `open` that `wildcity episode run` asks for.
 fn asked_open() -> anyhow::Result<Open> {
     let mut fields: serde_json::Map<String, serde_json::Value> =
         serde_json::from_str(&asked("WILDCITY_OPEN")?).context("WILDCITY_OPEN")?;
@@ -213,7 +214,7 @@ fn asked(name: &str) -> anyhow::Result<String> {
 }
 
 fn number(name: &str) -> anyhow::Result<u64> {
-    asked(name)?.parse().with_context(|| format!("{name} is no number"))
+    asked(name)?.parse().with_context(|| format!("{name} is not a number"))
 }
 
 fn line(report: &EpisodeReport) -> serde_json::Value {
@@ -234,7 +235,7 @@ fn line(report: &EpisodeReport) -> serde_json::Value {
 }
 
 fn size(text: &str) -> Result<[u32; 2], String> {
-    let refused = || format!("{text:?} is no size; expected WIDTHxHEIGHT in pixels, as 576x320");
+    let refused = || format!("{text:?} is not a size; expected WIDTHxHEIGHT in pixels, as 576x320");
     let (width, height) = text.split_once('x').ok_or_else(refused)?;
     Ok([width.parse().map_err(|_| refused())?, height.parse().map_err(|_| refused())?])
 }

@@ -7,17 +7,17 @@ pub(super) struct Exit {
     pub(super) code: u8,
     /// What happened.
     pub(super) message: String,
-    /// Whether it is what the program found: then it is printed without `error:`.
+    /// Whether this is a result and not an error: a result is printed without `error:`.
     pub(super) is_finding: bool,
 }
 
 impl Exit {
-    /// The program could not do what it should.
+    /// The program failed.
     pub(super) fn error(code: u8, message: String) -> Self {
         Self { code, message, is_finding: false }
     }
 
-    /// The program did what it should, and this is what it found.
+    /// The program worked, and the exit code reports what it found.
     pub(super) fn finding(code: u8, message: String) -> Self {
         Self { code, message, is_finding: true }
     }

@@ -27,7 +27,7 @@ use super::sky_source::SkySource;
 /// The format of SRC is detected from its content, not from its extension; the formats are listed below.
 /// Every Gaussian is checked before anything is written. An import that fails leaves nothing behind.
 ///
-/// A new version of an existing twin has the Gaussians of SRC alone. What was pushed to the twin before is in its earlier
+/// A new version of an existing twin has only the Gaussians of SRC. Earlier pushes to the twin remain in its earlier
 /// versions (`wildcity twin log`).
 ///
 /// Prints how long each phase took: reading and checking the file, sorting Gaussians into cells, packing cells with
@@ -38,7 +38,7 @@ use super::sky_source::SkySource;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
-    /// The scene file. For a scene in a folder: a SOG's folder, or the .gltf in it.
+    /// The scene file; for a scene in a folder, the folder of a SOG, or the .gltf file.
     #[arg(value_name = "SRC")]
     source: PathBuf,
 
@@ -63,9 +63,9 @@ pub(super) struct Import {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     scale: f64,
 
-    /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They become the
-    /// twin's default rig. A version that is imported without this option has no default rig, even if the
-    /// version before had one.
+    /// The vehicle's cameras: a preset (see `wildcity rig show`) or a JSON file (see below). They become the twin's
+    /// default rig. A version that is imported without this option has no default rig, even if the previous version has
+    /// one.
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
 
@@ -215,7 +215,7 @@ impl Import {
     }
 }
 
-/// How long each phase of an import took.
+/// The time of each phase of an import.
 struct Phases {
     began: Instant,
     ended: Vec<(&'static str, Duration)>,
@@ -226,7 +226,7 @@ impl Phases {
         Self { began: Instant::now(), ended: Vec::new() }
     }
 
-    /// The phase `name` ends, and the next one begins.
+    /// Ends the phase `name` and starts the next one.
     fn end(&mut self, name: &'static str) {
         let now = Instant::now();
         self.ended.push((name, now - self.began));

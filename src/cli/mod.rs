@@ -2,8 +2,8 @@
 //!
 //! A command reads its options, calls the packages below, and prints. Long work shows a progress bar on
 //! standard error if that is a terminal; results go to standard output. Exit codes: 0 for success, 1 for a
-//! failure, 2 for a command line that cannot be parsed, and for `episode` also for a file that is missing or none of its kind;
-//! `episode run` has more, which its help lists.
+//! failure, 2 for a command line that cannot be parsed, and for `episode` also for a file that is missing or of another
+//! kind; `episode run` has more, which its help lists.
 //!
 //! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
 //! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it

@@ -47,7 +47,7 @@ pub(super) fn pack(path: &Path, is_only: bool) -> anyhow::Result<Option<PackedFo
     Ok(Some(packed.with_context(|| format!("cannot pack {}", folder.display()))?))
 }
 
-/// The scene file at a path. If a folder is there, it is the description of the SOG in it.
+/// The scene file at a path; for a folder, the description of the SOG in it.
 ///
 /// # Errors
 /// The folder has no SOG.
@@ -87,8 +87,9 @@ fn write(folder: &Path, description: &str) -> anyhow::Result<PackedFolder> {
     Ok(PackedFolder { path, _dir: dir })
 }
 
-/// The description and the files that it names, and those that these name, relative to `folder`, which must be canonical.
-/// What is named and does not exist is left out: a server needs the finest blocks alone, and says what it misses.
+/// The description and the files that it names, and those that these name, relative to `folder`, which must be
+/// canonical. Named files that do not exist are left out: a server needs only the finest blocks, and reports missing
+/// files.
 fn named_files(folder: &Path, description: &str) -> anyhow::Result<BTreeSet<String>> {
     let mut names = BTreeSet::from([description.to_owned()]);
     let mut unread = vec![description.to_owned()];

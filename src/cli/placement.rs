@@ -1,4 +1,4 @@
-//! From the axes of a capture to those of its twin.
+//! The transform from the axes of a capture to those of its twin.
 
 use anyhow::Context;
 
@@ -9,19 +9,20 @@ use wildcity_twin::store::{Catalog, Version};
 
 use crate::cli::directories::{TwinVersion, Twins};
 
-/// From the axes of a capture to those of its twin: as the twin was made, or as the options say.
+/// The transform from the axes of a capture to those of its twin: that of the twin's import, or that of the options.
 #[derive(Debug, clap::Args)]
 pub(super) struct Placement {
-    /// The twin that was trained from the capture: its version says with which axes and scale it was imported, and how
-    /// it was aligned.
+    /// The twin that was trained from the capture: its version records with which axes and scale it was imported, and
+    /// how it was aligned.
     #[arg(long, value_name = "TWIN", conflicts_with_all = ["axes", "scale"])]
     twin: Option<TwinVersion>,
 
-    /// Directions of the capture's axes, as of `wildcity import`; without --twin [default: y-down-z-forward]
+    /// Directions of the capture's axes, in the form of `wildcity import --axes`; without --twin [default:
+    /// y-down-z-forward]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
 
-    /// Metres per unit of the capture, as of `wildcity import`; without --twin [default: 1]
+    /// Metres per unit of the capture, applied after --axes; without --twin [default: 1]
     #[arg(long, value_name = "M")]
     scale: Option<f64>,
 
@@ -63,7 +64,7 @@ pub(super) fn imported(axes: &str, scale: f64) -> anyhow::Result<Alignment> {
     })
 }
 
-/// The options of an import that say where its capture is.
+/// The options of an import that place its capture.
 #[derive(Debug, PartialEq)]
 struct Import {
     axes: String,
@@ -73,8 +74,8 @@ struct Import {
 /// The import that a version was made from by pushes and edits.
 ///
 /// # Errors
-/// An older version cannot be read; a push of its files had other axes or another scale, so that there are two captures;
-/// or a push lost the alignment of the version before, as pushes did before versions recorded it.
+/// An older version cannot be read; a push of its files had other axes or another scale, so that there are two
+/// captures; or a push lost the alignment of the previous version, as pushes did before versions recorded it.
 fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
     let twin = &version.manifest.twin;
     let log = catalog.versions(twin)?;
@@ -112,13 +113,13 @@ fn import_of(catalog: &Catalog, version: &Version) -> anyhow::Result<Import> {
 }
 
 impl Import {
-    /// From the axes of the capture to those of a twin that was aligned since.
+    /// The transform from the axes of the capture to those of a twin that was aligned since.
     fn placed(&self, aligned: Option<Alignment>) -> anyhow::Result<Alignment> {
         let capture = imported(&self.axes, self.scale)?;
         Ok(aligned.map_or(capture, |aligned| aligned.after(&capture)))
     }
 
-    /// What a version says of the files that it was made from.
+    /// The options that a version records for the files that it was made from.
     fn of(provenance: &Provenance) -> anyhow::Result<Self> {
         let one = |key: &str, default: &'static str| -> anyhow::Result<String> {
             let options = &provenance.options;

@@ -19,7 +19,7 @@ pub(super) fn state() -> ProgressBar {
     bar("waiting", "{msg:12} {wide_bar} {percent} %")
 }
 
-/// A sign that something runs of which no progress is known.
+/// A spinner for work of unknown progress.
 pub(super) fn waiting(label: &'static str) -> ProgressBar {
     let sign = ProgressBar::new_spinner().with_message(label);
     sign.enable_steady_tick(Duration::from_millis(100));

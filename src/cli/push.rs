@@ -22,8 +22,8 @@ use super::{packed_folder, progress};
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Push {
-    /// Scene files of the formats that `wildcity import` reads, and the files that they name. Of a SOG, the folder, or
-    /// its meta.json or lod-meta.json alone, is enough.
+    /// Scene files in the formats that `wildcity import` reads, and the files that they name. For a SOG, only its
+    /// folder is needed, or only its meta.json or lod-meta.json.
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
 
@@ -34,7 +34,7 @@ pub(super) struct Push {
     #[command(flatten)]
     server: Server,
 
-    /// Which way the files' axes point, as in `wildcity import`.
+    /// Directions of the files' axes, as in `wildcity import`.
     #[arg(long, default_value = "identity", allow_hyphen_values = true)]
     axes: String,
 
@@ -73,13 +73,13 @@ pub(super) struct Push {
     #[arg(long)]
     note: Option<String>,
 
-    /// Refuse the push if the PSNR between the images before and after it, at any of four poses along the twin's drives,
-    /// is lower than this, in dB; or if no pose sees a Gaussian.
+    /// Refuse the push if, at any of four poses along the twin's drives, the PSNR between the images before and after
+    /// the push is lower than this, in dB; or if no Gaussian is visible from any of them.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
 }
 
-/// A frame, as it is called on the wire.
+/// A coordinate frame, by its name on the wire.
 #[derive(Clone, Copy, Debug, clap::ValueEnum)]
 enum FrameName {
     Twin,
@@ -111,9 +111,7 @@ impl Push {
             [] => None,
             [all] if all == "all" => Some(CellSelection::All(AllCells::All)),
             cells if cells.iter().any(|cell| cell == "all") => {
-                anyhow::bail!(
-                    "--cells all replaces all cells: give it once, and no cells beside it"
-                )
+                anyhow::bail!("--cells all replaces all cells: give it once, without other cells")
             }
             cells => Some(CellSelection::Listed(
                 cells.iter().map(|text| parse_cell(text)).collect::<Result<_, _>>()?,
@@ -182,7 +180,8 @@ impl Push {
     }
 }
 
-/// Uploads files, with progress bars, and gives them as a request has them. A folder with a SOG is one archive.
+/// Uploads files, with progress bars, and returns them in the form of a request. A folder with a SOG becomes one
+/// archive.
 pub(super) async fn upload_all(
     client: &HttpClient,
     paths: &[PathBuf],
@@ -217,8 +216,8 @@ fn file_name(path: &Path) -> Option<String> {
     path.file_name().and_then(|name| name.to_str()).map(str::to_owned)
 }
 
-/// The name by which the first of some files names another one, `textures/paint.png`, if that lies below its folder. A
-/// file beside it has its own name.
+/// The path of a file relative to the folder of the first file, which names it so: `textures/paint.png`. `None` if it
+/// is not in a folder below that one; then its own file name is its name.
 fn name_beside(files: &[PathBuf], path: &Path) -> Option<String> {
     let below = path.strip_prefix(files.first()?.parent()?).ok()?;
     let steps: Option<Vec<&str>> = below.iter().map(|step| step.to_str()).collect();

@@ -100,7 +100,7 @@ impl Format {
         }
     }
 
-    /// The bytes of the file. They are written at once, so that no error is lost in a buffer.
+    /// The bytes of the file. They are written in one call, so that no error is lost in a buffer.
     fn encode(self, shot: &Shot, rgba: &[f32], rgb8: &[u8]) -> Result<Vec<u8>, String> {
         let width = shot.view.camera.width_px;
         let height = shot.view.camera.height_px;

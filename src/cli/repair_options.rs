@@ -1,4 +1,4 @@
-//! `--repair` and its companions: the models that repair images, the same on every command that uses them.
+//! `--repair` and related options: the models that repair images, the same on every command that uses them.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use wildcity_repair::{LoadOptions, Models, RepairError};
 
-/// Most threads of a model.
+/// Largest number of threads of a model.
 const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 
 /// The models that repair images.
@@ -17,15 +17,16 @@ pub(super) struct RepairOptions {
     #[arg(long, value_name = "FILES")]
     repair: Option<Manifests>,
 
-    /// ONNX Runtime library for --repair, from version 1.18 on [default: ORT_DYLIB_PATH]
+    /// ONNX Runtime library for --repair, version 1.18 or later [default: $ORT_DYLIB_PATH]
     #[arg(long, value_name = "PATH")]
     onnxruntime: Option<PathBuf>,
 
-    /// Threads of each repair model on the processor. The bytes do not depend on it.
+    /// Threads of each repair model on the processor. The images do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
     repair_threads: u16,
 
-    /// Memory for recorded images that repair models compare with, in MiB. The least recently used are read again.
+    /// Memory for recorded images that repair models compare with, in MiB. Images that do not fit are read again when
+    /// needed.
     #[arg(long, value_name = "MIB", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..))]
     views_mib: u32,
 }
@@ -46,7 +47,7 @@ impl FromStr for Manifests {
     }
 }
 
-/// The runtime library: as named, or by the environment; empty if neither.
+/// The runtime library: the named one, or that of the environment; empty if neither is set.
 pub(super) fn runtime_library(named: Option<&PathBuf>) -> PathBuf {
     let from_environment = || std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
     named.cloned().or_else(from_environment).unwrap_or_default()
@@ -56,7 +57,7 @@ impl RepairOptions {
     /// The models, by name. Reads their manifests, and loads nothing.
     ///
     /// # Errors
-    /// A manifest is wrong, or the library is not named or is no file.
+    /// A manifest is wrong, or the library is not named or is not a file.
     pub(super) fn models(&self) -> Result<Arc<Models>, RepairError> {
         let Some(Manifests(paths)) = &self.repair else { return Ok(Arc::default()) };
         let library = runtime_library(self.onnxruntime.as_ref());

@@ -27,9 +27,9 @@ pub(super) struct Replay {
     #[arg(value_name = "EPISODE")]
     episode: PathBuf,
 
-    /// Render every frame again; the exit code is 1 if an image, a time, a hash or the summary at the end differs, or
-    /// if there are no frames; and 3 if all is as recorded, but the recording was cut: the episode still runs, or the
-    /// server was killed. Without --out, stops at the first difference.
+    /// Render every frame again. The exit code is 1 if an image, a time, a hash or the summary at the end differs, or
+    /// if there are no frames. It is 3 if everything is as recorded, but the recording was cut: the episode still runs,
+    /// or the server was killed. Without --out, stops at the first difference.
     #[arg(long)]
     verify: bool,
 
@@ -47,7 +47,7 @@ pub(super) struct Replay {
     repair: RepairOptions,
 }
 
-/// The exit code of a recording that was cut and verifies as far as it goes.
+/// The exit code for a recording that was cut and is as recorded up to there.
 const CUT_EXIT_CODE: u8 = 3;
 
 const EXAMPLES: &str = "\

@@ -30,14 +30,13 @@ use super::rig::rig_of;
 use super::stress::{BackendName, candidate};
 use super::{demo, output, progress};
 
-/// Measure what each setting of the renderer costs and what it loses, on one twin and this machine.
+/// Measure the run time and the error of each setting of the renderer, on one twin and this machine.
 ///
-/// Compares backends, levels of detail, record formats, antialiasing, the smallest alpha, the stop
-/// transmittance, the sky map, lenses, image scale and encoding with the f64 reference. Sample points lie
-/// on the recorded drive and 1, 3 and 5 m beside it, or around a twin without a drive. Windows of each
-/// image are compared at full focal length, and whole steps are timed. Settings that cannot affect this
-/// twin are skipped, and the report lists them. The report also has the trust of images beside the drive,
-/// the stress table, and what each feature of a scene costs.
+/// Compares backends, levels of detail, record formats, antialiasing, the smallest alpha, the stop transmittance, the
+/// sky map, lenses, image scale and encoding with the f64 reference. Sample points lie on the recorded drive and 1, 3
+/// and 5 m off it, or around a twin without a drive. Windows of each image are compared at full focal length, and whole
+/// steps are timed. Settings that cannot affect this twin are skipped, and the report lists them. The report also has
+/// the trust of images off the drive, the stress table, and the cost of each feature of a scene.
 ///
 /// Writes report.html (a single self-contained file), report.json and report.csv.
 ///
@@ -74,9 +73,8 @@ pub(super) struct Command {
     #[arg(conflicts_with = "at_least_db")]
     at_most_ms: Option<Goal>,
 
-    /// Stations along the drive, each with a sample point on it and 1, 3 and 5 m beside it; a twin without a
-    /// drive has four times as many sample points around it. The reference takes about a second for each
-    /// sample point and camera.
+    /// Stations along the drive, each with a sample point on it and 1, 3 and 5 m off it; a twin without a drive has
+    /// four times as many sample points around it. The reference takes about a second for each sample point and camera.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=limits::REPORT_STATIONS))]
     stations: u32,
 
@@ -104,13 +102,13 @@ pub(super) struct Command {
     #[command(flatten)]
     repair: RepairOptions,
 
-    /// Distances beside the drive at which --repair is measured, in metres; the drive itself always is.
+    /// Lateral distances from the drive at which --repair is measured, in metres; it is always measured on the drive.
     #[arg(long, value_name = "M", value_delimiter = ',', default_values_t = [1.0, 3.0, 5.0], value_parser = offset_m)]
     #[arg(requires = "repair", allow_negative_numbers = true)]
     offsets: Vec<f64>,
 
-    /// Twin that shows what is true, for --repair on a twin that was spoiled: NAME, or NAME@NUMBER. Without it,
-    /// what is true beside a drive is unknown, and only times and flicker are measured.
+    /// Twin with the ground truth, for --repair on a twin that was generated with --spoil: NAME, or NAME@NUMBER.
+    /// Without it, there is no ground truth off the drive, and only times and flicker are measured.
     #[arg(long, value_name = "TWIN", requires = "repair")]
     truth: Option<TwinVersion>,
 
@@ -175,7 +173,7 @@ struct Compared {
     skipped: Vec<Skipped>,
     /// Time of a step of the reference, in milliseconds.
     reference_ms: f64,
-    /// The same with an exact ray for every pixel; `None` if every camera is a pinhole without motion.
+    /// Time with an exact ray for every pixel; `None` if every camera is a pinhole without motion.
     exact_rays_ms: Option<f64>,
 }
 
@@ -301,7 +299,7 @@ impl Command {
         })
     }
 
-    /// What the models of --repair gain and cost; none without models.
+    /// Gains and costs of the models of --repair; none without models.
     fn measure_repair(
         &self,
         resident: &Arc<Resident>,
@@ -426,7 +424,7 @@ fn compare(
         };
         match benchmark.measure(setting, reference) {
             Ok(measurement) => measurements.push(measurement),
-            // The map of so exact a sky would be too large.
+            // The map of a sky with this accuracy would be too large.
             Err(ReportError::Render(error @ RenderError::Sky(_))) => {
                 skipped.push(Skipped::new(setting.name.clone(), error.to_string()));
             }

@@ -26,9 +26,9 @@ pub(super) struct SceneSource {
     #[arg(value_name = "SCENE")]
     scene: String,
 
-    /// JSON list of cameras, or one a line, in the scene's own axes and metres: name, width, height, fx, fy, cx, cy
-    /// (pixels), position (or position_ply), R_world_to_cam (rotation matrix by rows), and optionally
-    /// near (metres).
+    /// JSON list of cameras, or one camera per line, in the scene's own axes and metres: name, width, height, fx, fy,
+    /// cx, cy (pixels), position (or position_ply), R_world_to_cam (rotation matrix by rows), and optionally near
+    /// (metres).
     #[arg(long, value_name = "FILE")]
     cameras: PathBuf,
 
@@ -110,7 +110,7 @@ impl Source {
         }
     }
 
-    /// What a frame of these views draws.
+    /// The part of the source that a frame of these views draws.
     pub(super) fn scene(
         &self,
         views: &[View],

@@ -1,9 +1,9 @@
 //! `wildcity stress`.
 //!
-//! The stress table is part of the program and not of its tests, so that a faulty driver is found on the
-//! machine that has it. The reference is not compared with itself: its images must be finite, and have the
-//! values that a case states. For each check, `tests/stress/mutations.rs` plants a fault in the cpu backend
-//! and in the reference that the check must find.
+//! The stress table is part of the program and not of its tests, so that a faulty driver is found on the machine that
+//! has it. The reference is not compared with itself: its images must be finite, and have the values that a case
+//! states. For each check, `tests/stress/mutations.rs` applies a mutation to the cpu backend and to the reference that
+//! the check must detect.
 
 use std::io::{self, Write};
 
@@ -39,7 +39,7 @@ pub(super) struct Stress {
     )]
     backends: Vec<BackendName>,
 
-    /// Also run the cases that take gigabytes and minutes.
+    /// Also run the cases that need gigabytes of memory and take minutes.
     #[arg(long)]
     heavy: bool,
 

@@ -108,7 +108,7 @@ fn an_edge_of_a_mesh_at_eight_metres_is_sharp() {
     assert!(few.width_px > 2.0, "{few:?}, {own:?}");
 }
 
-/// Runs `wildcity actor` on a directory. Returns whether it succeeded, and what it said.
+/// Runs `wildcity actor` on a directory. Returns whether it succeeded, and its output.
 fn actor(twins: &Path, arguments: &[&str]) -> (bool, String) {
     let output =
         wildcity().arg("actor").args(arguments).arg("--twins").arg(twins).output().unwrap();
@@ -145,7 +145,7 @@ fn a_damaged_asset_is_listed_and_removed() {
     let (done, said) = actor(&twins, &["show", "bad"]);
     let remove = format!("wildcity actor remove {}", &hashes[1][..12]);
     assert!(!done && said.contains("is damaged") && said.contains(&remove), "{said}");
-    // The command line says where it looked.
+    // The error names the directory that was searched.
     let (done, said) = actor(&twins, &["show", "bus"]);
     assert!(!done && said.contains(&*twins.to_string_lossy()) && said.contains("good"), "{said}");
     let found = wildcity().arg("doctor").arg("--twins").arg(&twins).output().unwrap();

@@ -1,4 +1,4 @@
-//! `wildcity augment`: views beside a drive, read back by `wildcity eval`, continued after damage and kills.
+//! `wildcity augment`: views off a drive, read back by `wildcity eval`; runs continued after damage and kills.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -23,7 +23,7 @@ use crate::root::root;
 use crate::versions::files;
 use crate::wildcity;
 
-/// A short street, and the same one spoiled, with a pinhole to the front and a dark fisheye with a rolling shutter to
+/// A short street, and a degraded copy of it, with a pinhole to the front and a dark fisheye with a rolling shutter to
 /// the left. They are made once, and copied for each test.
 fn twins(dir: &Path) {
     static MADE: OnceLock<tempfile::TempDir> = OnceLock::new();
@@ -118,7 +118,7 @@ fn eval_reads_the_views_back_as_the_twin_draws_them() {
     assert!(!round.join("rendered").exists(), "without a model nothing is there to compare");
     assert_eq!(fs::read_dir(at.join("out")).unwrap().count(), 1, "no remains of the server");
 
-    // By the OpenGL poses and by COLMAP's, all pixels and those of the masks.
+    // With the poses of OpenGL and with those of COLMAP, for all pixels and for those of the masks.
     for images in ["out/round_2/transforms.json", "out/round_2"] {
         let db = psnr_db(at, "street", images, &["--axes", "identity"]);
         assert_eq!(db.len(), 32);
@@ -265,7 +265,7 @@ fn a_model_repairs_the_images_and_another_one_is_refused() {
         let bytes = |folder: &str| image::open(round.join(folder).join(name)).unwrap().into_bytes();
         assert!(bytes("images") != bytes("rendered"), "{name}");
     }
-    // What was rendered is the worn twin; what was repaired is nearer to the street.
+    // The rendered images show the degraded twin; the repaired ones are nearer to the street.
     let colmap = |twin, folder| {
         let folder = format!("out/round_4/{folder}");
         let more = ["--axes", "identity", "--image-dir", &folder];
@@ -290,7 +290,7 @@ fn a_model_repairs_the_images_and_another_one_is_refused() {
     assert!(said.contains("another repair: \"street-repair\" there, none here"), "{said}");
     let said = refused(at, &arguments("worn", "out", &low));
     assert!(said.contains("another repair.at_least: 0.1 there, 1.0 here"), "{said}");
-    // The manifest decides the hash, even by its version.
+    // The hash depends on the manifest, even on its version.
     let mut other: Value = json(Path::new(&manifest));
     other["version"] = "2".into();
     fs::write(at.join("repair.json"), other.to_string()).unwrap();

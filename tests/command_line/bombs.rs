@@ -135,7 +135,7 @@ fn decompression_bombs_are_refused_in_bounded_memory() {
         let path = dir.path().join(name);
         let file_mb = std::fs::metadata(&path).unwrap().len() >> 20;
         assert!(file_mb < 6, "{name} is {file_mb} MB: no bomb");
-        // The shell keeps to the limit of address space, which bounds what is resident.
+        // The shell sets a limit of address space, which bounds resident memory.
         let import = Command::new("sh")
             .args(["-c", r#"ulimit -v "$1"; exec "$2" import "$3" --twin bomb --twins "$4""#, "sh"])
             .arg(((limit_mb + 150) << 10).to_string())

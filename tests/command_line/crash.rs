@@ -46,7 +46,7 @@ fn a_killed_import_leaves_the_old_version_or_the_new_one() {
                 .spawn()
                 .unwrap();
             let deadline = Instant::now() + Duration::from_secs(30);
-            // The staging directory of the twin's commit, and what is in it beside its lock.
+            // The staging directory of the twin's commit, and its content other than the lock.
             let seen = || {
                 let entries = files(&staging).into_iter();
                 entries.filter(|path| path.extension().is_none()).count().saturating_sub(1)
@@ -121,7 +121,7 @@ fn an_import_killed_at_a_hundred_points_loses_nothing() {
     let (mut killed, mut left) = (0, 0);
     for point in 0..POINTS {
         let mut running = import().spawn().unwrap();
-        // Not to wait for anything: this is where it is killed.
+        // This does not wait for an event: it sets the time of the kill.
         std::thread::sleep(takes * point / POINTS);
         killed += u32::from(running.try_wait().unwrap().is_none());
         running.kill().unwrap();

@@ -28,7 +28,7 @@ fn demo_command(dir: &Path, arguments: &[&str]) -> Command {
     command
 }
 
-/// What the first drive said, with the demo twin that it built.
+/// The output of the first drive, with the demo twin that it built.
 struct Built {
     said: String,
     dir: tempfile::TempDir,
@@ -45,7 +45,7 @@ fn built() -> &'static Built {
     })
 }
 
-/// The first line that a demo says, which then is killed.
+/// The first line that a demo prints; then it is killed.
 fn first_line(dir: &Path) -> String {
     let mut child = demo_command(dir, &[]).stderr(Stdio::piped()).spawn().unwrap();
     let mut line = String::new();
@@ -133,7 +133,7 @@ fn a_damaged_demo_twin_is_built_again() {
     let remove = |path: &Path| fs::remove_file(path).unwrap();
     let both = [object(&version.manifest.chunks[3].object), object(&version.hash)];
     for damage in [&flip as &dyn Fn(&Path), &remove] {
-        // Each alone is noticed.
+        // Damage of only one file is detected.
         for path in &both {
             let whole = fs::read(path).unwrap();
             damage(path);

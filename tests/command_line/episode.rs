@@ -42,7 +42,7 @@ fn a_suite_is_driven_and_its_records_are_read() {
     let stand = run("stand", "stand");
     assert_eq!(stand.status.code(), Some(1), "{}", stdout(&stand));
     assert!(stdout(&stand).contains("progress"), "{}", stdout(&stand));
-    // A verdict is no error of the program.
+    // A verdict is not an error of the program.
     let verdict = String::from_utf8(stand.stderr).unwrap();
     assert!(verdict.starts_with("of 1 episodes 1 failed, "), "{verdict}");
     let wanted = ["run", "short.json", "--twins", twins, "--at-least", "0.9", "--out", "wanted"];
@@ -55,7 +55,7 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert_eq!(again.status.code(), Some(2), "the directory has another run");
     assert!(again.stderr.starts_with(b"error: "), "{}", String::from_utf8_lossy(&again.stderr));
     assert_eq!(wildcity(&["run", "nowhere.json"], dir.path()).status.code(), Some(2));
-    // An export that cannot be written is told on standard error and in the report, not in the result.
+    // An export that cannot be written is reported on standard error and in the report, not in the result.
     std::fs::create_dir_all(dir.path().join("told/episodes/short-0-1.mcap")).unwrap();
     let told = run("log", "told");
     assert_eq!(told.status.code(), Some(0), "{}", stdout(&told));
@@ -127,7 +127,7 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert_eq!(count(&with_images, "/wildcity/step"), count(&bytes, "/wildcity/step"));
     let unknown = wildcity(&[&images[..], &["--camera", "roof"]].concat(), dir.path());
     assert!(String::from_utf8(unknown.stderr).unwrap().contains("--camera roof: the episode has"));
-    // The run wrote the same beside the record; the order of the index differs from file to file.
+    // The run wrote the same file next to the record; the order of the index differs from file to file.
     let of_run = std::fs::read(dir.path().join("log/episodes/short-0-1.mcap")).unwrap();
     assert_eq!((count(&of_run, "/wildcity/step"), of_run.len()), (9, bytes.len()));
     let none = [

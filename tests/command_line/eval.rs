@@ -1,4 +1,4 @@
-//! `wildcity eval` on images that the program rendered itself, and that the tests then spoil.
+//! `wildcity eval` on images that the program rendered itself, and that the tests then change.
 
 use std::fs;
 use std::path::Path;
@@ -13,7 +13,7 @@ use crate::scene_files::{gaussians, inria_columns, ply};
 
 pub(crate) const WIDTH: u32 = 120;
 pub(crate) const HEIGHT: u32 = 80;
-/// What is added to each value of the image `b`, of 255.
+/// The amount that is added to each value of the image `b`, of 255.
 pub(crate) const OFF: u8 = 10;
 
 /// Names, positions and the rows of `R_world_to_cam` of cameras that look at the origin, each rolled a little.
@@ -28,7 +28,7 @@ fn cameras() -> Vec<(&'static str, DVec3, [DVec3; 3])> {
     ["a", "b", "c"].into_iter().enumerate().map(camera).collect()
 }
 
-/// A camera list, one camera a line. The lens is distorted.
+/// A camera list, one camera per line. The lens is distorted.
 fn list() -> String {
     let lines = cameras().into_iter().map(|(name, at, rows)| {
         let line = json!({"name": name, "image": format!("front/{name}.png"), "width": WIDTH, "height": HEIGHT,
@@ -138,7 +138,7 @@ fn an_image_that_was_spoiled_by_a_known_amount_has_that_error() {
             assert!((image["psnr_db"].as_f64().unwrap() - off_db).abs() < 1e-9, "{image}");
             assert!((0.01..0.3).contains(&image["flip"].as_f64().unwrap()), "{image}");
             assert!(image["ssim"].as_f64().unwrap() < 0.999, "{image}");
-            // A constant is taken away by the best change of exposure.
+            // The best change of exposure removes a constant.
             assert!(image["aligned"]["psnr_db"].as_f64().unwrap() > 200.0, "{image}");
             assert!((image["aligned"]["exposure"]["gain"][0].as_f64().unwrap() - 1.0).abs() < 1e-9);
         } else {
@@ -195,7 +195,7 @@ fn lists_nerfstudio_and_colmap_give_the_same() {
             assert!(db > least_db - 0.01, "{image} {listed}");
         }
     }
-    // Without --image-dir, COLMAP's images are beside its model.
+    // Without --image-dir, COLMAP's images are next to its model.
     done(at, &["eval", "scene.ply", "--images", "sparse/0", "--out", "beside", "--backend", "cpu"]);
     let beside: Value =
         serde_json::from_slice(&fs::read(at.join("beside/eval.json")).unwrap()).unwrap();
@@ -251,7 +251,7 @@ fn a_twin_has_the_axes_and_the_unit_of_its_import() {
 fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
     let dir = capture();
     let at = dir.path();
-    // `b` is spoiled in its left half only; masks hide that half.
+    // `b` is changed in its left half only; masks hide that half.
     let path = at.join("images/front/b.png");
     let mut image = image::open(&path).unwrap().into_rgb8();
     for (x, _, pixel) in image.enumerate_pixels_mut() {
@@ -270,7 +270,7 @@ fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
         let numbers = [&image["psnr_db"], &image["ssim"], &image["flip"], &image["counted"]];
         assert_eq!(numbers, [&json!("inf"), &json!(1.0), &json!(0.0), &json!(0.5)]);
     }
-    // Names of transforms.json begin with the folder of the images; masks need not be in a folder of that name.
+    // Names of transforms.json start with the folder of the images; masks need not be in a folder of that name.
     let frames = transforms(&json!({})).replace("front/", "images/front/");
     fs::write(at.join("transforms.json"), frames).unwrap();
     mask.save(at.join("masks/front/b.png")).unwrap();
@@ -280,7 +280,7 @@ fn masked_pixels_do_not_count_and_smaller_images_scale_their_cameras() {
     for image in made["images"].as_array().unwrap() {
         assert_eq!(image["counted"], json!(0.5), "{image}");
     }
-    // transforms.json names masks beside itself.
+    // transforms.json names masks in its own folder.
     mask.save(at.join("images/mask.png")).unwrap();
     fs::write(at.join("images/transforms.json"), transforms(&json!({"mask_path": "mask.png"})))
         .unwrap();

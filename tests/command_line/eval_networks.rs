@@ -1,4 +1,4 @@
-//! `wildcity eval` with models, networks, boxes and LiDAR, and beside the drive.
+//! `wildcity eval` with models, networks, boxes and LiDAR, and off the drive.
 
 use std::fs;
 use std::path::Path;
@@ -198,7 +198,7 @@ fn boxes_hide_what_moves_and_lidar_measures_depth() {
     assert!(found.len() == 3 && !seen.is_empty(), "{found:?}");
     assert!(seen.iter().all(|lidar| number(&lidar["mean_m"]) < 3.0), "{found:?}");
 
-    // Points that no image sees are told, and not a mean of nothing.
+    // Points that no image sees are reported, and not the mean of an empty set.
     let (said, made) = with_points([500.0; 12]);
     assert!(said.contains("no LiDAR point was compared") && !said.contains("NaN"), "{said}");
     let page = fs::read_to_string(at.join("out/report.html")).unwrap();

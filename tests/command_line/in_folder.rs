@@ -16,14 +16,14 @@ fn run(dir: &Path, arguments: &[&str]) -> Output {
     wildcity().args(arguments).current_dir(dir).env("XDG_DATA_HOME", dir).output().unwrap()
 }
 
-/// What it prints when it succeeds.
+/// Standard output of a run that must succeed.
 pub(crate) fn done(dir: &Path, arguments: &[&str]) -> String {
     let output = run(dir, arguments);
     assert!(output.status.success(), "{arguments:?}: {output:?}");
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// What it says when it refuses.
+/// Standard error of a run that must fail with exit code 1.
 pub(crate) fn refused(dir: &Path, arguments: &[&str]) -> String {
     let output = run(dir, arguments);
     assert_eq!(output.status.code(), Some(1), "{arguments:?}: {output:?}");

@@ -100,7 +100,7 @@ async fn a_killed_server_has_the_old_version_or_the_new_one() {
         let id = format!("push-{round}");
         let pushing = tokio::spawn(push(serving.client.clone(), path.clone(), id.clone()));
         tokio::time::sleep(whole.mul_f64(random.unit())).await;
-        // The machine has others to serve: the kills follow how long a push takes now.
+        // The load of the machine changes, so the kills follow the current duration of a push.
         match pushing.is_finished() {
             true => whole = whole * 7 / 8,
             false => on_the_way += 1,

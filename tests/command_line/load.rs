@@ -52,7 +52,7 @@ async fn memory_is_flat_over_thousands_of_steps() {
 /// Drives a car the same way twice, in one session: as many bytes in memory after the second lap as in the
 /// first, the same bytes seen, and a clock that is exact.
 async fn two_laps(steps: u64) {
-    // The export of a record takes memory of its own, which is not what this measures.
+    // The export of a record takes memory of its own, which this test does not measure.
     let served = Served::with(&["--mcap", "false"]);
     let mut agent = Agent::connect(served.address).await;
     agent.hello().await;

@@ -36,7 +36,7 @@ fn the_doctor_finds_nothing_wrong_with_this_machine() {
         assert!(!found.is_empty(), "nothing about {subject}");
         assert!(found.iter().all(|(level, _)| level != "bad"), "{subject}: {found:?}");
     }
-    // Looking creates nothing.
+    // The checks create no file.
     assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0);
 }
 
@@ -153,7 +153,7 @@ fn a_mixed_soak_pushes_to_a_copy() {
 
 #[test]
 fn a_soak_whose_memory_grows_fails() {
-    // The most memory later may be less than at first, but not a hundredth of it.
+    // The largest later memory may be less than the first, but not a hundredth of it.
     let output = soak(&["--minutes", "0.03", "--growth=-99"]);
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     let text = String::from_utf8(output.stderr).unwrap();

@@ -49,7 +49,7 @@ async fn a_file_is_pushed_and_reported() {
     assert_eq!(get(&server, "/v1/twins/test").await.body["version"], 3);
 }
 
-/// Runs the command, and returns whether it succeeded, and what it said.
+/// Runs the command, and returns whether it succeeded, and its output.
 fn wildcity(arguments: &[&str]) -> (bool, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
     let done = tokio::task::block_in_place(|| command.args(arguments).output().unwrap());
@@ -98,7 +98,7 @@ async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
         .map(|line| serde_json::from_str::<Value>(line).unwrap()["note"].clone())
         .collect();
     assert_eq!(json!(notes), json!([null, "first", "first", null, "in\nmetres", "epoch 30"]));
-    // A manifest that is damaged costs its note alone.
+    // A damaged manifest loses only its own note.
     let hash = log.lines().nth(1).unwrap();
     let hash = serde_json::from_str::<Value>(hash).unwrap()["hash"].as_str().unwrap().to_owned();
     let object = server.twins.path().join("test/objects").join(&hash[..2]).join(&hash);
@@ -136,7 +136,7 @@ async fn the_folder_of_a_sog_is_pushed_as_one_file() {
     let import = ["import", folder.to_str().unwrap(), "--twin", "sog", "--twins"];
     let (ok, said) = wildcity(&[&import[..], &[twins.to_str().unwrap()]].concat());
     assert!(ok && said.contains("twin sog version 1: 50 Gaussians"), "{said}");
-    // One block alone.
+    // A single block.
     let block = folder.join("0/meta.json");
     let (ok, said) =
         wildcity(&["push", block.to_str().unwrap(), "--twin", "block", "--server", &url]);
@@ -195,7 +195,7 @@ fn a_push_is_followed_by_a_release_of_memory() {
     }
 }
 
-/// Runs `wildcity actor` with some arguments. Returns whether it succeeded, and what it said.
+/// Runs `wildcity actor` with some arguments. Returns whether it succeeded, and its output.
 fn actor(arguments: &[&str]) -> (bool, String, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_wildcity"));
     let command = command.arg("actor").args(arguments);

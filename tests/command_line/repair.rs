@@ -1,4 +1,4 @@
-//! `wildcity repair check`, and what other commands do not load.
+//! `wildcity repair check`, and that other commands do not load the runtime.
 
 use std::fs;
 use std::io::{BufRead, BufReader};
@@ -52,7 +52,7 @@ fn mistakes_are_told_before_and_with_the_runtime_library() {
     assert!(said.contains("files[0].blake3") && said.contains("pin the new hash"), "{said}");
 }
 
-/// A server, and what it has mapped.
+/// A server, to test which libraries it has mapped.
 struct Serving(Child);
 
 impl Serving {
@@ -103,7 +103,7 @@ async fn only_a_session_that_asks_loads_the_library_and_its_record_is_repaired_a
     let repair = ["--repair", &manifest, "--onnxruntime", &library];
     let (server, address) = Serving::start(twins.path(), episodes.path(), &repair);
 
-    // Cameras that see no ground: the trust depends on the distance alone.
+    // These cameras see no ground, so the trust depends only on the distance.
     let camera = serde_json::json!({"name": "front", "width": 64, "height": 16, "fx": 40.0, "fy": 40.0, "cx": 32.0,
         "cy": 12.0, "camera_to_rig": {"xyz": [0.5, 0.0, 1.5], "q": [0.5, -0.5, 0.5, -0.5]}});
     let rig = serde_json::json!({"name": "one", "cameras": [camera]});
@@ -172,7 +172,7 @@ fn a_manifest_that_is_wrong_stops_the_server_before_it_listens() {
     assert!(said.contains("is also that of model.json"), "{said}");
 }
 
-/// The model that comes with the project, from the spoiled street to the pictures.
+/// The model that comes with the project, from the degraded street to the pictures.
 #[test]
 fn the_demo_repairs_views_beside_its_drive() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! `wildcity report`, and what `serve` loads.
+//! `wildcity report`, and the libraries that `serve` loads.
 
 use std::collections::BTreeSet;
 use std::io::{BufRead, BufReader};
@@ -38,7 +38,7 @@ fn a_server_on_the_cpu_has_no_library_of_a_gpu_in_memory() {
     }
 }
 
-/// What is enough where the numbers of a report do not matter.
+/// The smallest sampling, for tests in which the numbers of a report do not matter.
 const SMALLEST: [&str; 4] = ["--stations", "2", "--window", "16"];
 
 /// The command's report of the street in a directory, in its folder `report`.
@@ -189,7 +189,7 @@ fn without_a_recommendation_no_profile_is_left_and_the_report_says_why() {
     );
     assert!(report["unmet"].as_str().unwrap().contains("the best reaches"), "{}", report["unmet"]);
     assert!(read("report.html").contains("<b>at least 500 dB</b>: nothing is recommended"));
-    // Nor is a profile left if there is no goal.
+    // The old profile is also removed if there is no goal.
     an_earlier_one();
     assert!(report_of(dir.path(), SMALLEST, &[]).status.success() && !file.exists());
     let report: Value = serde_json::from_str(&read("report.json")).unwrap();

@@ -1,4 +1,4 @@
-//! `wildcity report --repair`, and that a report without it has nothing of it.
+//! `wildcity report --repair`, and reports without it.
 
 use std::fs;
 use std::path::Path;
@@ -76,7 +76,7 @@ fn with_a_model_the_page_has_a_section_and_losses_are_said() {
     commit(dir.path(), vec![drive()]);
     let model = root().join("scenes/repair.json").display().to_string();
     let library = library().display().to_string();
-    // The twin itself is true here, so every change is a loss.
+    // Here the twin itself is the ground truth, so every change is a loss.
     let given = ["--repair", &model, "--onnxruntime", &library, "--truth", "street"];
     let offsets = ["--offsets", "3,1", "--repair-side", "96"];
     let output = report(dir.path(), &[&given[..], &offsets[..]].concat()).output().unwrap();

@@ -60,11 +60,11 @@ fn a_scenario_is_checked_and_shown_with_its_map() {
     assert_eq!(shown["scenario"]["actors"][0]["idm"]["speed"], 2.0);
     assert_eq!(shown["scenario"]["twin"]["version_hash"].as_str().unwrap().len(), 64);
     assert_ne!(shown["hash"], show(&["--seed", "0", "--value", "v=2"])["hash"]);
-    // What is shown is a scenario, and the same episode.
+    // The output is a scenario, and the same episode.
     fs::write(at.join("two.json"), shown["scenario"].to_string()).unwrap();
     assert_eq!(show(&["--seed", "9"]), shown);
 
-    // A map that changed is another one, unless the user accepts it.
+    // A changed map is a different map, unless the user accepts it.
     let map = fs::read_to_string(at.join("test.map.json")).unwrap();
     fs::write(at.join("test.map.json"), format!("{map}\n")).unwrap();
     let error = refused(&[&["scenario", "check", "two.json"][..], &twins].concat(), at);

@@ -23,14 +23,14 @@ impl Served {
         Self::with(&[])
     }
 
-    /// With more arguments.
+    /// Starts a server with more arguments.
     pub(crate) fn with(arguments: &[&str]) -> Self {
         let twins = support::twins();
         let at = twins.path().as_os_str().to_owned();
         Self::at(&at, twins, |command| command.args(arguments))
     }
 
-    /// With twins at a directory or URL, and its uploads in `dir`.
+    /// Starts a server with twins at a directory or URL, and its uploads in `dir`.
     pub(crate) fn at(
         twins: &OsStr,
         dir: tempfile::TempDir,
@@ -39,7 +39,7 @@ impl Served {
         Self::logging("warn", twins, dir, change)
     }
 
-    /// As [`Served::at`], with a filter of its log.
+    /// As [`Served::at`], with a filter for its log.
     pub(crate) fn logging(
         filter: &str,
         twins: &OsStr,

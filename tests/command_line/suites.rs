@@ -1,4 +1,4 @@
-//! `wildcity episode run` and `compare` in CI: what is refused, what is compared, and with which exit code.
+//! `wildcity episode run` and `compare` in CI: refused input, comparisons, and exit codes.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::Path;
@@ -140,7 +140,7 @@ fn a_run_against_another_is_one_command() {
     }
     assert!(bench.out("worse/report.html").contains("Exit code 1: of 2 episodes 2 failed"));
 
-    // What failed before may fail now; what JUnit says does not change.
+    // Episodes that failed before may fail again; the content of junit.xml does not change.
     let kept = bench.run("stand", "kept", &["--against", "stand"]);
     let (out, _) = ends(&kept, 0);
     assert!(
@@ -307,7 +307,7 @@ fn records_are_found_in_a_run_and_named() {
         "{}",
         text(&missing.stderr)
     );
-    // A name with a dot is no file name.
+    // A name with a dot is not a file name.
     let episodes = bench.path().join("main/episodes");
     std::fs::rename(episodes.join("short-1-1.jsonl"), episodes.join("short-1.2-1.jsonl")).unwrap();
     ends(&bench.episode(&["show", "short-1.2-1", "--episodes", "main"]).output().unwrap(), 0);

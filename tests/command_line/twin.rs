@@ -281,7 +281,7 @@ fn an_image_that_cannot_be_written_is_an_error() {
         ("jpeg", "jpg", b"\xff\xd8\xff"),
         ("npy", "npy", b"\x93NUM"),
     ] {
-        // No file may grow beyond so many blocks: 0 is a full disk.
+        // No file may grow beyond this number of blocks: 0 is a full disk.
         let render = |blocks: &str| {
             let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$@\"");
             let mut command = std::process::Command::new("sh");

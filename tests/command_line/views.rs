@@ -62,7 +62,7 @@ fn images_are_stored_scaled_along_the_drive_and_removed() {
     let stored = catalog.views(&version).unwrap();
     assert_eq!(stored.len(), 6);
     for (index, view) in stored.iter().enumerate() {
-        // The drive begins 3 m before the first image.
+        // The drive starts 3 m before the first image.
         assert!((view.station_m - (3.0 + 2.0 * index as f64)).abs() < 1e-9, "{view:?}");
         assert_eq!((&*view.trajectory, &*view.camera_name), ("log", "front"));
         let camera = &view.camera;

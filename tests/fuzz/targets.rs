@@ -1,5 +1,5 @@
-//! What is fuzzed: one function per parser of bytes that others write. Each ends in an answer or an error, and never
-//! in a panic, a hang or an absurd allocation.
+//! The fuzz targets: one function per parser of bytes from outside. Each ends in an answer or an error, and never in a
+//! panic, a hang or an absurd allocation.
 //!
 //! `cargo fuzz run --fuzz-dir tests/fuzz scene` lets libFuzzer search (nightly); the test `fuzz` of this package does
 //! the same with simple mutations, for a bounded time, on stable.
@@ -59,14 +59,14 @@ pub(crate) fn record(data: &[u8]) {
     assert!(catalog.version("city", None).is_err(), "it has no manifest");
 }
 
-/// An observation, as a client gets it.
+/// An observation, as a client receives it.
 pub(crate) fn observation(data: &[u8]) {
     if let Ok(observation) = Observation::decode(data.to_vec()) {
         let _ = observation.verify();
     }
 }
 
-/// A request, as the server gets it.
+/// A request, as the server receives it.
 pub(crate) fn request(data: &[u8]) {
     let Ok(mut value) = serde_json::from_slice::<serde_json::Value>(data) else { return };
     if let Some(fields) = value.as_object_mut() {

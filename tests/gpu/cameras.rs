@@ -85,7 +85,8 @@ fn small_images_are_drawn_as_by_the_cpu() {
     }
 }
 
-/// Only what is this near: the planes of the road and of the facades begin around the camera.
+/// Gaussians beyond this distance are left out, in metres: the planes of the road and of the facades start around the
+/// camera.
 const NEAR_M: f64 = 30.0;
 
 /// Thousands of surfels of one plane, ordered by z, by distance, and by the depth of a moving camera.

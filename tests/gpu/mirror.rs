@@ -13,7 +13,7 @@ use crate::gpu::{bindings, gpu, gpu_with_limits};
 use crate::images::{render, view_along};
 use crate::streets::{street, turning_views};
 
-/// Most bytes per resident Gaussian of SH degree 1.
+/// Largest number of bytes per resident Gaussian of SH degree 1.
 const BYTES: f64 = 64.0;
 
 /// The demo street in blocks of 16 m as in a twin, for each focal length. Each block is at the coarsest level of detail
@@ -53,7 +53,7 @@ fn demo(focals_px: [f32; 3]) -> [Scene; 3] {
 
 fn bytes_per_gaussian(scene: &Scene) -> f64 {
     let backend = gpu();
-    // Into the sky: all chunks of a scene become resident, whatever a view sees, and none has to be projected.
+    // A view into the sky: all chunks of a scene become resident in any view, and none has to be projected.
     let view = view_along([64, 64], 50.0, DVec3::new(0.0, 0.0, 500.0), DVec3::Z, DVec3::X);
     render(&backend, scene, &RenderProfile::default(), &[view]);
     backend.usage().unwrap().mirror_bytes as f64 / scene.gaussians() as f64

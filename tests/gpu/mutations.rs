@@ -1,5 +1,5 @@
-//! Faults of each stage's shader, which the comparisons of stages and images must detect: a comparison that
-//! cannot fail proves nothing.
+//! Mutations of each stage's shader, which the comparisons of stages and images must detect: a comparison that cannot
+//! fail proves nothing.
 
 use glam::DVec3;
 use wildcity_render::View;
@@ -9,7 +9,7 @@ use wildcity_scene::Gaussians;
 use crate::images::view_along;
 use crate::streets::{street, street_views};
 
-/// A fault of a shader.
+/// A mutation of a shader.
 #[derive(Debug)]
 pub(crate) struct Mutation {
     /// The shader.
@@ -18,7 +18,7 @@ pub(crate) struct Mutation {
     pub(crate) original: &'static str,
     /// Its replacement.
     pub(crate) replacement: &'static str,
-    /// The stages that are wrong with this fault: more than one if they share the shader.
+    /// The stages that are wrong with this mutation: more than one if they share the shader.
     pub(crate) stages: &'static [&'static str],
 }
 
@@ -120,8 +120,8 @@ pub(crate) const MUTATIONS: &[Mutation] = &[
     mutation("rasterize", "vec4f(255.0)", "vec4f(250.0)", RASTERIZE),
 ];
 
-/// Faults of lenses and rolling shutters: an expression of `project_unscented`, and another one of its type; or a
-/// statement, which is left out.
+/// Mutations of lenses and rolling shutters: an expression of `project_unscented`, and a different one of its type; or
+/// a statement, which is left out.
 pub(crate) const LENS_MUTATIONS: &[(&str, &str)] = &[
     ("0.07902598 * square", "0.0 * square"),
     ("select(0.0, 0.25 * HALF_TURN, steep)", "0.0"),

@@ -84,7 +84,7 @@ fn a_sky_behind_lenses_and_shutters() {
     let half = |view: View| View { camera: view.camera.scaled(80, 50).unwrap(), ..view };
     let mut views: Vec<View> = lens_views().into_iter().map(half).collect();
     views.push(half(street_views()[1]));
-    // Where Newton's steps alone, from the middle or the end, would lead nowhere.
+    // Newton's steps alone do not converge here, neither from the middle nor from the end.
     let far = OpenCv::new([0.75, -0.27, -0.096, 0.0, 0.0, 0.0], [0.0; 2], [0.0; 4]);
     let pinhole = Pinhole { fx: 33.0, fy: 33.0, cx: 50.0, cy: 50.0 };
     let far = Camera { lens: Lens::opencv(far), ..Camera::from_pinhole(100, 100, pinhole) };
@@ -111,7 +111,7 @@ fn a_sky_behind_lenses_and_shutters() {
 
 #[test]
 fn images_and_a_background() {
-    // A colour for every direction, so that edges of faces are no seams.
+    // A colour for every direction, so that edges of faces are not seams.
     let mut rgb8 = Vec::new();
     for face in 0..6 {
         for k in 0..81 {
@@ -148,7 +148,7 @@ fn a_sky_behind_gaussians() {
     for (image, truth) in images.iter().zip(&truths) {
         agree(image, truth).unwrap();
     }
-    // In parts, the same bytes.
+    // A frame that is drawn in parts has the same bytes.
     let small = gpu_with_limits(bindings(2 << 20));
     let at_once = render(&gpu, &scene, &RenderProfile::DEFAULT, &street_views());
     assert!(render(&small, &scene, &RenderProfile::DEFAULT, &street_views()) == at_once);

@@ -145,7 +145,7 @@ enum Mutation {
     ActorsOff,
     /// Actors stand still during the exposure.
     FrozenActors,
-    /// Actors are drawn on top of everything, with what hides them removed.
+    /// Actors are drawn on top of everything, without the Gaussians that hide them.
     OnlyActors,
 }
 
@@ -380,7 +380,7 @@ const OUT_OF_REACH: (&str, &str) = ("T10", "centres off by m");
 /// mutation.
 fn every_check_can_fail(backend: &dyn Backend, sound: &Checked) {
     let mut wrong = Vec::new();
-    // Of the last case and its mutation: the table has some in several lines.
+    // The checks of the last case and its mutation: the table has some cases in several lines.
     let mut mutated_checks: Option<(&str, Mutation, Vec<Check>)> = None;
     for &(number, mutation, wanted) in MUTATIONS {
         let (_, sound) = sound.iter().find(|(case, _)| *case == number).unwrap();
@@ -456,7 +456,7 @@ fn every_check_of_moving_actors_fails_under_a_mutation() {
     for number in ["T29", "T30"] {
         let sound = case(number).checks(&backend).unwrap();
         assert!(sound.iter().all(Check::holds), "{number}: {sound:?}");
-        // What is finite is T16's.
+        // T16 checks that values are finite.
         let mut unfailed: Vec<&str> = sound.iter().map(|check| &*check.what).collect();
         unfailed.retain(|what| !what.ends_with("every value is finite"));
         assert!(unfailed.len() >= 4, "{number}: {unfailed:?}");

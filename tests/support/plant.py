@@ -1,7 +1,8 @@
-"""Plants one fault into each of many copies of a package's source, and says which test notices it.
+"""Mutation testing: applies one mutation to each of many copies of a package's source, and reports which test detects
+it.
 
-A copy is a module of the package's test binary, with the tests that use it, so that one build serves all of them. Nothing
-of it stays: the binary's main.rs is restored.
+A copy is a module of the package's test binary, with the tests that use it, so that one build serves all of them. At
+the end, the copies are removed and the binary's main.rs is restored.
 """
 
 import os
@@ -36,7 +37,7 @@ def source(path: str) -> str:
 
 
 def planted(text: str, fault: Fault) -> str:
-    assert fault.old in text, f"{fault.file} has no {fault.old!r}: the list of faults is behind the source"
+    assert fault.old in text, f"{fault.file} has no {fault.old!r}: the list of mutations is out of date"
     return text.replace(fault.old, fault.new, 1)
 
 
@@ -67,7 +68,7 @@ def run(package: str, faults: list[Fault], copies: list[Copy]) -> int:
 
 
 def chosen(faults: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Those that the command line chooses: all, or those of the files that it names."""
+    """The mutations of the files that the command line names; all if it names none."""
     names = sys.argv[1:]
     unknown = [name for name in names if all(fault[0] != name for fault in faults)]
     if unknown:
@@ -78,7 +79,7 @@ def chosen(faults: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
 def report(faults: list[Fault], output: str) -> int:
     ran = set()
     failed = defaultdict(list)
-    # Tests of a copy: those beside it, and those in its own files.
+    # Tests of a copy: those next to it, and those in its own files.
     pattern = r"^test planted::m(\d+)::(?:mutant::(?:\w+::)*?)?tests::(\S+) \.\.\. (\w+)"
     for index, test, result in re.findall(pattern, output, re.MULTILINE):
         ran.add(int(index))

@@ -28,7 +28,7 @@ fn a_planted_cycle_is_found() {
         file("b/d.rs", "use super::B; use crate::c;"),
         file("c.rs", "fn f() { crate::a::g(); }"),
     ]);
-    // a -> b is no part of it: b/mod.rs names only its own child.
+    // a -> b is not part of it: b/mod.rs names only its own child.
     assert!(cycles_of(&edges(&files)).is_empty());
     let mut files = files;
     files.insert("b/mod.rs".to_owned(), "mod d; use crate::c; pub struct B;".to_owned());
@@ -60,7 +60,7 @@ fn edges(files: &BTreeMap<String, String>) -> Edges {
     edges
 }
 
-/// Groups of files each of which reaches each other, sorted.
+/// Groups of files that all reach each other, sorted.
 fn cycles_of(edges: &Edges) -> Vec<Vec<String>> {
     let reached: BTreeMap<&String, BTreeSet<&String>> =
         edges.keys().map(|file| (file, reached_from(edges, file))).collect();

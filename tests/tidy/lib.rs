@@ -1,1 +1,1 @@
-//! Nothing of its own: a package so that these tests compile without the program.
+//! Empty library. The package exists so that these tests compile without the rest of the workspace.

@@ -1,7 +1,7 @@
 //! Licences and versions of all dependencies, as `deny.toml` allows them.
 //!
-//! `cargo deny check` says the same and more, but takes longer to build than this project; the list is
-//! one, `deny.toml`, which both read.
+//! `cargo deny check` checks this and more, but takes longer to build than this project. Both read the same list,
+//! `deny.toml`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;

@@ -1,4 +1,4 @@
-//! Links of the documents to files beside them.
+//! Links of the documents to files of the repository.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -25,7 +25,7 @@ fn a_planted_link_to_nowhere_is_found() {
     assert_eq!(broken(&path, "[x]: nowhere.md\n").len(), 1);
 }
 
-/// What is not the project's own, or not written by hand.
+/// Folders that are not part of the project, or not written by hand.
 const ELSEWHERE: &[&str] = &["target", "shared", "node_modules"];
 
 fn documents() -> Vec<PathBuf> {

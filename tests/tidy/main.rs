@@ -1,5 +1,5 @@
-//! What Cargo cannot say about the source: which crate may be used where within a package, no import cycles,
-//! plain prose, links that lead somewhere, licences.
+//! Rules for the source that Cargo cannot check: which crate may be used where within a package, no import cycles,
+//! plain prose, links that lead to files, licences.
 
 mod cycles;
 mod licences;

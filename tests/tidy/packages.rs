@@ -1,5 +1,5 @@
-//! The table of packages in `src/lib.rs` is what the manifests say, and crates that belong to one place
-//! are named there alone.
+//! The table of packages in `src/lib.rs` equals the manifests, and crates that belong to one place are named only
+//! there.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -61,7 +61,7 @@ const FILES: &[&str] = &[
 /// The modules that open files.
 const FILE_MODULES: &[&[&str]] = &[&["std", "fs"], &["tokio", "fs"]];
 
-/// Within the server, only the converter knows the messages of the wire; its limits hold everywhere.
+/// Within the server, only the converter uses the messages of the wire; its limits apply everywhere.
 const WIRE_IN_SERVER: &[&str] = &["src/server/convert"];
 
 #[test]

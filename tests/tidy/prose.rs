@@ -1,4 +1,4 @@
-//! Prose that reads at once: words for persons only where a person is meant, one binding per line.
+//! Readable text: words for persons only where a person is meant, one binding per line.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,8 +9,8 @@ use syn::visit::{self, Visit};
 use crate::root;
 use crate::source::rust_files;
 
-/// Words that mean persons. In this project something else is meant nearly always, and then "what", "which",
-/// "that" or the name of the thing reads at once.
+/// Words that mean persons. In this project something else is meant nearly always; then "what", "which", "that" or the
+/// name of the thing is right.
 const PERSONS: &[&str] = &["who", "whom", "whoever", "nobody", "somebody", "everybody", "anybody"];
 
 /// Folders and files that people read.
@@ -32,7 +32,7 @@ const READ: &[&str] = &[
 
 const EXTENSIONS: &[&str] = &["rs", "md", "py", "wgsl", "toml", "yml"];
 
-/// Lines that mean a person, or name the words.
+/// Files that contain these words on purpose.
 const MEANT: &[&str] = &["tests/tidy/prose.rs"];
 
 #[test]

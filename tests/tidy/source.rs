@@ -104,7 +104,7 @@ pub(crate) fn rust_files(folder: &Path) -> BTreeMap<String, String> {
 }
 
 /// A path that code names, as `["crate", "cpu", "bin"]` or `["axum", "Router"]`, and its line, from 1.
-/// `self` and `super` are resolved: what lies in the package starts with `crate`.
+/// `self` and `super` are resolved: paths in the package start with `crate`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Named {
     pub(crate) path: Vec<String>,

@@ -1,4 +1,4 @@
-//! The options with which files become an asset: of `wildcity actor import` and of `wildcity actor push`.
+//! Options of `wildcity actor import` and `wildcity actor push`: how files become an asset.
 
 use std::path::Path;
 
@@ -14,7 +14,7 @@ pub(super) struct AssetOptions {
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
 
-    /// What it is: vehicle, pedestrian, bicycle or object.
+    /// Class of the actor: vehicle, pedestrian, bicycle or object.
     #[arg(long, default_value = "vehicle", value_parser = parse_class)]
     pub(super) class: ActorClass,
 
@@ -28,7 +28,8 @@ pub(super) struct AssetOptions {
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
     pub(super) scale: f64,
 
-    /// Number of flat Gaussians that cover the triangles of a mesh, 1,000 to 1,000,000. Small triangles add more.
+    /// Number of flat Gaussians that cover the triangles of a mesh, 1,000 to 1,000,000. Small triangles add more
+    /// Gaussians.
     #[arg(
         long,
         value_name = "N",

@@ -20,11 +20,11 @@ use wildcity_twin::store::{Catalog, CutPlace, Version};
 use super::asset_options::parse_class;
 use crate::cli::directories::{TwinVersion, Twins};
 
-/// Lift what lies in a box out of a twin: makes a new version without it, and an asset of exactly these Gaussians.
+/// Cut the Gaussians in a box out of a twin: makes a new version without them, and an asset of exactly these Gaussians.
 ///
-/// This lets a parked car drive away. Everything from 5 cm above the bottom of the box on is cut; the ground stays.
-/// Where the car hid the ground, the new version may have a hole, which shows in the opacity. Open sessions keep the
-/// version that they have.
+/// So a parked car can become an actor that drives away. Everything from 5 cm above the bottom of the box on is cut;
+/// the ground stays. Where the car hid the ground, the new version may have a hole, which shows in the opacity. Open
+/// sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Cut {
@@ -38,8 +38,9 @@ pub(super) struct Cut {
     #[arg(required_unless_present = "tracks", conflicts_with = "tracks", requires = "name")]
     region: Option<Region>,
 
-    /// Cut what the recorded actors of a file wildcity.tracks/1 swept, in place of a box: what was driven through is
-    /// no wall. Makes no asset, since a moving car leaves a smear.
+    /// Cut the volume that the recorded actors of a wildcity.tracks/1 file swept, instead of a box. Vehicles drove
+    /// through this volume, so it contains no static object. Makes no asset, because a moving car is reconstructed as a
+    /// smear.
     #[arg(long, value_name = "FILE")]
     tracks: Option<PathBuf>,
 
@@ -47,7 +48,7 @@ pub(super) struct Cut {
     #[arg(long, value_name = "NAME", conflicts_with = "tracks")]
     name: Option<String>,
 
-    /// What it is: vehicle, pedestrian, bicycle or object.
+    /// Class of the actor: vehicle, pedestrian, bicycle or object.
     #[arg(long, default_value = "vehicle", value_parser = parse_class)]
     class: ActorClass,
 
@@ -61,9 +62,9 @@ Examples:
   wildcity actor cut street@2 --box=-12,7.5,0.1,178,5.2,2.0,2.1 --name van
   wildcity actor cut street --tracks recorded.tracks.json";
 
-/// Most that a swept box moves between two places at which it is cut, in metres.
+/// Largest motion of a swept box between two places at which it is cut, in metres.
 const SWEEP_STEP_M: f64 = 0.25;
-/// Most places of all tracks together: 25 km of driving.
+/// Largest number of places of all tracks together: 25 km of driving.
 const SWEEP_PLACES: usize = 100_000;
 
 /// A box on the ground.
@@ -154,7 +155,7 @@ impl Cut {
     }
 }
 
-/// The places of all boxes on their tracks, so close that nothing is left between two of them.
+/// The places of all boxes on their tracks, close enough that nothing is left between two of them.
 fn swept(file: &TracksFile) -> anyhow::Result<Vec<CutPlace>> {
     let mut places = Vec::new();
     for section in &file.tracks {

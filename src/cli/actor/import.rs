@@ -29,7 +29,7 @@ use crate::cli::progress;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Import {
-    /// The file. For a scene in a folder: a SOG's folder, or the .gltf in it.
+    /// The file; for a scene in a folder, the folder of a SOG, or the .gltf file.
     #[arg(value_name = "FILE")]
     source: PathBuf,
 

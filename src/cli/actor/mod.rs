@@ -13,9 +13,9 @@ mod summary;
 
 pub(super) use generate::generated;
 
-/// Make, list, look at and remove assets of actors: what other vehicles and pedestrians are drawn from.
+/// Make, list, show and remove assets of actors, from which other vehicles and pedestrians are rendered.
 ///
-/// Assets lie beside the twins and are shared by all of them. An asset is identified by the BLAKE3 of its content.
+/// Assets are stored next to the twins, and all twins share them. An asset is identified by the BLAKE3 of its content.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -18,7 +18,7 @@ const SIZE_PX: [u32; 2] = [640, 400];
 /// Focal length, in pixels: 53° wide.
 const FOCAL_PX: f64 = 640.0;
 
-/// Renders four pictures beside and below each other, as a PNG.
+/// Renders the four pictures as one PNG.
 pub(super) fn draw_all_around(asset: &ActorAsset) -> anyhow::Result<Vec<u8>> {
     let ActorBox { length_m, width_m, height_m } = asset.description.box_;
     let middle_m = DVec3::new(0.0, 0.0, 0.5 * height_m);

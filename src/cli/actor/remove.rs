@@ -6,9 +6,9 @@ use anyhow::Context as _;
 
 use crate::cli::directories::Twins;
 
-/// Remove an asset, to make room or to free its name.
+/// Remove an asset, to free disk space or its name.
 ///
-/// Episodes that run keep it in memory. From then on scenarios that name it are refused, and recorded episodes that drew
+/// Running episodes keep it in memory. Afterwards, scenarios that name it are refused, and recorded episodes that show
 /// it cannot be replayed, until the same asset is made again. No twin changes.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
@@ -16,11 +16,11 @@ Examples:
   wildcity actor remove car --dry-run
   wildcity actor remove 9f0c21ab")]
 pub(super) struct Remove {
-    /// The asset: its name if no other has it, or the first digits of its hash; a damaged one, too.
+    /// The asset: its name if no other has it, or the first digits of its hash; it may be damaged.
     #[arg(value_name = "ACTOR")]
     actor: String,
 
-    /// Only print what would be done.
+    /// Only print what would be removed.
     #[arg(long)]
     dry_run: bool,
 

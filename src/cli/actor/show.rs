@@ -11,7 +11,7 @@ use super::picture;
 use crate::cli::directories::Twins;
 use crate::cli::output;
 
-/// Show an asset: its box, its levels of detail, what it was made from; and a picture of it.
+/// Show an asset: its box, its levels of detail, its source, and a picture of it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

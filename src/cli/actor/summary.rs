@@ -1,4 +1,4 @@
-//! What `wildcity actor import` and `wildcity actor push` say of the asset that they made.
+//! The summary that `wildcity actor import` and `wildcity actor push` print of the asset that they made.
 
 use std::fmt;
 

@@ -1,7 +1,7 @@
 //! `wildcity augment`.
 
 mod options;
-mod studio;
+mod view_sessions;
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -24,24 +24,25 @@ use wildcity_server::{Config, Directories};
 use wildcity_twin::store::{Catalog, Version};
 
 use self::options::{ModelOptions, metres};
-use self::studio::{Drawn, Studio};
+use self::view_sessions::{Drawn, ViewSessions};
 use super::backend_options::BackendOptions;
 use super::directories::{TwinVersion, Twins};
 use super::{output, placement, progress};
 
-/// Draw views beside a twin's recorded drives, repair them, and write them as training data.
+/// Render views of a twin off its recorded drives, repair them, and write them as training data.
 ///
-/// A twin is right on its drives and less so beside them. This command draws the twin beside its drives, lets
-/// a model repair the images, and writes them with masks, depth and poses, so that a trainer can learn from
-/// them as from recorded images, but with less weight. The twin that is trained so is right farther away.
+/// A twin is accurate on its drives and less accurate off them. This command renders the twin off its drives, repairs
+/// the images with a model, and writes them with masks, depth and poses, so that a trainer can learn from them as from
+/// recorded images, but with less weight. A twin that is trained on these images is accurate at larger distances from
+/// the drives.
 ///
-/// A model repairs what is nearly right. So the views move away from the drives in rounds: round N draws at
-/// min(0.5 m x N, OFFSET) for each OFFSET of --offsets, to the left and to the right of the drive, every
-/// --every metres, with the heading of the drive and all cameras. Train on a round, push the twin, and draw
-/// the next round from it. Each round has a folder of its own, DIR/round_N.
+/// A model can correct small errors; where the image is far off, it hallucinates. So the views move away from the
+/// drives in rounds: round N renders at min(0.5 m x N, OFFSET) for each OFFSET of --offsets, to the left and to the
+/// right of the drive, every --every metres, with the heading of the drive and all cameras. Train on a round, push the
+/// twin, and render the next round from it. Each round has its own folder, DIR/round_N.
 ///
-/// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. A run that was
-/// interrupted is continued by the same command. docs/augmentation.md explains how to train with it.
+/// Images have no overlay, exposure or rolling shutter. Poses are in the twin's axes. To continue an interrupted run,
+/// run the same command again. docs/augmentation.md explains how to train with it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Augment {
@@ -49,15 +50,15 @@ pub(super) struct Augment {
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
-    /// Wanted distances to the drives, in metres, separated by commas, each to both sides.
+    /// Lateral offsets that the rounds lead to, in metres, separated by commas, each to both sides of the drives.
     #[arg(long, value_name = "M,..", default_value = "1,3,5", value_delimiter = ',', value_parser = metres)]
     offsets: Vec<f64>,
 
-    /// Distance of two views along a drive, in metres: 2 or 2m.
+    /// Distance between two views along a drive, in metres: 2 or 2m.
     #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
     every: f64,
 
-    /// The round: views are at most 0.5 m x N beside the drives.
+    /// The round N: views are at most 0.5 m x N off the drives.
     #[arg(long, value_name = "N", default_value_t = 1)]
     round: u32,
 
@@ -65,17 +66,18 @@ pub(super) struct Augment {
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     cameras: Vec<String>,
 
-    /// Longest side of an image, in pixels; larger images are drawn as the rig's images shrunk [default: the rig's]
+    /// Longest side of an image, in pixels; larger images of the rig are rendered at a reduced size [default: the
+    /// rig's]
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     side: Option<u32>,
 
-    /// Keep the lenses of the rig. Without it each lens is replaced by a pinhole of its field, up to 100° across.
-    /// transforms.json and COLMAP can describe pinholes, OpenCV lenses with k1, k2, p1 and p2, and OpenCV fisheyes;
-    /// other lenses and windshields are refused.
+    /// Keep the lenses of the rig. Without this option, each lens is replaced by a pinhole with its field of view, up
+    /// to 100°. transforms.json and COLMAP can describe pinholes, OpenCV lenses with k1, k2, p1 and p2, and OpenCV
+    /// fisheyes; other lenses and windshields are refused.
     #[arg(long)]
     lenses: bool,
 
-    /// Most points of the COLMAP model: opaque Gaussians within 100 m of a view, chosen at random.
+    /// Largest number of points of the COLMAP model: opaque Gaussians within 100 m of a view, chosen at random.
     #[arg(long, value_name = "N", default_value_t = limits::POINTS, value_parser = clap::value_parser!(u32).range(0..=MOST_POINTS))]
     points: u32,
 
@@ -83,7 +85,7 @@ pub(super) struct Augment {
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
 
-    /// Form of the COLMAP model.
+    /// Format of the COLMAP model.
     #[arg(long, value_name = "FORM", value_enum, default_value_t)]
     colmap: ColmapName,
 
@@ -103,13 +105,13 @@ pub(super) struct Augment {
 
 const EXAMPLES: &str = "\
 In DIR/round_N:
-  images/          what to train on: repaired, or as rendered without --repair
-  rendered/        the same before the repair
+  images/          images to train on: repaired, or as rendered without --repair
+  rendered/        the same images before the repair
   masks/           255 where the opacity is at least 1/2 and within the lens' field
   depth/           16-bit PNG in millimetres up to 65 m, 0 for none
   transforms.json  cameras, poses and weights, for nerfstudio and `wildcity eval`
   sparse/0         the same as a COLMAP model, with Gaussians as points
-  augment.json     what all of it was made with, and the hash of each file
+  augment.json     the settings of the run, and the hash of each file
 
 Examples:
   wildcity augment street --repair model.json --offsets 1,3,5 --every 2m --round 1 --out augmented
@@ -138,7 +140,7 @@ impl From<ColmapName> for ColmapForm {
     }
 }
 
-/// What is drawn.
+/// The views to render.
 struct Job {
     version: Version,
     plan: Plan,
@@ -155,7 +157,7 @@ impl Augment {
         let dir = self.out.join(format!("round_{}", job.plan.round()));
         output::create_dir(&self.out)?;
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
-        // For the records of the two sessions, which are of no use afterwards.
+        // The records of the two sessions, which are not needed afterwards.
         let scratch = tempfile::tempdir().context("cannot create a temporary directory")?;
         runtime.block_on(async {
             let running = wildcity_server::start(self.server(scratch.path(), &models)?).await?;
@@ -191,11 +193,11 @@ impl Augment {
             repairs: Arc::clone(models),
             ..Config::local(directories, Arc::from(self.backend.backend()?))
         };
-        config.limits.step = studio::PATIENCE;
+        config.limits.step = view_sessions::PLACE_TIMEOUT;
         Ok(config)
     }
 
-    /// Draws what is missing, and writes the lists.
+    /// Renders the missing samples, and writes the lists.
     async fn draw(
         &self,
         url: &str,
@@ -205,8 +207,8 @@ impl Augment {
         dir: &Path,
     ) -> anyhow::Result<()> {
         let model = models.names().next().map(|name| (name, self.model.at_least));
-        let mut studio = Studio::open(url, &job.version, &job.cameras, model).await?;
-        let header = self.header(catalog, job, &studio);
+        let mut sessions = ViewSessions::open(url, &job.version, &job.cameras, model).await?;
+        let header = self.header(catalog, job, &sessions);
         let bar = progress::count("checking");
         let folder = Folder::open(dir, header, &mut progress::show(&bar))?;
         bar.finish_and_clear();
@@ -224,14 +226,14 @@ impl Augment {
         bar.set_length((job.places.len() * job.cameras.len()) as u64);
         bar.set_position(kept as u64);
         bar.reset_eta();
-        // One place is written while the next one is drawn.
+        // One place is written while the next one is rendered.
         let (sender, receiver) = mpsc::channel(1);
         let cameras = job.cameras.clone();
         let writer_bar = bar.clone();
-        let writer = spawn_blocking(move || written(folder, &cameras, receiver, &writer_bar));
+        let writer = spawn_blocking(move || write_samples(folder, &cameras, receiver, &writer_bar));
         for place in missing {
-            let drawn = studio.draw(place).await?;
-            // The writer has ended only if it failed, and says why.
+            let drawn = sessions.draw(place).await?;
+            // The writer ends early only if it failed; then it returns the reason.
             if sender.send((place.clone(), drawn)).await.is_err() {
                 break;
             }
@@ -239,11 +241,11 @@ impl Augment {
         drop(sender);
         let folder = writer.await??;
         bar.finish_and_clear();
-        studio.close().await?;
+        sessions.close().await?;
         self.finish(catalog, job, folder, kept, dir)
     }
 
-    fn header(&self, catalog: &Catalog, job: &Job, studio: &Studio) -> Header {
+    fn header(&self, catalog: &Catalog, job: &Job, sessions: &ViewSessions) -> Header {
         let options = Options {
             round: job.plan.round(),
             wanted_offsets_m: job.plan.wanted_m().to_vec(),
@@ -258,22 +260,22 @@ impl Augment {
         let made_with = MadeWith {
             twin: job.version.manifest.twin.clone(),
             version_hash: job.version.hash.clone(),
-            backend: studio.backend().to_owned(),
-            repair: studio.repaired_with(),
+            backend: sessions.backend().to_owned(),
+            repair: sessions.repaired_with(),
             options,
         };
         Header {
             made_with,
             version: job.version.number,
             offsets_m: job.plan.offsets_m(),
-            // Not every version says it: pushed ones may not.
+            // Some versions do not record this, such as pushed ones.
             world_from_capture: placement::of_version(catalog, &job.version)
                 .ok()
                 .map(|alignment| alignment.to_string()),
         }
     }
 
-    /// Writes transforms.json, the COLMAP model and augment.json, and says what was made.
+    /// Writes transforms.json, the COLMAP model and augment.json, and prints a summary.
     fn finish(
         &self,
         catalog: &Catalog,
@@ -319,8 +321,8 @@ fn is_done(folder: &Folder, place: &Place, job: &Job) -> bool {
     job.cameras.iter().all(|camera| folder.has(&place.image_name(&camera.name)))
 }
 
-/// Writes what comes in, until nothing comes any more.
-fn written(
+/// Writes the samples of each received place to the folder, until the channel is closed.
+fn write_samples(
     mut folder: Folder,
     cameras: &[TrainingCamera],
     mut receiver: mpsc::Receiver<(Place, Vec<Drawn>)>,
@@ -339,7 +341,7 @@ fn written(
     Ok(folder)
 }
 
-/// A drawn image as a sample with its files.
+/// Makes a sample and its files of a rendered image.
 fn sample(
     name: String,
     place: &Place,

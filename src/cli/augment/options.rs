@@ -12,9 +12,9 @@ use wildcity_twin::store::Version;
 
 use crate::cli::repair_options::runtime_library;
 
-/// Most threads of a model.
+/// Largest number of threads of a model.
 const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
-/// The rig of a twin that has none, as of a session.
+/// The rig of a twin without one, as in a session.
 const DEFAULT_RIG: &str = "vehicle6";
 
 /// The model that repairs the images.
@@ -24,15 +24,15 @@ pub(super) struct ModelOptions {
     #[arg(long, value_name = "MODEL.json")]
     repair: Option<PathBuf>,
 
-    /// Leave images below this trust as rendered: a model would invent what is there.
+    /// Leave images below this trust as rendered: there the model would hallucinate.
     #[arg(long, value_name = "TRUST", default_value_t = 0.1, value_parser = trust, requires = "repair")]
     pub(super) at_least: f64,
 
-    /// ONNX Runtime library for --repair, from version 1.18 on [default: ORT_DYLIB_PATH]
+    /// ONNX Runtime library for --repair, version 1.18 or later [default: $ORT_DYLIB_PATH]
     #[arg(long, value_name = "PATH")]
     onnxruntime: Option<PathBuf>,
 
-    /// Threads of the model on the processor. The bytes do not depend on it.
+    /// Threads of the model on the processor. The images do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
     repair_threads: u16,
 
@@ -78,7 +78,7 @@ pub(super) fn cameras(
     cameras.collect()
 }
 
-/// The camera with images of at most this side. Images that are small enough stay as they are.
+/// The camera with images of at most this side. Smaller images stay as they are.
 fn sized(camera: Camera, side_px: Option<u32>) -> anyhow::Result<Camera> {
     let [width, height] = [camera.width_px, camera.height_px].map(f64::from);
     let scale = side_px.map_or(1.0, |side_px| f64::from(side_px) / width.max(height));
@@ -95,7 +95,7 @@ fn sized(camera: Camera, side_px: Option<u32>) -> anyhow::Result<Camera> {
 pub(super) fn metres(text: &str) -> Result<f64, String> {
     let text = text.trim();
     let number = text.strip_suffix('m').unwrap_or(text).trim_end();
-    number.parse().map_err(|_| format!("{text:?} is no number of metres, such as 2 or 2m"))
+    number.parse().map_err(|_| format!("{text:?} is not a number of metres, such as 2 or 2m"))
 }
 
 fn trust(text: &str) -> Result<f64, String> {

@@ -18,11 +18,12 @@ use wildcity_scene::route::Route;
 use wildcity_server::Running;
 use wildcity_session::{Encoding, Outputs, RigChoice, Session, Still, Stills};
 
-/// Measure what it costs to bring a step's raw images to an agent on the same machine.
+/// Measure the cost of delivering a step's raw images to an agent on the same machine.
 ///
 /// The same poses are rendered in four ways, in turn: the renderer alone; a session of this process; a client through
-/// the socket; and a client with shared memory. Server and client are in this process. Prints the medians of the wall time
-/// and of the processor time of a step, and the median of its ratio to rendering alone in the same round.
+/// the socket; and a client with shared memory. Server and client are in this process. Prints, for each way, the median
+/// wall time and the median processor time of a step, and the median ratio of its time to that of the renderer alone in
+/// the same round.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Delivery {
@@ -33,7 +34,7 @@ pub(super) struct Delivery {
     #[arg(long, value_name = "PRESET", default_value = "vehicle6")]
     rig: String,
 
-    /// Rounds, in which each way has one step; one round before them is not counted.
+    /// Number of rounds, in which each way makes one step; one round before them is not counted.
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     rounds: u32,
 }
@@ -46,7 +47,7 @@ Examples:
 /// The ways, in the order of [`Ways::step`].
 const WAYS: [&str; 4] = ["renderer alone", "session", "socket", "shared memory"];
 
-/// What makes a step in each way.
+/// The renderer, the session and the clients of the four ways.
 struct Ways {
     stills: Stills,
     rig: Rig,
@@ -55,7 +56,7 @@ struct Ways {
     memory: Client,
 }
 
-/// What a step took.
+/// The cost of a step.
 #[derive(Clone, Copy, Default)]
 struct Cost {
     wall: Duration,

@@ -53,7 +53,7 @@ Examples:
   wildcity bench load street --file street.ply
   sudo wildcity bench load street --cold --twins ./twins";
 
-/// One line of the result: what was read, and how fast.
+/// One line of the result: the data that was read, and its speed.
 struct Line {
     what: String,
     bytes: u64,

@@ -1,4 +1,4 @@
-//! How much memory this process has.
+//! The memory of this process.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use anyhow::Context as _;
 /// Memory of this process that is in RAM, in bytes.
 pub(super) struct Rss {
     pub(super) now: u64,
-    /// The most since the process began.
+    /// Its largest value since the process started.
     pub(super) peak: u64,
 }
 

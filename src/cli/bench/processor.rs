@@ -1,4 +1,4 @@
-//! How much processor time this process took.
+//! The processor time of this process.
 
 use std::fs;
 use std::time::Duration;

@@ -16,12 +16,11 @@ use wildcity_scene::route::Route;
 use wildcity_scene::{Manifest, Rig};
 use wildcity_session::{Encoding, Engine, Outputs, RigChoice, Session, SessionOptions, Start};
 
-/// Measure how many steps per second several sessions on one twin take together, without a network.
+/// Measure how many steps per second several sessions on one twin make together, without a network.
 ///
-/// Every session drives along the twin's first trajectory, each from another place, as fast as it can. For
-/// each number of sessions, prints the steps per second of all together, how long a step takes, the processor
-/// time of a step, and what a session costs beyond its pixels: the part of a step that is neither waiting for
-/// the renderer nor rendering.
+/// Every session drives along the twin's first trajectory, each from another place, as fast as it can. For each number
+/// of sessions, prints the steps per second of all together, the time of a step, the processor time of a step, and the
+/// time of a step beyond its pixels: the part that is neither waiting for the renderer nor rendering.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Sessions {

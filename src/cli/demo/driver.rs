@@ -11,7 +11,7 @@ use wildcity_sim::traffic::{Course, Idm, rolled};
 
 use super::wire_pose;
 
-/// A driver that looks at the boxes of actors, as `outputs.actors` tells them.
+/// A driver that reads the boxes of actors from `outputs.actors`.
 pub(super) struct CarefulDriver {
     course: Course,
 }
@@ -19,11 +19,11 @@ pub(super) struct CarefulDriver {
 /// Poses of a plan, and the time between two of them.
 const PLAN_POSES: i64 = 20;
 const PLAN_STEP_US: i64 = 100_000;
-/// An actor is in the way if its middle is at most this far beside the line, in metres: half of both widths.
+/// Largest lateral distance from the line at which an actor is in the way, in metres: half of both widths.
 const BESIDE_M: f64 = 2.2;
 /// From the ego's rear axle to its front bumper, in metres.
 const FRONT_M: f64 = 4.0;
-/// The driver brakes harder than the model's comfort, in m/s².
+/// Deceleration of the driver, in m/s²: larger than the comfortable one of the model.
 const BRAKING_MPS2: f64 = 6.0;
 
 impl CarefulDriver {

@@ -46,9 +46,9 @@ use super::{output, progress, view};
 ///
 /// With --scenario, there is traffic: the agent keeps its distance from other vehicles and pedestrians.
 ///
-/// With --off-trajectory, it does not drive. It draws views beside the drive from a copy of the street that is
-/// damaged there, as real captures are, and compares them with the street itself: without a repair, and with --repair
-/// also after.
+/// With --off-trajectory, the command does not drive. It renders views off the recorded drive from a degraded copy of
+/// the street, which has reconstruction errors there as real captures have. It compares these views with views of the
+/// street itself: as rendered, and with --repair also after the repair.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Demo {
@@ -68,15 +68,15 @@ pub(super) struct Demo {
     #[arg(long, conflicts_with_all = ["steps", "scenario"])]
     view: bool,
 
-    /// Draw views this far to the left of the drive, in metres, instead of driving.
+    /// Render views at this distance to the left of the recorded drive, in metres, instead of driving.
     #[arg(long, value_name = "M", conflicts_with_all = ["steps", "scenario", "view"], allow_negative_numbers = true)]
     off_trajectory: Option<f64>,
 
-    /// Repair these views by the model that comes with the program.
+    /// Also repair these views, with the model that comes with the program.
     #[arg(long, requires = "off_trajectory")]
     repair: bool,
 
-    /// ONNX Runtime library for --repair, from version 1.18 on [default: ORT_DYLIB_PATH]
+    /// ONNX Runtime library for --repair, version 1.18 or later [default: $ORT_DYLIB_PATH]
     #[arg(long, value_name = "PATH", requires = "repair")]
     onnxruntime: Option<PathBuf>,
 
@@ -100,9 +100,9 @@ Examples:
 pub(super) const TWIN: &str = "demo";
 /// Name of the demo twin that `wildcity report` measures: the same street in record format f32.
 const EXACT_TWIN: &str = "demo-f32";
-/// Name of the demo twin that is spoiled.
+/// Name of the degraded copy of the demo twin.
 const SPOILED_TWIN: &str = "demo-spoiled";
-/// How much it is spoiled: [`Spoil::new`].
+/// Amount of its reconstruction errors: [`Spoil::new`].
 const SPOILED_BY: f64 = 0.5;
 /// Prefix of the provenance of the demo street, in every revision of the generator.
 const STREET: &str = "street ";
@@ -272,12 +272,12 @@ struct Drive {
     steps: Vec<serde_json::Value>,
     /// File names of the mosaics.
     mosaics: Vec<String>,
-    /// What happened in the scenario.
+    /// Events of the scenario.
     events: Vec<Event>,
 }
 
 impl Drive {
-    /// Writes a mosaic, if the step is one of every tenth.
+    /// Writes a mosaic of every tenth step.
     fn write_mosaic(&mut self, seen: &Observation, out: &Path) -> anyhow::Result<()> {
         let step = seen.metadata().step;
         if step.is_multiple_of(MOSAIC_STEPS) {

@@ -1,4 +1,4 @@
-//! `wildcity demo --off-trajectory`: views beside the drive, from a spoiled copy of the street, repaired, and as they are.
+//! `wildcity demo --off-trajectory`: views off the drive from a degraded copy of the street, as rendered and repaired.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -33,7 +33,7 @@ const SIZE_PX: [u32; 2] = [360, 232];
 /// Distance of two recorded images along the drive, in metres, and the quality of their JPEGs.
 const RECORDED_M: f64 = 2.0;
 const JPEG_QUALITY: u8 = 95;
-/// Where views are drawn, in metres along the drive.
+/// Stations of the views, in metres along the drive.
 const STATIONS_M: [f64; 4] = [40.0, 90.0, 190.0, 240.0];
 
 /// Writes the files of the model to a directory, and reads its manifest. Loads nothing.
@@ -45,9 +45,9 @@ pub(super) fn model(dir: &Path, options: LoadOptions) -> anyhow::Result<Models> 
     Ok(Models::read(&[dir.join(MODEL[0].0)], options)?)
 }
 
-/// Gives the spoiled twin images of its drive, unless it has them: what the cameras saw there is the street itself.
+/// Stores recorded images in the degraded twin, unless it has some. They show the street without errors.
 ///
-/// They are drawn where the repair of the views looks for them: up to 8 m behind a view and 2 m ahead.
+/// Their stations are those that the repair of the views searches: from 8 m behind a view to 2 m ahead of it.
 async fn record_images(
     url: &str,
     catalog: &Catalog,
@@ -95,12 +95,12 @@ async fn record_images(
     Ok(())
 }
 
-/// Views beside the drive.
+/// Views off the drive.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Views<'a> {
-    /// How far to the left of the drive, in metres.
+    /// Distance from the drive to the left, in metres.
     pub(super) offset_m: f64,
-    /// Whether they are repaired.
+    /// Whether the views are also repaired.
     pub(super) repair: bool,
     /// Folder of the pictures.
     pub(super) out: &'a Path,
@@ -158,7 +158,7 @@ fn mean_db(images: &[Vec<RgbImage>], truth: &[Vec<RgbImage>], camera: usize) -> 
     pairs.map(db).sum::<f64>() / images.len() as f64
 }
 
-/// Rows of images of [`SIZE_PX`] as one.
+/// Joins rows of images of [`SIZE_PX`] into one image.
 fn side_by_side(rows: &[&[RgbImage]]) -> RgbImage {
     let [width, height] = SIZE_PX;
     let mut picture = RgbImage::new(CAMERAS.len() as u32 * width, rows.len() as u32 * height);
@@ -170,7 +170,7 @@ fn side_by_side(rows: &[&[RgbImage]]) -> RgbImage {
     picture
 }
 
-/// The images of a twin from poses, in the order of the cameras, for each pose.
+/// Renders the images of a twin: for each pose, in the order of the cameras.
 async fn drawn(
     url: &str,
     twin: &str,
@@ -186,7 +186,7 @@ async fn drawn(
         encoding: Encoding::Raw,
         ..Outputs::default()
     };
-    // Whatever the trust is.
+    // At any trust.
     let always = Repair {
         model: MODEL_NAME.to_owned(),
         below: Some(1.0),

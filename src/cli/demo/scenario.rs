@@ -4,12 +4,12 @@ use serde_json::{Map, Value};
 
 use wildcity_twin::store::StoredActor;
 
-/// Which scenario.
+/// A scenario of the demo.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub(super) enum DemoScenario {
-    /// A van overtakes, moves into the ego's lane and brakes; a car comes from ahead.
+    /// A van overtakes, moves into the ego's lane and brakes; there is an oncoming car.
     CutIn,
-    /// Cars ahead and from ahead, and a pedestrian on the crosswalk.
+    /// Cars ahead, oncoming cars, and a pedestrian on the crosswalk.
     Traffic,
 }
 
@@ -22,7 +22,7 @@ impl DemoScenario {
         }
     }
 
-    /// Steps until what it promises has happened.
+    /// Number of steps until all its events have happened.
     pub(super) fn steps(self) -> u32 {
         match self {
             Self::CutIn => 100,

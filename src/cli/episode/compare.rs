@@ -23,7 +23,7 @@ use super::bad_input;
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Compare {
-    /// The run before: its result.json, or its folder.
+    /// The earlier run: its result.json, or its folder.
     #[arg(value_name = "BEFORE")]
     before: PathBuf,
 
@@ -31,8 +31,8 @@ pub(super) struct Compare {
     #[arg(value_name = "AFTER")]
     after: PathBuf,
 
-    /// By how much pass_rate, or the mean of a score, may be worse; may be given several times. pass_rate=0 asks for the
-    /// pass rate alone, and not for each episode.
+    /// By how much pass_rate, or the mean of a score, may be worse; may be given several times. pass_rate=0 compares
+    /// only the pass rates, and not each episode.
     #[arg(long, value_name = "NAME=AMOUNT")]
     worse_by: Vec<Tolerance>,
 

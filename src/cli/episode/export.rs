@@ -56,7 +56,7 @@ Examples:
   wildcity episode export agent-1 --mcap agent-1.mcap --images
   wildcity episode export run/episodes/straight-0-1.jsonl --mcap straight.mcap --images --camera front";
 
-/// A calibration that is farther off its lens is worth a note, in pixels.
+/// Difference of a calibration from its lens above which a note is printed, in pixels.
 const NOTED_ERROR_PX: f64 = 0.1;
 
 impl Export {

@@ -11,10 +11,10 @@ use super::bad_input;
 /// The folder of a run that has its records.
 const EPISODES: &str = "episodes";
 
-/// Most runs that a message names.
+/// Largest number of runs that a message names.
 const NAMED: usize = 5;
 
-/// The folder with the records: that of `--episodes`, or its folder `episodes` if it is that of a run.
+/// The folder with the records: that of `--episodes`; or if that is the folder of a run, the folder `episodes` in it.
 ///
 /// # Errors
 /// There is no such folder, or it cannot be read; exit code 2.
@@ -45,7 +45,7 @@ pub(super) fn runs_in(dir: &Path) -> Vec<PathBuf> {
 
 /// The file of an episode: a path, or a name `SESSION-NUMBER` in the folder of records.
 pub(super) fn file_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
-    // A name may have dots, as of a second attempt: `straight-0.2-1`.
+    // A name may have dots, such as that of a second attempt: `straight-0.2-1`.
     let is_file_name = episode.extension().is_some_and(|ext| ext == "jsonl" || ext == "mcap");
     let is_name = !is_file_name && episode.components().count() == 1;
     if !is_name || episode.is_file() {

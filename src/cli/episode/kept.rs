@@ -5,7 +5,7 @@ use anyhow::Context as _;
 use wildcity_episode::driven_indices;
 use wildcity_session::{FrameRecord, FrameRequest, RecordedEpisode};
 
-/// Index of the camera of a name.
+/// Index of the camera with a name.
 pub(super) fn camera_of(recording: &RecordedEpisode, wanted: &str) -> anyhow::Result<usize> {
     let cameras = &recording.header.rig.cameras;
     cameras.iter().position(|camera| camera.name == wanted).with_context(|| {
@@ -14,7 +14,7 @@ pub(super) fn camera_of(recording: &RecordedEpisode, wanted: &str) -> anyhow::Re
     })
 }
 
-/// Leaves of a frame the images of some cameras; none of poses that were only looked at.
+/// Removes the images of other cameras from a frame, and all images of a frame that only observed poses.
 pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_cameras: usize) {
     let is_driven = matches!(frame.request, FrameRequest::Reset | FrameRequest::Step);
     let mut images = std::mem::take(&mut frame.images).into_iter();

@@ -23,9 +23,9 @@ use folder::file_of;
 
 /// Drive suites of scenarios; compare runs; list, score, compare and export recorded episodes.
 ///
-/// Exit codes of all of these commands: 0 if all is well; 1 if it is not: an episode failed (run), a run is worse (compare),
-/// two episodes differ (diff), an episode cannot be scored, rendered or written; 2 for a mistake in the command line, and
-/// for a file or folder that is missing or cannot be read. `run` also has 3 and 4, which its help explains.
+/// Exit codes of all of these commands: 0 for success; 1 if an episode failed (run), a run is worse (compare), two
+/// episodes differ (diff), or an episode cannot be scored, rendered or written; 2 for a mistake in the command line,
+/// and for a file or folder that is missing or cannot be read. `run` also has 3 and 4, which its help explains.
 ///
 /// A record is named SCENARIO-SEED-1, with a sweep SCENARIO-COMBINATION-SEED-1. SCENARIO-SEED.2-1 is the second attempt,
 /// after a technical failure of the first.
@@ -65,15 +65,15 @@ impl Episode {
 /// Reads an episode.
 ///
 /// # Errors
-/// There is no such file, or it is no record; exit code 2.
+/// There is no such file, or it is not a record; exit code 2.
 fn read(episode: &Path, episodes: &Episodes) -> anyhow::Result<EpisodeFile> {
     EpisodeFile::read(&file_of(episode, episodes)?).map_err(unreadable)
 }
 
-/// The file of an episode, of which the first line was read.
+/// The file of an episode, after its first line was read.
 ///
 /// # Errors
-/// As of [`read`].
+/// As for [`read`].
 fn record_of(episode: &Path, episodes: &Episodes) -> anyhow::Result<PathBuf> {
     let path = file_of(episode, episodes)?;
     EpisodeFile::header(&path).map_err(unreadable)?;
@@ -86,12 +86,12 @@ fn unreadable(error: ReadError) -> anyhow::Error {
     ))
 }
 
-/// The end of a command for a mistake in what it was given: exit code 2.
+/// The error of a command for a mistake in its input: exit code 2.
 fn bad_input(message: impl std::fmt::Display) -> anyhow::Error {
     exit(ExitCode::Usage, message)
 }
 
-/// The end of a command that could not do what it should.
+/// The error of a command that failed, with an exit code.
 fn exit(code: ExitCode, message: impl std::fmt::Display) -> anyhow::Error {
     Exit::error(code as u8, format!("{message:#}")).into()
 }

@@ -23,21 +23,21 @@ use super::{bad_input, exit};
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
 /// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if no
-/// episode failed by driving, 1 if one did, 2 if the command line, the suite, a scenario or the run of --against is wrong or
-/// the agent cannot be started, 3 if an episode was not driven for technical reasons or more than a tenth of
-/// them left the trained area, 4 if an episode does not repeat (--verify).
+/// episode failed by driving, and 1 if one did. It is 2 if the command line, the suite, a scenario or the run of
+/// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for technical reasons, or
+/// more than a tenth of the episodes left the trained area. It is 4 if an episode does not repeat (--verify).
 ///
-/// With --at-least and --against, episodes may fail and the exit code be 0. --at-least requires a pass rate, and
+/// With --at-least or --against, the exit code can be 0 although episodes failed. --at-least requires a pass rate, and
 /// --against that the run is not worse than an earlier one, as `wildcity episode compare` judges; it also writes
-/// comparison.json and comparison.html. junit.xml has every failure all the same, and the exit code as a property.
+/// comparison.json and comparison.html. junit.xml always lists every failure, and has the exit code as a property.
 ///
-/// Two episodes of a scenario that were driven alike count once in rates and means: two seeds of a scenario without
-/// jitter are the same episode.
+/// Episodes of a scenario that were driven alike count once in rates and means: two seeds of a scenario without jitter
+/// are the same episode.
 ///
 /// The shell starts the command of --agent once for each episode, with these variables in its environment:
 /// WILDCITY_URL, WILDCITY_OPEN (fields of its request `open` as JSON), WILDCITY_SEED (for `reset`) and WILDCITY_STEPS
-/// (after which it closes its session). docs/suites.md has an example. The command ends with exit code 0, or 124 if
-/// it ran out of time, 69 if something that it needs went away.
+/// (after which it closes its session). docs/suites.md has an example. The command must end with exit code 0; with 124
+/// if it ran out of time; or with 69 if it lost something that it needs.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Run {
@@ -45,7 +45,7 @@ pub(super) struct Run {
     #[arg(value_name = "SUITE")]
     suite: PathBuf,
 
-    /// What drives: log, stand or idm; egodriver:HOST:PORT, a driver of AlpaSim; or a command [default: that of the
+    /// The agent: log, stand or idm; egodriver:HOST:PORT for a driver of AlpaSim; or a command [default: that of the
     /// suite, or log]
     #[arg(long, value_name = "AGENT")]
     agent: Option<String>,
@@ -54,32 +54,33 @@ pub(super) struct Run {
     #[arg(long, value_name = "DIR", default_value = "wildcity-run")]
     out: PathBuf,
 
-    /// Episodes at once. Results do not depend on it.
+    /// Number of episodes at a time. Results do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
     jobs: u16,
 
-    /// How often an episode that failed for technical reasons is driven again.
+    /// Largest number of times that an episode is driven again after a technical failure.
     #[arg(long, value_name = "N", default_value_t = 1)]
     retries: u32,
 
-    /// How long a command may take for an episode, in seconds.
+    /// Time limit of a command for an episode, in seconds.
     #[arg(long, value_name = "S", default_value_t = wildcity_suite::limits::AGENT_TIMEOUT.as_secs())]
     agent_timeout_s: u64,
 
-    /// The least pass rate, from 0 to 1: the lower end of its 95 % interval must reach it [default: that of the
-    /// suite; without one every episode must pass]
+    /// The pass rate that is required, from 0 to 1: the lower end of the 95 % interval must reach it [default: that of
+    /// the suite; without one every episode must pass]
     #[arg(long, value_name = "RATE")]
     at_least: Option<f64>,
 
-    /// Compare with a run before: its result.json, or its folder.
+    /// Compare with an earlier run: its result.json, or its folder.
     #[arg(long, value_name = "RUN")]
     against: Option<PathBuf>,
 
-    /// By how much pass_rate, or the mean of a score, may be worse than before; see `wildcity episode compare --help`
+    /// By how much pass_rate, or the mean of a score, may be worse than in that run; see `wildcity episode compare
+    /// --help`
     #[arg(long, value_name = "NAME=AMOUNT", requires = "against")]
     worse_by: Vec<Tolerance>,
 
-    /// Export the record of each episode as MCAP, beside it: for Foxglove, Rerun and others.
+    /// Export the record of each episode as MCAP, next to it: for Foxglove, Rerun and others.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
 
@@ -87,11 +88,11 @@ pub(super) struct Run {
     #[arg(long)]
     verify: bool,
 
-    /// Take the latest versions of the twins, whatever the scenarios name; the results say so.
+    /// Use the latest versions of the twins instead of those that the scenarios name; the results record this.
     #[arg(long)]
     latest: bool,
 
-    /// Leave out all actors: on the bare twin the agent log must pass.
+    /// Remove all actors. The agent log must then pass, which checks the scenario.
     #[arg(long)]
     bare: bool,
 
@@ -113,7 +114,7 @@ Examples:
 
 impl Run {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        // What is wrong is said before anything is driven.
+        // Mistakes are reported before anything is driven.
         let (suite, scenarios) = SuiteFile::read(&self.suite).map_err(bad_input)?;
         let at_least = self.at_least.or(suite.at_least);
         if at_least.is_some_and(|rate| !(0.0..=1.0).contains(&rate)) {

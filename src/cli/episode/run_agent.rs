@@ -8,26 +8,28 @@ use wildcity_suite::{AGENTS, AgentChoice, BuiltIn, ExitCode};
 
 use super::{bad_input, exit};
 
-/// How an agent is called that is a driver of AlpaSim.
+/// Prefix of an agent that is a driver of AlpaSim.
 const EGODRIVER: &str = "egodriver:";
 
 /// How long one attempt to connect may take, and the time between two.
 const ATTEMPT: Duration = Duration::from_secs(2);
 const RETRY: Duration = Duration::from_millis(200);
 
-/// An agent by what the command line or the suite says.
+/// The agent that the command line or the suite names.
 ///
 /// # Errors
-/// It is empty, or the address of a driver is none; exit code 2.
+/// It is empty, or has an invalid address of a driver; exit code 2.
 pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
     if let Some(built_in) = BuiltIn::named(agent) {
         return Ok(AgentChoice::BuiltIn(built_in));
     }
     let line = match agent.strip_prefix(EGODRIVER) {
-        // This program is the bridge. The address is an argument of its own for the shell.
+        // This program is the bridge. The address is an argument of its own in the shell.
         Some(address) => {
             check_address(address).map_err(|reason| {
-                bad_input(format!("{agent:?} is no agent: expected egodriver:HOST:PORT; {reason}"))
+                bad_input(format!(
+                    "{agent:?} is not an agent: expected egodriver:HOST:PORT; {reason}"
+                ))
             })?;
             let program = std::env::current_exe().map_err(bad_input)?;
             format!("'{}' drive --egodriver '{address}'", program.display())
@@ -40,11 +42,11 @@ pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
     Ok(AgentChoice::Command { name: agent.to_owned(), line })
 }
 
-/// Checks that an address is HOST:PORT, of characters that a shell leaves alone.
+/// Checks that an address is HOST:PORT, without characters that have a meaning in a shell.
 fn check_address(address: &str) -> Result<(), &'static str> {
     let is_allowed = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
     if !address.chars().all(is_allowed) {
-        return Err("an address has letters, digits and -._:[] alone");
+        return Err("an address has only letters, digits and -._:[]");
     }
     let Some((host, port)) = address.rsplit_once(':') else { return Err("there is no port") };
     let is_ipv6 = host.starts_with('[') && host.ends_with(']');
@@ -60,8 +62,8 @@ fn check_address(address: &str) -> Result<(), &'static str> {
     }
 }
 
-/// Waits until the driver of AlpaSim listens, if the agent is one. The bridge of each episode would wait as long, and say
-/// nothing.
+/// Waits until the driver of AlpaSim listens, if the agent is one. Otherwise the bridge of each episode would wait for
+/// the same time, without a message.
 ///
 /// # Errors
 /// Nothing listens in the time that a driver may take to start; exit code 3.

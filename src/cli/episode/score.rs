@@ -10,7 +10,7 @@ use wildcity_episode::{EpisodeFile, EpisodeResult, result};
 
 use crate::cli::directories::Episodes;
 
-/// Score recorded episodes, from their records alone: no renderer, no twin.
+/// Score recorded episodes from their records only, without a renderer or a twin.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Score {
@@ -18,7 +18,7 @@ pub(super) struct Score {
     #[arg(value_name = "EPISODE", required = true)]
     episodes_to_score: Vec<PathBuf>,
 
-    /// Print one JSON object per episode, with what each score was computed from.
+    /// Print one JSON object per episode, with the values from which each score was computed.
     #[arg(long)]
     json: bool,
 

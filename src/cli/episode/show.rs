@@ -7,7 +7,7 @@ use wildcity_episode::{EpisodeFile, Event};
 
 use crate::cli::directories::Episodes;
 
-/// Show an episode: what was driven, what happened, how it ended.
+/// Show an episode: its steps, its events, and its end.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Show {

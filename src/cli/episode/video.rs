@@ -14,9 +14,9 @@ use super::kept::{camera_of, keep_cameras};
 
 /// Write the frames of an episode as numbered pictures, for a video.
 ///
-/// The episode is driven and rendered again, and compared with its record. No video is encoded here, since this program
-/// has no encoder; the printed ffmpeg command makes one of the pictures, at the speed of the simulation, which most players
-/// show: pictures of an odd width or height get a black column or row for it.
+/// The episode is driven and rendered again, and compared with its record. This program has no video encoder. It prints
+/// an ffmpeg command that makes a video of the pictures, at the speed of the simulation. The command pads an odd width
+/// or height with a black column or row, because most players need even sizes.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Video {
@@ -94,7 +94,7 @@ impl Video {
     }
 }
 
-/// Most players know yuv420p alone, which has one colour for 2 x 2 pixels: an odd size gets a black row or column.
+/// Most players support only yuv420p, which has one colour for 2 x 2 pixels: an odd size gets a black row or column.
 const PAD: &str = "-vf 'pad=ceil(iw/2)*2:ceil(ih/2)*2' ";
 
 fn write_png(path: &Path, image: &ReplayedImage<'_>) -> anyhow::Result<()> {

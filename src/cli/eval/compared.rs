@@ -8,13 +8,13 @@ use wildcity_scene::geometry::camera::FieldMask;
 use wildcity_scene::rig::RigCamera;
 use wildcity_session::{OfflineView, RenderedImage};
 
-use super::beside::Lens;
 use super::networks::Networks;
+use super::off_trajectory::Lens;
 use super::renderer::{covered, expose};
 use super::{Eval, Setup};
 use crate::cli::real_images::{RealImage, own_vehicle, picture};
 
-/// An image that was compared, for what comes after it.
+/// A compared image, with all that its views off the trajectory need.
 pub(super) struct Compared {
     pub(super) scores: EvaluatedImage,
     pub(super) view: View,
@@ -24,7 +24,7 @@ pub(super) struct Compared {
     pub(super) repaired: Option<Vec<u8>>,
     pub(super) counts: Option<Vec<bool>>,
     pub(super) camera: RigCamera,
-    /// Of the images that are repaired or moved beside the drive.
+    /// The camera for the warp, if images are repaired or there are views off the trajectory.
     pub(super) lens: Option<Lens>,
 }
 
@@ -38,7 +38,7 @@ struct Truth<'a> {
 }
 
 impl Eval {
-    /// Renders one image and compares it with the real one, and the repaired image, too.
+    /// Renders one image and compares it with the real one. Does the same with the repaired image, if there is a model.
     pub(super) fn evaluate(
         &self,
         setup: &Setup,
@@ -46,7 +46,7 @@ impl Eval {
         camera_name: &str,
     ) -> anyhow::Result<Compared> {
         let Setup { renderer, repairer, labels, networks, .. } = setup;
-        // Draw what the camera saw.
+        // Render the view of the camera.
         let profile = renderer.profile(image.near)?;
         let (truth, camera) = picture::real(&image.file, &image.camera, profile.background)?;
         let size_px = [camera.width_px, camera.height_px];
@@ -63,7 +63,7 @@ impl Eval {
         };
         expose(image.exposure_stops, &mut rendered, &mut repaired);
 
-        // Leave out what the twin does not have: what masks hide, the own vehicle, and what moves.
+        // Leave out what the twin does not have: masked pixels, the own vehicle, and moving objects.
         let mask = image.mask.as_deref().map(|file| picture::mask(file, size_px)).transpose()?;
         let rig = renderer.source.version().and_then(|version| version.manifest.rig.as_ref());
         let outside = own_vehicle::outside(rig, camera_name, size_px);
@@ -95,7 +95,8 @@ impl Eval {
         Ok(Compared { scores, view, profile, truth, rendered, repaired, counts, camera, lens })
     }
 
-    /// Compares an image with the real one. With `--save-images` it and the map of its errors go into two folders.
+    /// Compares an image with the real one. With `--save-images`, writes the image and the map of its errors to two
+    /// folders.
     fn compare(
         &self,
         networks: &Networks,
@@ -114,7 +115,7 @@ impl Eval {
     }
 }
 
-/// The repaired pixels of an image, if there is a model. The image gets its trust.
+/// The repaired pixels of an image, if there is a model. Sets the trust of the image.
 fn repaired(
     setup: &Setup,
     view: &View,
@@ -128,7 +129,7 @@ fn repaired(
         let place = drives.place(&camera.name, &view.world_from_camera)?;
         Some((drives, place.world_from_rig))
     });
-    // Without a drive the camera stands for the rig, and is trusted.
+    // Without a drive the pose of the camera is taken for that of the rig, and the trust is 1.
     let world_from_rig = placed.map_or(view.world_from_camera, |(_, rig)| rig);
     rendered.trust = placed.map_or(1.0, |(drives, rig)| drives.trust(&rig, view, rendered));
     let of = OfflineView {

@@ -22,9 +22,9 @@ pub(super) struct Drives {
 pub(super) struct DrivePlace<'a> {
     trajectory: &'a Trajectory,
     station_m: f64,
-    /// The pose of the drive there.
+    /// Pose of the drive at this station.
     drive: Pose,
-    /// Where the rig is when the image is taken.
+    /// Pose of the rig when the image was taken.
     pub(super) world_from_rig: Pose,
 }
 
@@ -37,8 +37,8 @@ impl Drives {
 
     /// The place of an image that a camera took from a pose.
     ///
-    /// A camera of the twin's rig, by its name, says where the rig is. For another camera, the rig has the heading of the
-    /// drive, and is as far beside it as the camera.
+    /// If the twin's rig has a camera of this name, its mounting gives the pose of the rig. For another camera, the rig
+    /// has the heading of the drive, and the lateral distance of the camera from it.
     pub(super) fn place(
         &self,
         camera_name: &str,
@@ -69,7 +69,7 @@ impl Drives {
 }
 
 impl DrivePlace<'_> {
-    /// To the left of the drive, as a unit vector.
+    /// The direction to the left of the drive, as a unit vector.
     pub(super) fn left(&self) -> DVec3 {
         self.drive.rotation * DVec3::Y
     }

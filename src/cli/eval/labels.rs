@@ -1,4 +1,4 @@
-//! `--boxes` and `--lidar`: what else a log knows of its images.
+//! `--boxes` and `--lidar`: labels of images from a driving log.
 
 use std::path::{Path, PathBuf};
 
@@ -18,30 +18,32 @@ use crate::cli::limits;
 use crate::cli::real_images::RealImage;
 use crate::cli::scene_source::Source;
 
-/// Most of a time before or after an image, in seconds.
+/// Largest value of `--lidar-window`, in seconds.
 const LONGEST_S: f64 = 10.0;
 
 /// `--boxes` and `--lidar`.
 #[derive(Debug, clap::Args)]
 pub(super) struct LabelOptions {
-    /// Boxes around vehicles and pedestrians, a JSON object a line: time_us, track, size (length, width, height in the
-    /// unit of the poses), world_from_box ({"xyz", "q"}: the middle of the box, in the axes of the poses of --images), and
-    /// perhaps velocity. Pixels of boxes that move faster than 1 m/s do not count. The images need time_us in their list.
+    /// File of boxes around vehicles and pedestrians, one JSON object per line: time_us, track, size (length, width,
+    /// height in the unit of the poses), world_from_box ({"xyz", "q"}: the middle of the box, in the axes of the poses
+    /// of --images), and optionally velocity. Pixels in boxes that move faster than 1 m/s do not count. The images need
+    /// time_us in their list.
     #[arg(long, value_name = "FILE")]
     boxes: Option<PathBuf>,
 
-    /// Points of a LiDAR, a safetensors file: points_m [n, 3], time_us [n]; and perhaps rig_from_lidar [4, 4],
+    /// Points of a LiDAR, a safetensors file: points_m [n, 3], time_us [n]; and optionally rig_from_lidar [4, 4],
     /// pose_time_us [m] and world_from_rig [m, 4, 4] in the axes of the poses of --images [default: the twin's first
-    /// drive]. The rendered depth is compared with them. The images need time_us in their list, in the same clock.
+    /// drive]. The rendered depth is compared with these points. The images need time_us in their list, in the same
+    /// clock.
     #[arg(long, value_name = "FILE")]
     lidar: Option<PathBuf>,
 
-    /// Points at most so long before or after an image are compared with it, in seconds.
+    /// Largest time between an image and the LiDAR points that are compared with it, in seconds.
     #[arg(long, value_name = "S", default_value = "0.05", value_parser = seconds, requires = "lidar")]
     lidar_window: f64,
 }
 
-/// What a log knows of its images.
+/// The labels of the images.
 pub(super) struct Labels {
     boxes: Option<Boxes>,
     lidar: Option<WorldPoints>,
@@ -100,7 +102,8 @@ impl LabelOptions {
 }
 
 impl Labels {
-    /// Hides what moves in an image. Returns the pixels that count, and the share that is hidden; nothing without boxes.
+    /// Masks moving objects in an image. Returns the pixels that count, and the share that is masked; `None` without
+    /// boxes.
     pub(super) fn hide(
         &self,
         image: &RealImage,

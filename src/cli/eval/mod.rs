@@ -1,10 +1,10 @@
 //! `wildcity eval`.
 
-mod beside;
 mod compared;
 mod drive;
 mod labels;
 mod networks;
+mod off_trajectory;
 mod renderer;
 mod repairer;
 mod saved;
@@ -20,14 +20,14 @@ use wildcity_scene::RenderProfile;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::Pose;
 
-use self::beside::{Beside, BesideImage, Offsets, OnDrive, Tools};
 use self::compared::Compared;
 use self::drive::Drives;
 use self::labels::{LabelOptions, Labels};
 use self::networks::{FeatureSet, NetworkOptions, Networks};
+use self::off_trajectory::{OffTrajectoryImage, OffTrajectoryViews, Offsets, OnDrive, Tools};
 use self::renderer::{Maps, Renderer};
 use self::repairer::{Repairer, RepairerOptions};
-use self::summary::{decibels, print_beside, print_means};
+use self::summary::{decibels, print_means, print_off_trajectory};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::profile_options::ProfileOptions;
@@ -38,9 +38,9 @@ use super::{output, placement, progress};
 /// Compare a twin or a scene file with real images that it was not trained on.
 ///
 /// Renders each image with its camera (pose, intrinsics, distortion) and measures PSNR, SSIM and FLIP. Writes
-/// report.html (a single self-contained file, the worst images first), eval.json and eval.csv. Means are those of
-/// the images' values. The help of --images and --every says what to give for held-out images; an image that was
-/// trained on gives numbers that are too good.
+/// report.html (a single self-contained file, the worst images first), eval.json and eval.csv. Means are those of the
+/// images' values. Give images that the twin was not trained on, because others give values that are too good: see
+/// --images and --every.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Eval {
@@ -49,45 +49,43 @@ pub(super) struct Eval {
     #[arg(value_name = "SCENE")]
     scene: String,
 
-    /// The images with their cameras: a transforms.json of nerfstudio, a COLMAP model (its folder, or one that has
-    /// it in sparse/0; text or binary), or a camera list as of `wildcity render --cameras`, one camera a line, with
-    /// "image" (and perhaps "mask"). Poses of a list are in the axes of the scene. Those of the others are in the
-    /// axes in which a scene file is; a twin has the change of axes of its import and its alignment.
+    /// The images with their cameras: a transforms.json of nerfstudio; a COLMAP model (its folder, or a folder that has
+    /// it in sparse/0; text or binary); or a camera list in the format of `wildcity render --cameras`, one camera per
+    /// line, with "image" (and optionally "mask"). Poses of a list are in the axes of the scene. Other poses are in the
+    /// axes of the scene file; for a twin, they get the axes, scale and alignment with which it was made.
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: PathBuf,
 
-    /// Folder that the names of images are in [default: that of transforms.json or of the list; for COLMAP,
-    /// `images` beside the model]. Images may be smaller than their cameras, as in images_4: then the cameras are
-    /// scaled.
+    /// Folder of the images [default: that of transforms.json or of the list; for COLMAP, `images` next to the model].
+    /// Images may be smaller than their cameras, as in images_4: then the cameras are scaled.
     #[arg(long, value_name = "DIR")]
     image_dir: Option<PathBuf>,
 
-    /// Folder of masks: for image NAME.png, NAME.png or NAME.png.png. Black pixels do not count, as those of
-    /// vehicles and pedestrians that the twin does not have. Without it, the masks that transforms.json or the list
-    /// names.
+    /// Folder of masks: for image NAME.png, NAME.png or NAME.png.png. Black pixels do not count, such as those of
+    /// vehicles and pedestrians that the twin does not have [default: the masks that transforms.json or the list names]
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
 
-    /// Compare every Nth image in the order of their names, beginning with the first. 8 is what INRIA's and gsplat's
-    /// trainers hold out.
+    /// Compare every Nth image in the order of their names, starting with the first. The trainers of INRIA and gsplat
+    /// hold out every 8th.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
 
-    /// Directions of the poses' axes, as of `wildcity import` [default: as the twin was imported and aligned;
+    /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was imported and aligned;
     /// identity for a file and for a list]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
 
-    /// Metres per unit of the poses, as of `wildcity import`; with --axes [default: 1]
+    /// Metres per unit of the poses, applied after --axes [default: 1]
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 
-    /// Also compare after the gain and offset of each colour channel that fit best, image by image: for captures with
+    /// Also compare after fitting a gain and an offset to each colour channel of each image: for captures with
     /// automatic exposure.
     #[arg(long)]
     align_exposure: bool,
 
-    /// Images that the page shows, the worst first.
+    /// Number of images that the page shows, the worst first.
     #[arg(long, value_name = "N", default_value_t = 24)]
     show: usize,
 
@@ -99,8 +97,9 @@ pub(super) struct Eval {
     #[arg(long, value_name = "DIR", default_value = "wildcity-eval")]
     out: PathBuf,
 
-    /// Also draw views this far to the left of the drive, in metres (to the right if negative), from each image, and
-    /// tell what can be told without a real image there: trust, reprojection, flicker. Needs a twin with a drive.
+    /// For each image, also render views at these lateral offsets to the left of the drive, in metres (negative:
+    /// right), and compute the metrics that need no real image: trust, reprojection, flicker. Needs a twin with a
+    /// drive.
     #[arg(long, value_name = "METRES", allow_hyphen_values = true)]
     extrapolate: Option<Offsets>,
 
@@ -131,11 +130,11 @@ Examples:
   wildcity eval street --images views.jsonl --save-images
   wildcity eval street --images held-out/transforms.json --repair repair.json --extrapolate 1,3,5";
 
-/// What images are compared with.
+/// What renders, repairs and measures the images.
 struct Setup {
     renderer: Renderer,
     repairer: Option<Repairer>,
-    /// Of a twin that has some.
+    /// The recorded drives of the twin; `None` without any.
     drives: Option<Drives>,
     labels: Labels,
     networks: Networks,
@@ -146,8 +145,8 @@ struct Setup {
 struct Features {
     truth: Vec<Vec<f32>>,
     images: FeatureSet,
-    /// Distance by distance beside the drive.
-    beside: Vec<FeatureSet>,
+    /// Features of the views off the trajectory, distance by distance.
+    off_trajectory: Vec<FeatureSet>,
 }
 
 impl Eval {
@@ -188,17 +187,18 @@ impl Eval {
         let bar = progress::count("comparing");
         bar.set_length(images.len() as u64);
         let mut evaluated: Vec<EvaluatedImage> = Vec::with_capacity(images.len());
-        let mut beside = self.extrapolate.as_ref().map(Beside::new);
+        let mut off_trajectory = self.extrapolate.as_ref().map(OffTrajectoryViews::new);
         let mut features = Features::default();
         for (at, (image, camera_name)) in images.iter().enumerate() {
             let about = || format!("image {}", image.name);
             let compared = self.evaluate(&setup, image, camera_name).with_context(about)?;
             features.add(&setup.networks, &compared).with_context(about)?;
-            if let Some(beside) = &mut beside {
+            if let Some(views) = &mut off_trajectory {
                 let is_shown = at == images.len() / 2;
-                let drawn = self.look_beside(&setup, beside, &compared, image, is_shown);
+                let drawn = self.render_off_trajectory(&setup, views, &compared, image, is_shown);
                 let drawn = drawn.with_context(about)?;
-                features.add_beside(&setup.networks, &compared, &drawn).with_context(about)?;
+                let added = features.add_off_trajectory(&setup.networks, &compared, &drawn);
+                added.with_context(about)?;
             }
             evaluated.push(compared.scores);
             self.forget_better_pictures(&mut evaluated);
@@ -206,15 +206,16 @@ impl Eval {
         }
         bar.finish_and_clear();
         let mut evaluation = Evaluation::new(self.subject(&setup, profile), evaluated);
-        evaluation.extrapolation = beside.map(Beside::finish).unwrap_or_default();
+        let extrapolation = off_trajectory.map(OffTrajectoryViews::finish);
+        evaluation.extrapolation = extrapolation.unwrap_or_default();
         evaluation.kid = setup.networks.kid(&features.images, &features.truth)?;
-        for (line, set) in evaluation.extrapolation.iter_mut().zip(&features.beside) {
+        for (line, set) in evaluation.extrapolation.iter_mut().zip(&features.off_trajectory) {
             line.kid = setup.networks.kid(set, &features.truth)?;
         }
         self.write(&evaluation)
     }
 
-    /// From the axes of the poses to those of the scene.
+    /// The transform from the axes of the poses to those of the scene.
     fn alignment(&self, source: &Source, list: &ImageList) -> anyhow::Result<Alignment> {
         match (&self.axes, source) {
             (Some(axes), _) => placement::imported(axes, self.scale.unwrap_or(1.0)),
@@ -225,15 +226,15 @@ impl Eval {
         }
     }
 
-    /// Draws the views beside the drive that belong to an image.
-    fn look_beside(
+    /// Renders the views off the trajectory of an image.
+    fn render_off_trajectory(
         &self,
         setup: &Setup,
-        beside: &mut Beside,
+        views: &mut OffTrajectoryViews,
         compared: &Compared,
         image: &RealImage,
         is_shown: bool,
-    ) -> anyhow::Result<Vec<BesideImage>> {
+    ) -> anyhow::Result<Vec<OffTrajectoryImage>> {
         let (Some(drives), Some(lens)) = (&setup.drives, &compared.lens) else {
             return Ok(Vec::new());
         };
@@ -251,9 +252,9 @@ impl Eval {
             counts: compared.counts.as_deref(),
             is_shown,
         };
-        let drawn = beside.add(tools, &on_drive)?;
+        let drawn = views.add(tools, &on_drive)?;
         let offsets = self.extrapolate.iter().flat_map(|offsets| &offsets.0);
-        for (offset_m, BesideImage { rendered, repaired }) in offsets.zip(&drawn) {
+        for (offset_m, OffTrajectoryImage { rendered, repaired }) in offsets.zip(&drawn) {
             if self.save_images {
                 let name = format!("{offset_m}m/{}", image.name);
                 self.save_pixels("beside", &name, rendered, &compared.view)?;
@@ -265,7 +266,7 @@ impl Eval {
         Ok(drawn)
     }
 
-    /// Keeps the pictures of the worst images only, so that memory does not grow with the number of images.
+    /// Keeps only the pictures of the worst images, so that memory does not grow with the number of images.
     fn forget_better_pictures(&self, evaluated: &mut [EvaluatedImage]) {
         let shown = evaluated.iter().filter(|image| image.thumbnails.is_some()).count();
         if shown <= self.show {
@@ -322,7 +323,7 @@ impl Eval {
             )?;
         }
         for one in &evaluation.extrapolation {
-            print_beside(&mut out, one)?;
+            print_off_trajectory(&mut out, one)?;
         }
         if let Some(worst) = evaluation.worst_first().first() {
             writeln!(out, "worst: {}, {}", worst.name, decibels(worst.rendered.scores.psnr_db))?;
@@ -346,16 +347,16 @@ impl Features {
         Ok(())
     }
 
-    fn add_beside(
+    fn add_off_trajectory(
         &mut self,
         networks: &Networks,
         compared: &Compared,
-        drawn: &[BesideImage],
+        drawn: &[OffTrajectoryImage],
     ) -> anyhow::Result<()> {
         let camera = &compared.view.camera;
         let size_px = [camera.width_px, camera.height_px];
-        self.beside.resize_with(drawn.len(), FeatureSet::default);
-        for (set, image) in self.beside.iter_mut().zip(drawn) {
+        self.off_trajectory.resize_with(drawn.len(), FeatureSet::default);
+        for (set, image) in self.off_trajectory.iter_mut().zip(drawn) {
             set.rendered.extend(networks.features(size_px, &image.rendered)?);
             if let Some(repaired) = &image.repaired {
                 set.repaired.extend(networks.features(size_px, repaired)?);

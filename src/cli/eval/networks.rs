@@ -10,13 +10,14 @@ use wildcity_repair::{Image, LoadOptions, Network};
 /// `--lpips` and `--features`.
 #[derive(Debug, clap::Args)]
 pub(super) struct NetworkOptions {
-    /// Manifest of a network that gives the distance of two images, as LPIPS (docs/evaluation.md). Pixels that do not
-    /// count are replaced by the real image's.
+    /// Manifest of a network that computes the distance between two images, such as LPIPS (docs/evaluation.md). Pixels
+    /// that do not count are replaced by those of the real image.
     #[arg(long, value_name = "FILE")]
     lpips: Option<PathBuf>,
 
-    /// Manifest of a network that gives the features of an image, as Inception: for KID, the distance of the images
-    /// together from the real ones, also of views beside the drive.
+    /// Manifest of a network that computes the features of an image, such as Inception. They give KID, the distance
+    /// between the set of rendered images and the set of real ones; with --extrapolate also for the views off the
+    /// drive.
     #[arg(long, value_name = "FILE")]
     features: Option<PathBuf>,
 }
@@ -40,10 +41,11 @@ impl NetworkOptions {
         let load = |option: &str, path: &Path, compares: bool| {
             let about = || format!("{option} {}", path.display());
             let network = Network::load(path, options).with_context(about)?;
-            let roles = if compares { "\"image\" and \"truth\"" } else { "\"image\" alone" };
+            let roles =
+                if compares { "roles \"image\" and \"truth\"" } else { "role \"image\" only" };
             ensure!(
                 network.manifest().compares() == compares,
-                "{}: inputs: {option} takes a network with the roles {roles}",
+                "{}: inputs: {option} takes a network with the {roles}",
                 path.display()
             );
             Ok(network)
@@ -61,8 +63,8 @@ impl Networks {
         self.lpips.as_ref().map(name)
     }
 
-    /// The distance of an image from the real one; `None` without such a network. Where pixels do not count both are
-    /// the real image.
+    /// The distance of an image from the real one; `None` without such a network. Pixels that do not count are those of
+    /// the real image in both.
     pub(super) fn lpips(
         &self,
         size_px: [u32; 2],

@@ -1,4 +1,4 @@
-//! What renders the images.
+//! The renderer of the images.
 
 use wildcity_render::{Backend, Frame, Target, View};
 use wildcity_scene::RenderProfile;
@@ -9,17 +9,17 @@ use wildcity_session::RenderedImage;
 use crate::cli::profile_options::LoadedProfile;
 use crate::cli::scene_source::Source;
 
-/// What renders the images.
+/// The renderer of the images.
 pub(super) struct Renderer {
     pub(super) source: Source,
-    /// That of the scene.
+    /// The profile of the scene.
     pub(super) own_profile: RenderProfile,
     /// The changes of the command line.
     pub(super) changes: LoadedProfile,
     pub(super) backend: Box<dyn Backend>,
-    /// From the axes of the images' poses to those of the scene.
+    /// The transform from the axes of the images' poses to those of the scene.
     pub(super) alignment: Alignment,
-    /// Which maps are rendered beside colours and opacity.
+    /// The maps that are rendered in addition to colours and opacity.
     pub(super) maps: Maps,
 }
 
@@ -74,7 +74,7 @@ pub(super) fn covered(image: &RenderedImage) -> f64 {
     covered as f64 / image.opacity.len() as f64
 }
 
-/// Brings what was rendered and repaired from the exposure of the twin to that of a real image, if it is known.
+/// Converts rendered and repaired pixels from the exposure of the twin to that of a real image, if it is known.
 pub(super) fn expose(
     stops: Option<f64>,
     rendered: &mut RenderedImage,

@@ -20,23 +20,23 @@ use crate::cli::directories::Twins;
 use crate::cli::repair_options::runtime_library;
 use crate::cli::scene_source::Source;
 
-/// Most threads of a network.
+/// Largest number of threads of a network.
 const THREADS: i64 = wildcity_repair::limits::MAX_THREADS as i64;
 
 /// `--repair` and the runtime of networks.
 #[derive(Debug, clap::Args)]
 pub(super) struct RepairerOptions {
-    /// Also repair each image by the model of this manifest (docs/repair.md), and compare the repaired image, too. Every
-    /// image is repaired, whatever its trust. A model that compares with recorded images needs a twin with a drive; it
-    /// does not get the images that are compared here.
+    /// Also repair each image with the model of this manifest (docs/repair.md), and compare the repaired image, too.
+    /// Every image is repaired, at any trust. A model that compares with recorded images needs a twin with a drive; the
+    /// images that are compared here are withheld from it.
     #[arg(long, value_name = "FILE")]
     repair: Option<PathBuf>,
 
-    /// ONNX Runtime library for --repair, --lpips and --features, from version 1.18 on [default: ORT_DYLIB_PATH]
+    /// ONNX Runtime library for --repair, --lpips and --features, version 1.18 or later [default: $ORT_DYLIB_PATH]
     #[arg(long, value_name = "PATH")]
     onnxruntime: Option<PathBuf>,
 
-    /// Threads of each network on the processor. The numbers do not depend on it.
+    /// Threads of each network on the processor. The results do not depend on it.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=THREADS))]
     repair_threads: u16,
 }
@@ -45,7 +45,7 @@ pub(super) struct RepairerOptions {
 pub(super) struct Repairer {
     model: Arc<Model>,
     needed: NeededReferences,
-    /// Of a twin.
+    /// The recorded images of a twin.
     references: Option<OfflineReferences>,
     cache: ReferenceCache,
 }
@@ -127,7 +127,7 @@ impl Repairer {
         self.model.needs(InputRole::Normals)
     }
 
-    /// What the page and eval.json say of it.
+    /// The description of the model on the page and in eval.json.
     pub(super) fn subject(&self) -> RepairSubject {
         let manifest = self.model.manifest();
         let references = self.references.as_ref().filter(|_| self.needed.any());
@@ -152,18 +152,18 @@ impl Repairer {
         profile: &RenderProfile,
     ) -> anyhow::Result<Repaired> {
         let drawing = OfflineDrawing { profile, backend: &*renderer.backend, cache: &self.cache };
-        let beside = match &self.references {
+        let references = match &self.references {
             Some(references) => references.beside(of, self.needed, drawing)?,
             None => ViewReferences::default(),
         };
-        let nearest = beside.nearest().map(str::to_owned);
+        let nearest = references.nearest().map(str::to_owned);
         ensure!(
             nearest.is_some() || !self.needed.nearest,
             "the model {:?} needs a recorded image of the camera {:?} within 30 m; there is none",
             self.model.manifest().name,
             of.camera.name
         );
-        let (rgb8, _) = beside.repaired(&self.model, of)?;
+        let (rgb8, _) = references.repaired(&self.model, of)?;
         Ok(Repaired { rgb8, nearest })
     }
 }

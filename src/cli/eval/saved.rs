@@ -24,7 +24,7 @@ impl Eval {
         self.save_file(errors, name, &map.map_err(anyhow::Error::msg)?)
     }
 
-    /// Writes the pixels of a view beside the drive.
+    /// Writes the pixels of a view off the trajectory.
     pub(super) fn save_pixels(
         &self,
         folder: &str,

@@ -1,4 +1,4 @@
-//! What the command says of an evaluation.
+//! The summary of an evaluation on standard output.
 
 use std::io::{self, Write};
 
@@ -44,7 +44,7 @@ fn print_scores(out: &mut impl Write, what: &str, means: &ScoreMeans) -> io::Res
     Ok(())
 }
 
-pub(super) fn print_beside(out: &mut impl Write, one: &Extrapolation) -> io::Result<()> {
+pub(super) fn print_off_trajectory(out: &mut impl Write, one: &Extrapolation) -> io::Result<()> {
     let Extrapolation { offset_m, trust, covered, .. } = one;
     writeln!(
         out,

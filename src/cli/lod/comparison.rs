@@ -1,4 +1,4 @@
-//! Images with levels of detail beside images at full detail.
+//! Images with levels of detail next to images at full detail.
 
 use std::io::{self, Write};
 use std::path::Path;

@@ -15,8 +15,8 @@ use super::directories::{TwinVersion, Twins};
 
 /// Show the levels of detail of a twin: Gaussians, bytes, and geometric error of each.
 ///
-/// With --out it also renders images: for each camera a PNG with full detail beside the image at every
-/// --tau, and the PSNR between them in dB.
+/// With --out it also renders images: for each camera a PNG with full detail next to the image at every --tau, and the
+/// PSNR between them in dB.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Lod {

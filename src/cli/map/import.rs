@@ -12,15 +12,15 @@ use wildcity_twin::ingest;
 /// Read a map from OpenDRIVE or GeoJSON.
 ///
 /// OpenDRIVE: coordinates are those of the twin, at most 16 km from its origin. GeoJSON: features with the property
-/// layer, `lane`, `drivable`, `intersection`, `crosswalk`, `stop_line` or a layer of nuPlan; coordinates are metres
-/// of the twin, or degrees with --origin.
+/// layer, which is `lane`, `drivable`, `intersection`, `crosswalk`, `stop_line` or a layer of nuPlan; coordinates are
+/// metres of the twin, or degrees with --origin.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
   wildcity map import town.xodr --out town.map.json
   wildcity map import town.geojson --origin 11.58,48.14 --out town.map.json")]
 pub(in crate::cli) struct Import {
-    /// The file; its content tells the format.
+    /// The file; its format is detected from its content.
     #[arg(value_name = "FILE")]
     file: PathBuf,
 
@@ -44,7 +44,7 @@ impl Import {
             false => {
                 anyhow::ensure!(
                     self.origin.is_none(),
-                    "--origin is for GeoJSON; {} is none",
+                    "--origin is for GeoJSON; {} is not GeoJSON",
                     self.file.display()
                 );
                 let imported = opendrive::read(&bytes).with_context(context)?;

@@ -6,7 +6,7 @@ mod strips;
 
 /// Make and check maps: lanes and areas of a twin.
 ///
-/// A twin needs no map. With one, actors can follow lanes, and scores can tell which ego is off the road.
+/// A twin needs no map. With one, actors can follow lanes, and scores can detect that an ego is off the road.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -20,11 +20,11 @@ pub(in crate::cli) struct Strips {
     #[arg(value_name = "TWIN")]
     twin: TwinVersion,
 
-    /// How far the road goes to the left of the drive, in metres: 0.1 to 100.
+    /// Width of the road to the left of the drive, in metres: 0.1 to 100.
     #[arg(long, value_name = "M", value_parser = width)]
     left_m: f64,
 
-    /// How far the road goes to the right of the drive, in metres: 0.1 to 100.
+    /// Width of the road to the right of the drive, in metres: 0.1 to 100.
     #[arg(long, value_name = "M", value_parser = width)]
     right_m: f64,
 

@@ -18,7 +18,7 @@ pub(in crate::cli) struct RealImage {
     pub(in crate::cli) file: PathBuf,
     pub(in crate::cli) mask: Option<PathBuf>,
     pub(in crate::cli) camera: Camera,
-    /// In the axes and unit of the list.
+    /// Pose in the axes and unit of the list.
     pub(in crate::cli) world_from_camera: Pose,
     /// The smallest z that it draws, if the list says one, in units of the scene.
     pub(in crate::cli) near: Option<f64>,
@@ -47,7 +47,7 @@ struct ListedImage {
 /// A list before its files are looked for.
 struct Listed {
     images: Vec<ListedImage>,
-    /// The folder that names are in, unless another one is given.
+    /// The folder that names are in, unless the user gives a different one.
     folder: PathBuf,
     /// As [`ImageList::is_in_scene_axes`].
     is_in_scene_axes: bool,
@@ -90,7 +90,7 @@ impl ImageList {
         Ok(Self { images: found, is_in_scene_axes })
     }
 
-    /// Every `step`-th image, beginning with the first.
+    /// Every `step`-th image, starting with the first.
     pub(in crate::cli) fn every(&self, step: usize) -> Vec<&RealImage> {
         self.images.iter().step_by(step).collect()
     }
@@ -174,8 +174,9 @@ fn image_file(folder: &Path, name: &str) -> anyhow::Result<PathBuf> {
     })
 }
 
-/// The mask of an image: with its name, with .png in place of its extension, or behind it, as COLMAP names masks. Names of
-/// transforms.json begin with the folder of the images, such as `images` or `images_4`, and those of masks need not.
+/// The mask of an image: with the image's name, with .png in place of its extension, or with .png appended, as COLMAP
+/// names masks. Names of transforms.json start with the folder of the images, such as `images` or `images_4`; those of
+/// masks need not.
 fn mask_file(masks: &Path, name: &str) -> anyhow::Result<PathBuf> {
     let within = name.split_once('/').filter(|(folder, _)| folder.starts_with("images"));
     let names = [Some(name), within.map(|(_, within)| within)].into_iter().flatten();

@@ -1,4 +1,4 @@
-//! What a camera sees of its own vehicle: the overlay of the rig's camera of the same name.
+//! The part of an image that the own vehicle covers: the overlay of the rig's camera of the same name.
 
 use wildcity_scene::Rig;
 
@@ -36,7 +36,7 @@ pub(in crate::cli) fn outside(
     )
 }
 
-/// Pixels that count by both of two masks, if there are some.
+/// The pixels that count in both of two masks, if there are any masks.
 pub(in crate::cli) fn both(one: Option<Vec<bool>>, other: Option<Vec<bool>>) -> Option<Vec<bool>> {
     match (one, other) {
         (Some(one), Some(other)) => Some(one.iter().zip(&other).map(|(a, b)| *a && *b).collect()),

@@ -35,7 +35,7 @@ pub(in crate::cli) fn real(
     Ok((image.into_rgba8().as_raw().chunks_exact(4).flat_map(blend).collect(), camera))
 }
 
-/// Reads a mask: which pixels count. Those darker than half do not.
+/// Reads a mask: the pixels that count. Pixels darker than half do not.
 ///
 /// # Errors
 /// The file cannot be read, or has another size than the image.

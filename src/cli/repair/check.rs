@@ -16,11 +16,11 @@ use crate::cli::repair_options::runtime_library;
 
 /// Load a repair model, probe it, and measure it.
 ///
-/// Reads the manifest FILE and the files that it pins, compares it with the graph, and runs the model on a
-/// pattern: shape, NaN, time limit, three equal runs. For a model in tiles it measures the halo (how far an
-/// output pixel depends on the input) and compares tiles with the whole, to the bit. Then it prints time and
-/// additional memory of one image per size. Inputs beside the image get neutral values: the image itself as
-/// reference, 10 m of depth, full opacity and validity.
+/// Reads the manifest FILE and the files that it pins, compares it with the graph, and runs the model on a pattern:
+/// shape, NaN, time limit, three equal runs. For a model in tiles it measures the halo (how far an output pixel depends
+/// on the input) and checks that tiles give the same bits as the whole image. Then it prints time and additional memory
+/// of one image per size. Inputs other than the image get neutral values: the image itself as reference, 10 m of depth,
+/// full opacity and validity.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Check {
@@ -28,7 +28,7 @@ pub(super) struct Check {
     #[arg(value_name = "FILE")]
     manifest: PathBuf,
 
-    /// Image to repair; PNG or JPEG. Without it, a generated pattern.
+    /// Image to repair, PNG or JPEG [default: a generated pattern]
     #[arg(long, value_name = "PNG", requires = "out")]
     image: Option<PathBuf>,
 
@@ -36,15 +36,15 @@ pub(super) struct Check {
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
 
-    /// Runtime library, from version 1.18 on [default: ORT_DYLIB_PATH]
+    /// ONNX Runtime library, version 1.18 or later [default: $ORT_DYLIB_PATH]
     #[arg(long, value_name = "PATH")]
     onnxruntime: Option<PathBuf>,
 
-    /// One of the manifest's providers; there is no fall-back to another [default: its first]
+    /// One of the manifest's providers; the command does not fall back to another one [default: its first]
     #[arg(long, value_enum)]
     provider: Option<ProviderOption>,
 
-    /// Threads of the cpu provider. The bytes do not depend on it.
+    /// Threads of the cpu provider. The output does not depend on it.
     #[arg(long, value_name = "N", default_value_t = 1)]
     threads: usize,
 
@@ -100,9 +100,9 @@ impl Check {
                 Err(error) => writeln!(out, "{size:<12} {error}")?,
             }
             if model.needs(InputRole::ReferenceWarped) {
-                let [straight, bent] = warp_time::seconds(width, height);
-                let beside = "to warp five references; with a bent lens";
-                writeln!(out, "{:<12} {straight:>8.3} s {beside} {bent:.3} s", "")?;
+                let [pinhole, fisheye] = warp_time::seconds(width, height);
+                let what = "to warp five references; with a non-pinhole lens";
+                writeln!(out, "{:<12} {pinhole:>8.3} s {what} {fisheye:.3} s", "")?;
             }
         }
         ensure!(measured > 0, "the model repaired an image of none of these sizes");
@@ -172,14 +172,14 @@ impl Check {
     }
 }
 
-/// The largest memory of this process, from a moment on.
+/// The peak memory of this process since a point in time.
 struct Peak {
     before_kib: Option<u64>,
 }
 
 impl Peak {
     fn start() -> Peak {
-        // 5 resets the peak (proc(5)); where that is refused, no memory is told.
+        // 5 resets the peak (proc(5)); where that is refused, no memory is reported.
         let is_reset = fs::write("/proc/self/clear_refs", "5").is_ok();
         Peak { before_kib: status_kib("VmRSS:").filter(|_| is_reset) }
     }

@@ -5,7 +5,7 @@ use wildcity_repair::{Image, View};
 /// Depth everywhere, in metres.
 const DEPTH_M: f32 = 10.0;
 
-/// An image and neutral values beside it.
+/// An image, with neutral values for the other roles.
 pub(super) struct Sample {
     rendered: Image,
     ones: Vec<f32>,

@@ -1,4 +1,4 @@
-//! How long the references of a view take, beside the model.
+//! The time that the references of a view take, in addition to the model.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -16,7 +16,7 @@ const WALL_M: f64 = 20.0;
 /// Places of the references, in metres ahead of the view.
 const AHEAD_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
-/// Seconds to bring five references that see the whole view into it, on one core: with a pinhole, and with a fisheye.
+/// Seconds to warp five references that show the whole view into it, on one core: with a pinhole, and with a fisheye.
 pub(super) fn seconds(width: usize, height: usize) -> [f64; 2] {
     let pinhole = Pinhole {
         fx: 0.6 * width as f64,
@@ -25,8 +25,8 @@ pub(super) fn seconds(width: usize, height: usize) -> [f64; 2] {
         cy: 0.5 * height as f64,
     };
     let straight = Camera::from_pinhole(width as u32, height as u32, pinhole);
-    let bent = Camera { lens: Lens::Fisheye(Fisheye::new([0.0; 4], None)), ..straight };
-    [straight, bent].map(|camera| {
+    let fisheye = Camera { lens: Lens::Fisheye(Fisheye::new([0.0; 4], None)), ..straight };
+    [straight, fisheye].map(|camera| {
         let projection = Arc::new(Projection::of(&camera));
         let rays = Rays::of(&camera);
         let references: Vec<Arc<Reference>> = AHEAD_M

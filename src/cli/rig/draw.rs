@@ -32,7 +32,7 @@ pub(super) struct Draw {
 const HALF_SIDE_M: f64 = 10.0;
 /// Side of the drawing, in pixels.
 const SIDE_PX: u32 = 800;
-/// How far fields of view are drawn, in metres.
+/// Length of the drawn fields of view, in metres.
 const VIEW_M: f64 = 6.0;
 /// Rays across a field of view, including its edges.
 const RAYS: u32 = 25;

@@ -12,11 +12,11 @@ use super::files::to_json;
 use crate::cli::output;
 use crate::cli::placement::Placement;
 
-/// Make a drive and a rig of the camera poses of a COLMAP model.
+/// Make a drive and a rig from the camera poses of a COLMAP model.
 ///
-/// DIR has cameras.bin and images.bin, or cameras.txt and images.txt, or has them in sparse/0. The images of one folder
-/// are of one camera of the rig. The rig stands level on the ground under the camera with the most images, and looks
-/// where that camera looks. Images are in the order of their names.
+/// DIR has cameras.bin and images.bin, or cameras.txt and images.txt, or has them in sparse/0. Each folder of images
+/// belongs to one camera of the rig. The rig stands level on the ground under the camera with the most images, and
+/// looks where that camera looks. Images are in the order of their names.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -33,9 +33,9 @@ pub(in crate::cli) struct FromColmap {
     options: DriveOptions,
 }
 
-/// Make a drive and a rig of the camera poses of a transforms.json of nerfstudio or instant-ngp.
+/// Make a drive and a rig from the camera poses of a transforms.json of nerfstudio or instant-ngp.
 ///
-/// The images of one folder are of one camera of the rig. The rig stands level on the ground under the camera with the
+/// Each folder of images belongs to one camera of the rig. The rig stands level on the ground under the camera with the
 /// most images, and looks where that camera looks. Images are in the order of their names. The poses must be in the
 /// axes of the scene: nerfstudio moves and scales them when it trains (--orientation-method none --center-method none
 /// --auto-scale-poses False keeps them).
@@ -63,7 +63,7 @@ struct DriveOptions {
     #[arg(long, value_name = "NAME", default_value = "capture")]
     name: String,
 
-    /// Images a second of the capture; the files have no times.
+    /// Images per second of the capture; the files have no times.
     #[arg(long, value_name = "N", default_value_t = 10.0)]
     fps: f64,
 

@@ -13,9 +13,8 @@ use wildcity_scene::route::{self, Route};
 
 /// Cut a drive into shorter drives of given lengths, in the same world.
 ///
-/// Writes DIR/<name>-<length>-<number>.json for each cut, with a clock that begins at 0, and
-/// DIR/index.json with the name of each cut, its stations on the drive in metres, and its start on the
-/// drive's clock in microseconds.
+/// Writes DIR/<name>-<length>-<number>.json for each cut, with a clock that starts at 0, and DIR/index.json with the
+/// name of each cut, its stations on the drive in metres, and its start on the drive's clock in microseconds.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -11,9 +11,9 @@ use wildcity_twin::ingest;
 
 /// Read a scenario of OpenSCENARIO XML 1.0 to 1.3.
 ///
-/// Read are parameters with formulas, vehicles, pedestrians and objects, positions, speeds, trajectories, and events
-/// with conditions on time, speed, distance, driven distance and started events. Any other part is refused with its
-/// name and line, since a scenario without it would be another one.
+/// The import supports parameters with formulas, vehicles, pedestrians and objects, positions, speeds, trajectories,
+/// and events with conditions on time, speed, distance, driven distance and started events. It refuses any other part,
+/// with its name and line, because the scenario would be different without it.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
@@ -24,7 +24,7 @@ pub(in crate::cli) struct Import {
     #[arg(value_name = "FILE")]
     file: PathBuf,
 
-    /// Name of the twin in which the scenario plays. Positions of the file are in its axes.
+    /// Name of the twin in which the scenario takes place. Positions of the file are in its axes.
     #[arg(long, value_name = "NAME")]
     twin: String,
 

@@ -14,7 +14,7 @@ use wildcity_session::{ScenarioSource, Scenarios};
 use wildcity_sim::scenario::Document;
 use wildcity_twin::store::{Catalog, Version};
 
-/// Check scenarios, show one as an episode runs it, and read those of other formats.
+/// Check scenarios, show one as an episode runs it, and import those of other formats.
 ///
 /// A scenario is a JSON file: a twin, an ego, actors, a route, and when an episode ends. The tracks and maps that it
 /// names are in the same directory. docs/scenarios.md explains every field.
@@ -71,7 +71,7 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
     Ok(Opened { scenarios, document, version })
 }
 
-/// The version of a hash; the latest if there is none of that hash, which the pin then refuses.
+/// The version with a hash. If there is none, the latest version, which the check of the hash then refuses.
 fn version_of(
     catalog: &Catalog,
     twin: &str,

@@ -1,4 +1,4 @@
-//! What `wildcity doctor --config` looks at in the configuration of a server.
+//! The checks of a server's configuration that `wildcity doctor --config` makes.
 
 use std::ffi::OsString;
 use std::fs::{self, OpenOptions};
@@ -12,7 +12,7 @@ use crate::cli::directories::ServerDirectories;
 
 use super::{Serve, config_file};
 
-/// What was looked at, and what was found: good, or what is wrong.
+/// The subject of a check, and its result: a confirmation, or the reason why it failed.
 pub(in crate::cli) type Check = (&'static str, Result<String, String>);
 
 impl Serve {
@@ -31,7 +31,7 @@ impl Serve {
         &self.directories
     }
 
-    /// Checks the address and every file that the server reads or writes besides its directories. Changes nothing.
+    /// Checks the address and every file that the server reads or writes outside of its directories. Changes nothing.
     pub(in crate::cli) fn checks(&self) -> Vec<Check> {
         let mut checks = vec![("listen", self.check_listen())];
         if let Some(path) = &self.tokens {
@@ -59,7 +59,7 @@ impl Serve {
     fn check_listen(&self) -> Result<String, String> {
         let listen = self.listen;
         if self.tokens.is_none() && !listen.ip().is_loopback() {
-            return Err(format!("{listen} is no loopback address, and needs tokens"));
+            return Err(format!("{listen} is not a loopback address, and needs tokens"));
         }
         match TcpListener::bind(listen) {
             Ok(_) => Ok(format!("{listen} is free")),

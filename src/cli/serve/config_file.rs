@@ -51,7 +51,7 @@ pub(super) fn resolve(arguments: Vec<OsString>) -> anyhow::Result<Resolved> {
     Ok(Resolved { serve: Serve::from_arg_matches(&matches)?, matches })
 }
 
-/// The command with its options alone. An option that is given twice has its last value.
+/// The command with only its options. An option that is given twice has its last value.
 fn command() -> clap::Command {
     Serve::augment_args(clap::Command::new("serve")).args_override_self(true).no_binary_name(true)
 }

@@ -11,10 +11,10 @@ use crate::cli::backend_options::{bytes_of_gib, gib};
 /// Heading of these options in `--help`; in a configuration file they are the table `[limits]`.
 pub(super) const HEADING: &str = "Limits";
 
-/// Most sessions, connections, pushes or uploads that can be asked for.
+/// Largest number of sessions, connections, pushes or uploads that an option accepts.
 const MAX_COUNT: u64 = 65_535;
 
-/// Longest time-out that can be asked for: 30 days.
+/// Longest time-out that an option accepts: 30 days.
 const MAX_TIMEOUT_S: f64 = 30.0 * 24.0 * 3600.0;
 
 fn count() -> RangedU64ValueParser<usize> {
@@ -25,20 +25,20 @@ fn count() -> RangedU64ValueParser<usize> {
 #[derive(Clone, Debug, clap::Args)]
 #[command(next_help_heading = HEADING)]
 pub(super) struct LimitOptions {
-    /// Sessions at once: connected, or waiting to be resumed.
+    /// Largest number of sessions at a time, connected or waiting to be resumed.
     #[arg(long, value_name = "N", default_value_t = Limits::default().sessions, value_parser = count())]
     sessions: usize,
 
-    /// WebSocket connections at once; 64 more connections are accepted for HTTP requests alone.
+    /// Largest number of WebSocket connections at a time; 64 more connections are accepted for HTTP requests only.
     #[arg(long, value_name = "N", default_value_t = Limits::default().connections, value_parser = count())]
     connections: usize,
 
-    /// Pushes that wait or run at once.
+    /// Largest number of pushes that wait or run at a time.
     #[arg(long, value_name = "N", default_value_t = Limits::default().pushes, value_parser = count())]
     pushes: usize,
 
-    /// Memory that running pushes may take together, in GiB [default: a third of --memory-gib]. A push waits until what
-    /// it may need is free: 24 times the size of its files, and 0.25 GiB.
+    /// Memory that running pushes may take together, in GiB [default: a third of --memory-gib]. A push waits until the
+    /// memory that it may need is free: 24 times the size of its files, plus 0.25 GiB.
     #[arg(long, value_name = "GIB", value_parser = gib)]
     push_memory_gib: Option<f64>,
 
@@ -76,19 +76,20 @@ pub(super) struct LimitOptions {
     #[arg(long, value_name = "SECONDS", default_value_t = Limits::default().memory_release.as_secs_f64(), value_parser = seconds)]
     memory_release_s: f64,
 
-    /// Uploads that are kept at once, finished or not.
+    /// Largest number of uploads that are kept at a time, finished or not.
     #[arg(long, value_name = "N", default_value_t = SpoolLimits::default().uploads, value_parser = count())]
     max_uploads: usize,
 
-    /// Size of the largest upload, in GiB.
+    /// Largest size of an upload, in GiB.
     #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().upload_bytes), value_parser = gib)]
     upload_gib: f64,
 
-    /// Size of all uploads together, in GiB.
+    /// Largest total size of all uploads, in GiB.
     #[arg(long, value_name = "GIB", default_value_t = gib_of(SpoolLimits::default().bytes), value_parser = gib)]
     spool_gib: f64,
 
-    /// Size of the uploads of one token, in GiB [default: half of --spool-gib if several tokens may upload, else all]
+    /// Largest total size of the uploads of one token, in GiB [default: half of --spool-gib if several tokens may
+    /// upload, else all]
     #[arg(long, value_name = "GIB", value_parser = gib)]
     token_spool_gib: Option<f64>,
 

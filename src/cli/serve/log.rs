@@ -1,8 +1,8 @@
 //! Where a server logs, and where it sends its traces.
 //!
 //! A trace is a request with its parts: a step loads chunks, waits for a render thread, is rendered and encoded, and is
-//! recorded and sent. The parts are spans of `tracing` at the level `debug`, so that a server without traces, at the
-//! default level of its log, only asks whether each is wanted.
+//! recorded and sent. The parts are spans of `tracing` at the level `debug`. So a server without traces, at the default
+//! level of its log, only checks for each span whether it is enabled.
 
 use std::io::{self, IsTerminal as _};
 
@@ -13,11 +13,11 @@ use tracing_subscriber::{EnvFilter, Layer as _};
 #[cfg(feature = "otlp")]
 pub(super) use self::otlp::Traces;
 
-/// What sends traces until it is dropped; this program was built without.
+/// Stands for the sender of traces, which this build does not have.
 #[cfg(not(feature = "otlp"))]
 pub(super) struct Traces;
 
-/// Begins to log to standard error, and to send traces to an endpoint, if there is one.
+/// Starts to log to standard error, and to send traces to an endpoint, if there is one.
 pub(super) fn start(filter: &str, endpoint: Option<&str>) -> anyhow::Result<Option<Traces>> {
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(io::stderr)
@@ -57,12 +57,12 @@ mod otlp {
 
     /// Spans that wait to be sent: those of a thousand steps of six cameras. More are dropped.
     const WAITING_SPANS: usize = 1 << 15;
-    /// How often spans are sent.
+    /// Interval at which spans are sent.
     const SENT_EVERY: Duration = Duration::from_secs(1);
     /// Path below an endpoint that names none (OTLP specification 1.9, section "OTLP/HTTP Request").
     const TRACES_PATH: &str = "/v1/traces";
 
-    /// What sends traces; the rest is sent when it is dropped.
+    /// Sends traces. When it is dropped, it sends the remaining spans.
     pub(in crate::cli::serve) struct Traces(SdkTracerProvider);
 
     impl Traces {
@@ -82,7 +82,8 @@ mod otlp {
                 true => endpoint.to_owned(),
                 false => format!("{}{TRACES_PATH}", endpoint.trim_end_matches('/')),
             };
-            // The client of the exporter has no TLS of its own. Another part may have installed the provider before.
+            // The exporter's HTTP client has no TLS provider. Another part of the program may have installed one
+            // already.
             let _ = rustls::crypto::ring::default_provider().install_default();
             let exporter = SpanExporter::builder().with_http().with_endpoint(url).build();
             let exporter = exporter.with_context(cannot)?;

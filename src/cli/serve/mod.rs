@@ -45,60 +45,60 @@ pub(super) struct Serve {
     #[command(flatten)]
     directories: ServerDirectories,
 
-    /// Export each episode that ends as MCAP, beside its record: for Foxglove, Rerun and others. Takes half as much
-    /// disk again as the records, and no step waits for it.
+    /// Export each episode as MCAP when it ends, next to its record: for Foxglove, Rerun and others. The export takes
+    /// additional disk space of about half the size of the record, and no step waits for it.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = true, num_args = 0..=1, default_missing_value = "true")]
     mcap: bool,
 
     /// JSON file of tokens and what each allows: {"tokens": [{"name": "fleet", "role": "drive", "token": "TOKEN"}]}.
-    /// role is metrics, drive, push or admin; hash may stand in place of token; twins lists those that the token may use;
-    /// limits are what it may have at once: sessions, connections, pushes, upload_bytes. It is read again at SIGHUP. Without
-    /// it the server only listens on a loopback address. docs/operators.md says more.
+    /// role is metrics, drive, push or admin. hash may replace token. twins lists the twins that the token may use.
+    /// limits are its largest numbers at a time: sessions, connections, pushes, upload_bytes. The file is read again at
+    /// SIGHUP. Without it, the server listens only on a loopback address. docs/operators.md says more.
     #[arg(long, value_name = "FILE")]
     tokens: Option<PathBuf>,
 
-    /// Certificate of the server in PEM, followed by those of its authorities: then it speaks HTTPS, with the key of
-    /// --tls-key. Both files are read again at SIGHUP.
+    /// PEM file with the certificate of the server, followed by those of its authorities. The server then uses HTTPS,
+    /// with the key of --tls-key. Both files are read again at SIGHUP.
     #[arg(long, value_name = "FILE")]
     tls_cert: Option<PathBuf>,
 
-    /// Key of the certificate, in PEM.
+    /// PEM file with the key of the certificate.
     #[arg(long, value_name = "FILE")]
     tls_key: Option<PathBuf>,
 
-    /// Web pages of other sites that may send requests, separated by commas, for example
-    /// https://sim.example.org; pages of this machine always may. The server then answers to these hosts, its
-    /// addresses and localhost, and to no other name: list the name that it is called by, too.
+    /// Origins of web pages of other sites that may send requests, separated by commas, for example
+    /// https://sim.example.org; pages of this machine always may. With this option, the server answers only requests to
+    /// these hosts, to its addresses and to localhost: list the server's own host name, too.
     #[arg(long, value_name = "ORIGINS", value_parser = origins)]
     origin: Option<Origins>,
 
-    /// File of the audit log: which token pushed, edited or rolled back which twin, a JSON object a line. What cannot
-    /// be logged is refused. At 64 MiB the file is renamed to FILE.1, and the one before to FILE.2; eight of these are kept.
+    /// File of the audit log: which token pushed, edited or rolled back which twin, one JSON object per line. A change
+    /// that cannot be logged is refused. At 64 MiB the file is renamed to FILE.1, an earlier FILE.1 to FILE.2, and so
+    /// on; eight of these are kept.
     #[arg(long, value_name = "FILE")]
     audit_log: Option<PathBuf>,
 
-    /// Address and port to listen on; port 0 takes a free one. An address that is not loopback needs
-    /// --tokens.
+    /// Address and port to listen on; port 0 selects a free one. An address that is not loopback needs --tokens.
     #[arg(long, value_name = "ADDR", default_value = wildcity_server::limits::LISTEN, value_parser = address)]
     listen: SocketAddr,
 
-    /// Address and port of a second listener, for AlpaSim: gRPC `sensorsim`, by which AlpaSim uses the twins
-    /// as scenes of its renderer. AlpaSim sends no tokens.
+    /// Address and port of a second listener, for AlpaSim: the gRPC service `sensorsim`, through which AlpaSim uses the
+    /// twins as scenes of its renderer. AlpaSim sends no tokens.
     #[arg(long, value_name = "ADDR", value_parser = address)]
     alpasim: Option<SocketAddr>,
 
-    /// Let --alpasim listen on an address that is not loopback: every machine that reaches it can read the
+    /// Allow an address of --alpasim that is not loopback: every machine that can connect to it can then read the
     /// twins.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     alpasim_open: bool,
 
-    /// Refuse shared memory to clients on this machine: their observations then come through the socket alone.
+    /// Refuse shared memory to clients on this machine: they then receive observations through the socket only.
     #[arg(long, value_name = "BOOL", action = clap::ArgAction::Set, default_value_t = false, num_args = 0..=1, default_missing_value = "true")]
     no_shared_memory: bool,
 
-    /// Memory that the Gaussians of all twins and the frames that show them may take, in GiB, for example 2 or
-    /// 0.5 [default: three quarters of the machine's]. A session is refused if its largest frame does not fit into memory
-    /// together with those of the other sessions; the rest of the memory is a cache for later frames.
+    /// Memory for the Gaussians of all twins and for the frames that are rendered from them, in GiB, for example 2 or
+    /// 0.5 [default: three quarters of the machine's]. A session is refused if its largest frame does not fit into
+    /// memory together with those of the other sessions; the rest of the memory is a cache for later frames.
     #[arg(long, value_name = "N", value_parser = gib)]
     memory_gib: Option<f64>,
 
@@ -117,7 +117,7 @@ pub(super) struct Serve {
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
 
-    /// OpenTelemetry collector that gets traces of requests and pushes, by OTLP over HTTP, for example
+    /// OpenTelemetry collector that receives traces of requests and pushes, by OTLP over HTTP, for example
     /// http://127.0.0.1:4318. Needs a program built with the feature otlp.
     #[arg(long, value_name = "URL")]
     otlp_endpoint: Option<String>,
@@ -138,10 +138,10 @@ Examples:
   wildcity serve --config serve.toml --sessions 16
   curl http://127.0.0.1:8080/v1/twins
 
-Tokens file: role is metrics (GET /metrics alone), drive (sessions), push (sessions, uploads and pushes) or
-admin (everything). Give the token itself, of at least 16 characters, or hash: blake3: or sha-256: and its
-hash in hex. twins lists the twins that it may use; without the list it may use all. limits are what it may
-have at once: sessions, connections, pushes, upload_bytes.
+Tokens file: role is metrics (GET /metrics only), drive (sessions), push (sessions, uploads and pushes) or
+admin (everything). Give token, of at least 16 characters, or hash: blake3: or sha-256:, then the token's
+hash in hex. twins lists the twins that the token may use; without the list it may use all. limits are its
+largest numbers at a time: sessions, connections, pushes, upload_bytes.
   openssl rand -base64 24                 makes a TOKEN
   printf %s TOKEN | sha256sum             prints its HASH
   {\"tokens\": [
@@ -150,7 +150,7 @@ have at once: sessions, connections, pushes, upload_bytes.
 
 impl Serve {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        // The arguments after `wildcity serve` are parsed again, behind those of the file.
+        // The arguments after `wildcity serve` are parsed again, after those of the file.
         let resolved = config_file::resolve(std::env::args_os().skip(2).collect())?;
         if resolved.serve.print_config {
             write!(io::stdout(), "{}", resolved.to_toml()?)?;

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use crate::cli::directories::{TwinVersion, Twins};
 use wildcity_twin::store::{CommitKind, StorageOptions, Version, VersionChange};
 
-/// Commits a version that differs from its base by what `edit` changes.
+/// Commits a version with the changes that `edit` makes to its base.
 pub(super) fn commit(
     twins: &Twins,
     twin: &TwinVersion,
@@ -13,7 +13,7 @@ pub(super) fn commit(
 ) -> anyhow::Result<Version> {
     let catalog = twins.catalog()?;
     let base = catalog.version(&twin.name, twin.number)?;
-    // The Gaussians stay, and so does what the version says of their origin.
+    // The Gaussians stay, and so does the record of their origin.
     let mut change = VersionChange::edit();
     edit(&mut change);
     let storage = StorageOptions { record: base.manifest.record, ..StorageOptions::default() };
@@ -21,7 +21,7 @@ pub(super) fn commit(
     Ok(commit.change(base.number, change)?)
 }
 
-/// Prints the number of a new version, what it has, and its hash.
+/// Prints the number of a new version, a description of it, and its hash.
 pub(super) fn print(version: &Version, what: &str) -> anyhow::Result<()> {
     let Version { number, hash, manifest, .. } = version;
     writeln!(

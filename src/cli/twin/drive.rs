@@ -12,7 +12,7 @@ use crate::cli::rig::rig_of;
 
 /// Give a twin recorded drives and a rig: makes a new version with the same Gaussians.
 ///
-/// A drive replaces the one of its name; other drives stay. Open sessions keep the version that they have.
+/// A drive replaces the drive of the same name; other drives stay. Open sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:

@@ -23,8 +23,8 @@ pub(super) struct Fsck {
     #[command(flatten)]
     twins: Twins,
 
-    /// Set the newest log record aside if it cannot be read, and those before it that cannot; then check. The version
-    /// before them is the latest again.
+    /// Before the check, set aside the newest log record if it cannot be read, and those before it that cannot be read.
+    /// The version before them becomes the latest again.
     #[arg(long)]
     repair: bool,
 

@@ -26,11 +26,11 @@ pub(super) struct Gc {
           value_parser = clap::value_parser!(u32).range(1..))]
     keep: u32,
 
-    /// How long an object stays after it was noted as garbage, for example 90s, 30m, 24h or 7d.
+    /// How long an object is kept after it was recorded as garbage, for example 90s, 30m, 24h or 7d.
     #[arg(long, value_name = "TIME", default_value = limits::GC_GRACE, value_parser = duration)]
     grace: Duration,
 
-    /// Only print what would be done.
+    /// Only print the changes that would be made.
     #[arg(long)]
     dry_run: bool,
 

@@ -41,8 +41,9 @@ pub(in crate::cli) struct Generate {
     #[arg(long, value_name = "M_PER_S", default_value_t = 10.0)]
     speed_m_s: f64,
 
-    /// Spoil the twin as captures are: nearly right on the recorded drive, wrong beside it; from 0 to 1. Colours
-    /// change with the direction, sheets hang in the air, some Gaussians are displaced, missing or needles.
+    /// Add reconstruction errors like those of real captures, from 0 (none) to 1: small on the recorded drive, large
+    /// off it. Colours change with the viewing direction, there are sheet-shaped floaters, and some Gaussians are
+    /// displaced, missing or needle-shaped.
     #[arg(long, value_name = "AMOUNT")]
     spoil: Option<f64>,
 
@@ -70,8 +71,8 @@ Examples:
 /// Bytes on disk per Gaussian of a city of low density, including levels of detail. Dense cities take fewer.
 const STORED_BYTES: u64 = 48;
 
-/// Draw distance, in metres: the bends of the street hide what is farther. At four places of a kilometre the
-/// image is bit-identical to the one without a limit; with 300 m, one of the four is off by 1/255.
+/// Draw distance, in metres: the bends of the street hide everything beyond. At four places of a kilometre the image is
+/// bit-identical to the one without a limit; with 300 m, one of the four is off by 1/255.
 const REACH_M: f64 = 600.0;
 
 impl Generate {
@@ -143,7 +144,7 @@ impl Generate {
     }
 }
 
-/// Checks that the disk has space for so many Gaussians.
+/// Checks that the disk has space for this number of Gaussians.
 fn check_free_space(dir: &Path, gaussians: u64) -> anyhow::Result<()> {
     // The directory may not exist yet; then its nearest parent is on the same disk.
     let existing = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));

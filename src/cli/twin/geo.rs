@@ -5,7 +5,7 @@ use wildcity_scene::geo::GeoAnchor;
 
 use super::change;
 
-/// Say where a twin lies on the earth, or remove that: makes a new version with the same Gaussians.
+/// Set the place of a twin on the earth, or remove it: makes a new version with the same Gaussians.
 ///
 /// Observations of the version then have latitude, longitude and heading. Open sessions keep the version that they
 /// have.

@@ -29,7 +29,7 @@ impl Log {
         let mut out = io::stdout().lock();
         let catalog = self.twins.catalog()?;
         for entry in catalog.versions(&self.twin)? {
-            // Builds from before notes were shown gave edits the note of their base.
+            // Older builds, which did not show notes, gave edits the note of their base.
             let is_edit = entry.is_edit();
             let how = entry.kind_name();
             let note = match catalog.provenance(&self.twin, &entry) {
@@ -51,7 +51,7 @@ impl Log {
                 let from = parent.map_or(String::new(), |parent| format!(" of {parent}"));
                 let how = format!("{how}{from}");
                 let when = utc(created_us);
-                // A note may have lines; a version has one.
+                // A note may have several lines; a version has one.
                 let note = note.map(|note| format!("  {}", note.replace(char::is_control, " ")));
                 let note = note.unwrap_or_default();
                 writeln!(out, "{number:>6}  {when}  {how:<16}  {hash}{note}")?;

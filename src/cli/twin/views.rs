@@ -25,9 +25,8 @@ use super::change;
 ///
 /// A repair model can compare a rendered image with recorded ones (docs/repair.md). The images are stored as JPEG in
 /// the size that --side says, with their cameras. Each belongs to the place of the drive that is nearest to its camera.
-/// Their masks are kept: pixels that do not count are not brought into a view. Nor are those that the overlay of the rig's
-/// camera of the same name covers.
-/// Open sessions keep the version that they have.
+/// Masks are stored with the images. Masked pixels are not warped into views, and neither are pixels under the overlay
+/// of the rig's camera of the same name. Open sessions keep the version that they have.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 #[command(group = clap::ArgGroup::new("action").args(["images", "remove"]).required(true))]
@@ -35,28 +34,31 @@ pub(in crate::cli) struct Views {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, as of `wildcity eval`.
+    /// The images with their cameras: a transforms.json, a COLMAP model, or a camera list, in the format of `wildcity
+    /// eval --images`.
     #[arg(long, value_name = "FILE_OR_DIR")]
     images: Option<PathBuf>,
 
-    /// Folder that the names of images are in, as of `wildcity eval`.
+    /// Folder of the images, as for `wildcity eval`.
     #[arg(long, value_name = "DIR", requires = "images")]
     image_dir: Option<PathBuf>,
 
-    /// Directions of the poses' axes, as of `wildcity import` [default: as the twin was imported and aligned;
+    /// Axes of the poses, in the form of `wildcity import --axes` [default: as the twin was imported and aligned;
     /// identity for a list]
     #[arg(long, value_name = "AXES", allow_hyphen_values = true, requires = "images")]
     axes: Option<String>,
 
-    /// Metres per unit of the poses, as of `wildcity import`; with --axes [default: 1]
+    /// Metres per unit of the poses, applied after --axes [default: 1]
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 
-    /// Least distance of two images of a camera along the drive, in metres: 2 or 2m. Images up to a tenth nearer are kept.
+    /// Smallest distance between two images of a camera along the drive, in metres: 2 or 2m. Images up to a tenth
+    /// nearer are kept.
     #[arg(long, value_name = "M", default_value = "2", value_parser = metres)]
     every: f64,
 
-    /// Longest side of a stored image, in pixels. Larger images are scaled down: 0.4 GB per km of six cameras every 2 m.
+    /// Longest side of a stored image, in pixels. Larger images are scaled down. Six cameras with an image every 2 m
+    /// take 0.4 GB per km.
     #[arg(long, value_name = "PX", default_value_t = 720, value_parser = clap::value_parser!(u32).range(16..=8192))]
     side: u32,
 
@@ -78,12 +80,12 @@ Examples:
   wildcity twin views street --images capture --image-dir capture/images_2 --every 4m --side 480
   wildcity twin views street --remove";
 
-/// Images may be so much nearer than --every, as a share of it: a camera outside or inside of a bend travels another distance than
-/// the drive, and images every 2 m would otherwise be kept every 4 m.
+/// Tolerance of --every: an image is kept if its distance is at most this share below it. In a bend, a camera travels
+/// another distance than the drive; without the tolerance, images that were recorded every 2 m would be kept every 4 m.
 const SLACK: f64 = 0.1;
 
-/// Half of the images are at most so far from the drives, in metres, or their poses have other axes or another unit. Cameras of a
-/// vehicle are within some metres; another lane is within 20 m.
+/// Largest median distance of the images from the drives, in metres. A larger one means that the poses have other axes
+/// or another unit: cameras of a vehicle are within some metres, and another lane is within 20 m.
 const MOST_MEDIAN_M: f64 = 20.0;
 
 /// An image of the list with its place on the drive.
@@ -200,7 +202,8 @@ impl Views {
         Ok(views)
     }
 
-    /// Stores an image in its size, and its mask if not all pixels count. Returns its camera then.
+    /// Stores an image, scaled down to `side`, and its mask if not all pixels count. Returns the camera of the stored
+    /// image.
     fn store(
         &self,
         commit: &mut Commit,

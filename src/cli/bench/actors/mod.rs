@@ -25,7 +25,7 @@ use super::timed::median;
 use crate::cli::progress;
 use street::Cars;
 
-/// Measure what actors cost: a step among cars that are actors, against one in a twin that contains the same cars.
+/// Measure the cost of actors: a step among cars that are actors, against one in a twin that contains the same cars.
 ///
 /// Cars stand in two lanes around the middle of the twin's first trajectory. Both twins, without a sky, and the car's
 /// asset are made in a temporary directory. One session in each drives through the same poses, in turn; images are
@@ -42,7 +42,7 @@ pub(super) struct Actors {
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=256))]
     cars: u32,
 
-    /// Gaussians of a car: the generated sedan's, of which the largest are halved until there are so many.
+    /// Number of Gaussians of a car: the largest ones of the generated sedan are halved until this number is reached.
     #[arg(long, value_name = "N", default_value_t = 100_000,
         value_parser = clap::value_parser!(u32).range(1_000..=1_000_000))]
     gaussians: u32,
@@ -82,7 +82,7 @@ struct Row {
     tau_px: f64,
     actors: Times,
     baked: Times,
-    /// Between the last images of both. Actors have contact shadows.
+    /// PSNR between the last images of both, in dB. Only actors have contact shadows.
     psnr_db: f64,
 }
 
@@ -213,7 +213,7 @@ impl Actors {
     }
 }
 
-/// The tensors of an observation, which are behind its header: almost all of them pixels.
+/// The tensors of an observation, which follow its header: almost all of them pixels.
 fn pixels(seen: &Observation) -> &[u8] {
     let bytes = seen.buffer.bytes();
     let length = seen.tensors.last().map_or(0, |tensor| tensor.bytes.end);

@@ -22,7 +22,7 @@ pub(super) const BAKED: &str = "baked";
 
 /// Distance between the middles of two cars in a lane, in metres.
 const SPACING_M: f64 = 6.0;
-/// Distance of the lane from ahead to the left, in metres.
+/// Distance of the oncoming lane to the left, in metres.
 const LANE_M: f64 = 3.5;
 /// Distance of the ego to the next cars in its own lane, in metres, beyond half of the spacing.
 const FREE_M: f64 = 10.0;
@@ -93,7 +93,7 @@ pub(super) fn commit(
 }
 
 impl Cars {
-    /// The ego's pose, so far after the middle of the drive, in metres.
+    /// The ego's pose at this distance after the middle of the drive, in metres.
     pub(super) fn ego_at(&self, ahead_m: f64) -> Pose {
         self.drive.at_station(0.5 * self.drive.length_m() + ahead_m)
     }
@@ -110,7 +110,7 @@ impl Cars {
     }
 }
 
-/// Where the cars stand: in turn in the ego's lane, around the middle of the drive, and in the lane from ahead.
+/// Where the cars stand: alternately in the ego's lane, around the middle of the drive, and in the oncoming lane.
 fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
     let rows = count.div_ceil(2);
     let needed_m = f64::from(rows) * SPACING_M + 2.0 * FREE_M;

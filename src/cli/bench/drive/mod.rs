@@ -24,10 +24,9 @@ use step::DriveStep;
 
 /// Time a drive along a twin's first trajectory, in a session without a network.
 ///
-/// Drives at a constant speed with ten steps per second. Each step starts 0.1 s after the one before, or
-/// as soon as that one is done if it took longer, like an agent that runs in real time. For every
-/// kilometre, prints how long the steps took, how many of them waited for the disk and for how long, and
-/// how much memory was in use.
+/// Drives at a constant speed with ten steps per second. Each step starts 0.1 s after the previous one, or as soon as
+/// the previous one is done if that took longer, like an agent that runs in real time. For every kilometre, prints how
+/// long the steps took, how many of them waited for the disk and for how long, and how much memory was in use.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Drive {
@@ -51,7 +50,7 @@ pub(super) struct Drive {
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     crop: u32,
 
-    /// Start each step as soon as the one before is done, instead of in real time.
+    /// Start each step as soon as the previous one is done, instead of in real time.
     #[arg(long)]
     unpaced: bool,
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-/// One rendered pose: how long it took, and what the cache of sections did meanwhile.
+/// One rendered pose: its time, and the activity of the cache of sections during this time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct DriveStep {
     /// Position along the trajectory, in metres.

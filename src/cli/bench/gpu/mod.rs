@@ -45,7 +45,7 @@ pub(super) struct Gpu {
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
 
-    /// Frames to time. At least two frames, and frames for a second, are rendered before and not timed.
+    /// Frames to time. Before them, at least two frames, and frames for a second, are rendered and not timed.
     #[arg(long, default_value_t = 9, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     repeat: u32,
 
@@ -64,9 +64,9 @@ Examples:
   wildcity bench gpu --gaussians 100000 --repeat 3 --device llvmpipe
   wildcity bench gpu --json > report.json";
 
-/// Frames before those that are timed: the first one uploads the scene and allocates buffers.
+/// Untimed frames before the timed ones: the first one uploads the scene and allocates buffers.
 const WARM_UP: u32 = 2;
-/// The frames before take at least this long: a graphics card that was idle needs hundreds of milliseconds to raise its clock.
+/// Least time of the untimed frames: a graphics card that was idle needs hundreds of milliseconds to raise its clock.
 const WARM_UP_TIME: Duration = Duration::from_secs(1);
 
 impl Gpu {

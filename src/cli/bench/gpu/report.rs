@@ -83,7 +83,7 @@ pub(super) struct StageReport {
     bytes: u64,
     memory_ms: f64,
     arithmetic_ms: f64,
-    /// The larger one of both rooflines, divided by the device time.
+    /// The larger of the two rooflines, divided by the device time.
     share: f64,
 }
 

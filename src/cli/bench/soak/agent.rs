@@ -12,7 +12,7 @@ use wildcity_scene::Trajectory;
 /// Speed of the agents, in m/s.
 const SPEED_M_PER_S: f64 = 10.0;
 
-/// What one session did.
+/// Counts of one session.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Driven {
     pub(super) steps: u64,

@@ -76,7 +76,7 @@ mod tests {
         let leak = memory(|sample| 1000 + sample as u64);
         assert_eq!(leak, Growth { first: 1005, later: 1055, most: 1059 });
         assert!((leak.percent() - 4.975).abs() < 1e-3, "{}", leak.percent());
-        // What grew in the middle counts, although it is gone in the end.
+        // Memory that grew in the middle counts, although it is free in the end.
         assert_eq!(
             memory(|sample| if (30..40).contains(&sample) { 1100 } else { 1000 }).later,
             1100

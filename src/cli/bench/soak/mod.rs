@@ -23,24 +23,25 @@ use super::benched_twin::BenchedTwin;
 use super::memory::{mib, rss_bytes};
 use crate::cli::exit::Exit;
 
-/// Drive many sessions of small cameras against a server for minutes or hours, and look for what grows or changes.
+/// Drive many sessions of small cameras against a server for minutes or hours, and check that memory does not grow and
+/// images do not change.
 ///
 /// The server runs in this process. The twin needs a recorded drive: each session drives the same stretch of the first
 /// one again and again, and compares the hash of every image with that of its first round. Prints the memory of the
-/// process every minute. The exit code is 1 if a request fails, a hash changes, or memory grows by more than --growth: the
-/// median of the first sixth of the time is compared with the largest median of a later sixth. With --memory-gib below
-/// what the twin needs, the server evicts and loads all the time.
+/// process every minute. The exit code is 1 if a request fails, a hash changes, or memory grows by more than --growth.
+/// Growth is the largest median of a later sixth of the time, compared with the median of the first sixth. With
+/// --memory-gib below what the twin needs, the server evicts and loads all the time.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
 pub(super) struct Soak {
     #[command(flatten)]
     twin: BenchedTwin,
 
-    /// How long, in minutes.
+    /// Duration, in minutes.
     #[arg(long, value_name = "N", default_value_t = 60.0, value_parser = minutes)]
     minutes: f64,
 
-    /// Sessions at once.
+    /// Number of sessions at a time.
     #[arg(long, value_name = "K", default_value_t = 16, value_parser = clap::value_parser!(u32).range(1..=256))]
     sessions: u32,
 
@@ -53,7 +54,7 @@ pub(super) struct Soak {
     #[arg(long)]
     mixed: bool,
 
-    /// Growth of the memory that is accepted, in per cent.
+    /// Largest growth of the memory that is accepted, in per cent.
     #[arg(long, value_name = "PERCENT", default_value_t = 2.0)]
     growth: f64,
 }
@@ -70,7 +71,7 @@ const LINE_EVERY: Duration = Duration::from_secs(60);
 /// Sessions beyond those of the agents: clients that do not read leave theirs to be resumed.
 const OTHER_SESSIONS: usize = 64;
 
-/// What a soak drives.
+/// The drive of all sessions.
 struct Driving {
     /// The directory or URL of twins.
     twins: PathBuf,
@@ -81,7 +82,7 @@ struct Driving {
     until: Instant,
 }
 
-/// What else happened in a mixed soak.
+/// Counts of the other load in a mixed soak.
 struct Others {
     pushes: u64,
     damaged: u64,
@@ -191,7 +192,7 @@ impl Soak {
         Ok(Others { pushes, damaged, unread })
     }
 
-    /// Looks at the memory every second until the end, and prints it every minute.
+    /// Measures the memory every second until the end, and prints it every minute.
     async fn watch(&self, until: Instant) -> anyhow::Result<Memory> {
         let begun = Instant::now();
         let mut out = io::stdout();
@@ -212,7 +213,7 @@ impl Soak {
         Ok(memory)
     }
 
-    /// Prints what was done.
+    /// Prints the counts.
     ///
     /// # Errors
     /// The memory grew by more than is accepted.

@@ -1,4 +1,4 @@
-//! What else happens to a server in a mixed soak: pushes with garbage collection, damaged requests, and clients that do
+//! The other load on a server in a mixed soak: pushes with garbage collection, damaged requests, and clients that do
 //! not read. None of it may disturb the agents.
 
 use std::fs;
@@ -26,14 +26,14 @@ use wildcity_twin::store::{Catalog, Retention};
 const PUSH_EVERY: Duration = Duration::from_secs(10);
 const DAMAGED_EVERY: Duration = Duration::from_millis(100);
 const UNREAD_EVERY: Duration = Duration::from_secs(1);
-/// How long a client that does not read gets to send its request, and how long it stays then.
+/// Time that a client that does not read has for its request, and time that it stays afterwards.
 const UNREAD_AFTER: Duration = Duration::from_millis(2);
 const UNREAD_FOR: Duration = Duration::from_secs(20);
 /// How long the server may take to answer a damaged request or to close its connection.
 const REFUSED_WITHIN: Duration = Duration::from_secs(60);
 /// Gaussians of a push.
 const PUSHED: usize = 20_000;
-/// Versions that garbage collection keeps beside those in use.
+/// Versions that garbage collection keeps in addition to those in use.
 const KEPT: Retention = Retention { versions: 2, grace: Duration::from_secs(1) };
 
 /// Copies a twin into an empty directory of twins, so that pushes to it leave the user's own as it is.
@@ -41,7 +41,7 @@ pub(super) fn copy_twin(from: &Path, to: &Path, twin: &str) -> anyhow::Result<()
     let source = from.join(twin);
     anyhow::ensure!(
         source.is_dir(),
-        "--mixed copies the twin, and {} is no directory: give --twins DIR, not a URL",
+        "--mixed copies the twin, and {} is not a directory: give --twins DIR, not a URL",
         source.display(),
     );
     copy_directory(&source, &to.join(twin)).with_context(|| format!("cannot copy twin {twin:?}"))
@@ -61,7 +61,7 @@ fn copy_directory(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Pushes a scene to the twin again and again, each time another one, and collects the garbage of earlier versions.
+/// Pushes a scene to the twin again and again, each time a different one, and collects the garbage of earlier versions.
 pub(super) struct Pusher {
     pub(super) url: String,
     pub(super) catalog: Catalog,
@@ -156,7 +156,7 @@ pub(super) async fn send_damaged(address: SocketAddr, until: Instant) -> anyhow:
     Ok(sent)
 }
 
-/// A request that is cut off, has random bytes, or is text that is no request of the protocol.
+/// A request that is cut off, has random bytes, or is text that is not a request of the protocol.
 fn damaged(random: &mut Random) -> Vec<u8> {
     const UPGRADE: &str = "GET /v1/session HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\n\
         Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\

@@ -22,8 +22,8 @@ use crate::cli::{output, progress};
 /// Without --apply nothing changes: the command prints the ground that it found, and draws the twin before and after,
 /// with the ground as a grid. Look at the picture, then run the command again with --apply: that makes a new version,
 /// with the drives and the sky of the old one in the new axes. The twin's place on the earth is dropped, because it
-/// was that of the old axes. Open sessions keep the version that they have. The version remembers the change:
-/// `wildcity push --frame capture` pushes files that are still in the axes of the capture.
+/// belongs to the old axes. Open sessions keep the version that they have. The version records the change: `wildcity
+/// push --frame capture` pushes files that are still in the axes of the capture.
 ///
 /// The ground is the plane with most of the scene on it and little of it below. The same twin gives the same plane.
 /// All Gaussians are in memory at once: 56 bytes each without SH, 236 with SH degree 3, and as much for the picture.
@@ -33,19 +33,19 @@ pub(in crate::cli) struct Align {
     #[command(flatten)]
     edited: EditedTwin,
 
-    /// What is up in the twin now, within 45 degrees: x, -x, y, -y, z, -z; auto tries all directions.
+    /// Direction that is up in the twin now, within 45 degrees: x, -x, y, -y, z, -z; auto tries all directions.
     #[arg(long, value_name = "AXIS", default_value = "auto", allow_hyphen_values = true)]
     up: Up,
 
-    /// A point of known distance to the one of --to, in the twin's axes and unit.
+    /// First of two points whose real distance is known, in the twin's axes and unit; see --to and --distance-m.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, requires_all = ["to", "distance_m"])]
     from: Option<Point>,
 
-    /// The other point.
+    /// Second of the two points.
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "from")]
     to: Option<Point>,
 
-    /// Their distance, in metres.
+    /// Real distance between the two points, in metres.
     #[arg(long, value_name = "M", requires = "from")]
     distance_m: Option<f64>,
 
@@ -53,8 +53,8 @@ pub(in crate::cli) struct Align {
     #[arg(long, value_name = "M", conflicts_with = "from")]
     scale: Option<f64>,
 
-    /// PNG file to write: above before, below after; the left is a slice from the side, the right is from above
-    /// [default: TWIN-align.png]
+    /// PNG file to write: the twin before in the upper row and after in the lower one; on the left a slice from the
+    /// side, on the right the view from above [default: TWIN-align.png]
     #[arg(long, value_name = "FILE")]
     picture: Option<PathBuf>,
 

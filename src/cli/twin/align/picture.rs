@@ -19,13 +19,13 @@ const GAP_PX: u32 = 6;
 const LEFT_OUT: f64 = 0.02;
 /// Share of the scene's depth that the side view shows.
 const SLICE: f64 = 0.25;
-/// How far away the camera is, as a multiple of the scene's half size: nearly parallel rays.
+/// Distance of the camera, as a multiple of the scene's half size: nearly parallel rays.
 const AWAY: f64 = 12.0;
-/// Most Gaussians of a picture; of more, every n-th is drawn.
+/// Largest number of Gaussians of a picture; if there are more, every n-th is drawn.
 const MOST: usize = 2_000_000;
 /// Colour of the ground's grid.
 const GRID: Rgb<u8> = Rgb([255, 96, 32]);
-/// Most lines of the grid in each direction.
+/// Largest number of lines of the grid in each direction.
 const LINES: f64 = 24.0;
 
 /// Middle and half size of most of a scene.
@@ -35,7 +35,7 @@ struct Extent {
     half: DVec3,
 }
 
-/// Both, as a PNG, and the distance of the grid's lines in metres.
+/// Draws the twin before and after, as a PNG. Also returns the distance of the grid's lines, in metres.
 pub(super) fn before_and_after(
     gaussians: Gaussians,
     alignment: &Alignment,
@@ -75,7 +75,7 @@ pub(super) fn before_and_after(
 }
 
 impl Extent {
-    /// Of all Gaussians but the outermost.
+    /// The extent of all Gaussians but the outermost.
     fn of(gaussians: &Gaussians) -> Self {
         let ends = [0, 1, 2].map(|axis| {
             let mut values: Vec<f64> = gaussians.means_m.iter().map(|mean| mean[axis]).collect();
@@ -143,7 +143,7 @@ fn draw(
     Ok(picture)
 }
 
-/// From the south, or from above with north at the top.
+/// The view from the south, or from above with north at the top.
 fn view(extent: &Extent, is_side: bool) -> View {
     let Extent { middle, half } = *extent;
     let [width, height] = SIZE_PX.map(f64::from);
@@ -158,7 +158,7 @@ fn view(extent: &Extent, is_side: bool) -> View {
     view_along(SIZE_PX, focal_px, middle - away * forward, forward, down)
 }
 
-/// A line of the ground over the picture, half transparent.
+/// Draws a line of the ground over the picture, half transparent.
 fn line(picture: &mut RgbImage, view: &View, from: DVec3, to: DVec3) {
     let (Some(from), Some(to)) = (view.project_world(from), view.project_world(to)) else { return };
     let steps = (to - from).abs().max_element().ceil().clamp(1.0, 4_000.0);

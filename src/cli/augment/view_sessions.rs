@@ -1,4 +1,4 @@
-//! Views through an in-process server: one session draws them as rendered, another one repaired.
+//! Views through an in-process server: one session renders them, and another one also repairs them.
 
 use std::time::Duration;
 
@@ -13,11 +13,11 @@ use wildcity_client::{Client, ImageView, Observation, Open, Pose};
 use wildcity_scene::rig::RigCamera;
 use wildcity_twin::store::Version;
 
-/// How long the images of one place may take: a large model on a processor takes minutes an image.
-pub(super) const PATIENCE: Duration = Duration::from_secs(3600);
+/// Time limit for the images of one place: a large model on a processor takes minutes an image.
+pub(super) const PLACE_TIMEOUT: Duration = Duration::from_secs(3600);
 
-/// The two sessions.
-pub(super) struct Studio {
+/// The session that renders, and the session that also repairs.
+pub(super) struct ViewSessions {
     plain: Client,
     repaired: Option<Client>,
     backend: String,
@@ -28,7 +28,7 @@ pub(super) struct Studio {
 pub(super) struct Drawn {
     /// `[height, width, 3]`.
     pub(super) rendered: Vec<u8>,
-    /// The same after the repair, or as it was if it was kept; `None` without a model.
+    /// The same after the repair, or as rendered if it was not repaired; `None` without a model.
     pub(super) repaired: Option<Vec<u8>>,
     /// `[height, width]`.
     pub(super) opacity: Vec<f32>,
@@ -37,7 +37,7 @@ pub(super) struct Drawn {
     pub(super) repair: Option<SampleRepair>,
 }
 
-impl Studio {
+impl ViewSessions {
     /// Opens the sessions with these cameras. `model` is the name of the model and the least trust of its images.
     pub(super) async fn open(
         url: &str,
@@ -65,9 +65,9 @@ impl Studio {
             "twin {} changed while it was opened: try again",
             version.manifest.twin
         );
-        let mut studio = Self { plain, repaired: None, backend: opened.backend, repair: None };
+        let mut sessions = Self { plain, repaired: None, backend: opened.backend, repair: None };
         if let Some((model, at_least)) = model {
-            // Whatever the trust is, down to the least one.
+            // At any trust that is not below the least one.
             let always = Repair {
                 model: model.to_owned(),
                 below: Some(1.0),
@@ -78,10 +78,10 @@ impl Studio {
             };
             let mut repaired = client(url).await?;
             let opened = repaired.open(open(images, Some(always))).await?;
-            studio.repair = opened.repair;
-            studio.repaired = Some(repaired);
+            sessions.repair = opened.repair;
+            sessions.repaired = Some(repaired);
         }
-        Ok(studio)
+        Ok(sessions)
     }
 
     /// Name of the backend.
@@ -89,7 +89,7 @@ impl Studio {
         &self.backend
     }
 
-    /// The model, as it is on record.
+    /// The model, as it is recorded.
     pub(super) fn repaired_with(&self) -> Option<RepairedWith> {
         let repair = self.repair.as_ref()?;
         let references = repair.references.map(|source| match source {
@@ -106,7 +106,7 @@ impl Studio {
         })
     }
 
-    /// Draws the images of all cameras at a place.
+    /// Renders the images of all cameras at a place.
     pub(super) async fn draw(&mut self, place: &Place) -> anyhow::Result<Vec<Drawn>> {
         let pose = &place.world_from_rig;
         let poses = [Pose { xyz: pose.position_m.to_array(), q: pose.q_wxyz() }];
@@ -136,11 +136,11 @@ impl Studio {
 
 async fn client(url: &str) -> anyhow::Result<Client> {
     let mut client = Client::connect(url, "wildcity augment").await?;
-    client.set_answer_timeout(PATIENCE + Duration::from_secs(60));
+    client.set_answer_timeout(PLACE_TIMEOUT + Duration::from_secs(60));
     Ok(client)
 }
 
-/// A camera without shutter, exposure and overlay, on the wire. Rig files and the wire have the same JSON.
+/// A camera without shutter, exposure and overlay, in the form of the wire. Rig files and the wire have the same JSON.
 fn wire_camera(
     training: &TrainingCamera,
 ) -> anyhow::Result<wildcity_client::protocol::message::RigCamera> {
@@ -149,7 +149,7 @@ fn wire_camera(
     Ok(serde_json::from_value(serde_json::to_value(mounted)?)?)
 }
 
-/// The image of a camera, and its repaired one in the other observation.
+/// The image of a camera, with its repaired image from the other observation.
 fn drawn(image: ImageView<'_>, repaired: Option<&Observation>, at: usize) -> anyhow::Result<Drawn> {
     let rendered = image.rgb()?.into_owned();
     let trust = image.metadata().trust.context("the image has no trust")?.value;

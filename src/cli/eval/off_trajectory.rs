@@ -1,4 +1,4 @@
-//! `--extrapolate`: views beside the drive, for which there is no real image.
+//! `--extrapolate`: views off the trajectory, for which there is no real image.
 
 use std::sync::Arc;
 
@@ -23,7 +23,7 @@ use super::repairer::Repairer;
 /// Largest distance from the drive, in metres.
 const FARTHEST_M: f64 = 50.0;
 
-/// Most distances.
+/// Largest number of distances.
 const MOST: usize = 16;
 
 /// The distances of `--extrapolate`, in metres.
@@ -49,7 +49,7 @@ impl std::str::FromStr for Offsets {
     }
 }
 
-/// What draws and repairs views, and where they are.
+/// The renderer, the repairer and the recorded drives that the views need.
 #[derive(Clone, Copy)]
 pub(super) struct Tools<'a> {
     pub(super) renderer: &'a Renderer,
@@ -57,7 +57,7 @@ pub(super) struct Tools<'a> {
     pub(super) drives: &'a Drives,
 }
 
-/// A real image, from which views beside the drive are moved.
+/// A real image, whose camera is moved sideways for the views.
 pub(super) struct OnDrive<'a> {
     pub(super) name: &'a str,
     pub(super) camera: &'a RigCamera,
@@ -67,22 +67,22 @@ pub(super) struct OnDrive<'a> {
     pub(super) view: &'a View,
     pub(super) profile: &'a RenderProfile,
     pub(super) truth: &'a [u8],
-    /// What was rendered there.
+    /// The image that was rendered with its camera.
     pub(super) rendered: &'a RenderedImage,
     /// Which pixels of the real image count.
     pub(super) counts: Option<&'a [bool]>,
-    /// Whether its pictures are shown.
+    /// Whether the page shows the pictures of its views.
     pub(super) is_shown: bool,
 }
 
-/// The pixels of a view beside the drive.
-pub(super) struct BesideImage {
+/// The pixels of a view off the trajectory.
+pub(super) struct OffTrajectoryImage {
     pub(super) rendered: Vec<u8>,
     pub(super) repaired: Option<Vec<u8>>,
 }
 
-/// The views beside the drive, distance by distance.
-pub(super) struct Beside(Vec<Line>);
+/// The views off the trajectory, distance by distance.
+pub(super) struct OffTrajectoryViews(Vec<Line>);
 
 struct Line {
     offset_m: f64,
@@ -90,7 +90,7 @@ struct Line {
     pictures: Vec<(&'static str, Vec<u8>)>,
 }
 
-/// A view that is drawn, and repaired if that is asked for.
+/// A rendered view, with its repaired pixels if there is a model.
 struct Drawn {
     view: View,
     rendered: RenderedImage,
@@ -99,7 +99,7 @@ struct Drawn {
     nearest: Option<String>,
 }
 
-/// The camera of the views of an image, as the warp needs it.
+/// The camera of an image and of its views, in the form that the warp needs.
 pub(super) struct Lens {
     pub(super) rays: Rays,
     projection: Arc<Projection>,
@@ -111,19 +111,19 @@ impl Lens {
     }
 }
 
-impl Beside {
+impl OffTrajectoryViews {
     pub(super) fn new(offsets: &Offsets) -> Self {
         let line =
             |offset_m: &f64| Line { offset_m: *offset_m, views: Vec::new(), pictures: Vec::new() };
         Self(offsets.0.iter().map(line).collect())
     }
 
-    /// Draws and compares the views beside an image. Returns their pixels, distance by distance.
+    /// Renders and compares the views of an image. Returns their pixels, distance by distance.
     pub(super) fn add(
         &mut self,
         tools: Tools<'_>,
         image: &OnDrive<'_>,
-    ) -> anyhow::Result<Vec<BesideImage>> {
+    ) -> anyhow::Result<Vec<OffTrajectoryImage>> {
         let place = tools.drives.place(&image.camera.name, &image.view.world_from_camera);
         let Some(place) = place else { return Ok(Vec::new()) };
         let mut drawn = Vec::with_capacity(self.0.len());
@@ -149,10 +149,10 @@ impl Line {
         tools: Tools<'_>,
         image: &OnDrive<'_>,
         place: &DrivePlace<'_>,
-    ) -> anyhow::Result<BesideImage> {
+    ) -> anyhow::Result<OffTrajectoryImage> {
         let lens = image.lens;
         let moved_m = self.offset_m * place.left();
-        // The view before is drawn first, and the one after it keeps its nearest recorded image, as in a session.
+        // The previous view is rendered first, and this one keeps its nearest recorded image, as in a session.
         let step = place.step_back();
         let before =
             step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None));
@@ -160,7 +160,7 @@ impl Line {
         let kept = before.as_ref().and_then(|before| before.nearest.as_deref());
         let now = draw(tools, image, place, &|pose| moved(pose, moved_m), kept)?;
 
-        // The geometry is that of what was rendered, also for the repaired pixels.
+        // The geometry is that of the rendered views, also for the repaired pixels.
         let onto_now = |of: &dyn Fn(&Drawn) -> Vec<u8>| match &before {
             Some(before) => {
                 let back = into(lens, &now.view, &now.rendered, before, of(before));
@@ -204,7 +204,7 @@ impl Line {
             rendered,
             repaired,
         });
-        Ok(BesideImage { rendered: now.rendered.rgb8, repaired: now.repaired })
+        Ok(OffTrajectoryImage { rendered: now.rendered.rgb8, repaired: now.repaired })
     }
 }
 
@@ -212,7 +212,7 @@ fn moved(pose: &Pose, by_m: DVec3) -> Pose {
     Pose { position_m: pose.position_m + by_m, ..*pose }
 }
 
-/// Draws the view of an image that is moved, with its rig.
+/// Renders the view of an image after moving the camera and the rig.
 fn draw(
     tools: Tools<'_>,
     image: &OnDrive<'_>,
@@ -240,7 +240,7 @@ fn draw(
     Ok(Drawn { view, rendered, repaired, nearest: nearest.flatten() })
 }
 
-/// Brings pixels of one view into another by the depths that were rendered of both.
+/// Warps pixels of one view into another by the rendered depths of both.
 fn into(lens: &Lens, view: &View, rendered: &RenderedImage, from: &Drawn, rgb8: Vec<u8>) -> Warped {
     let depth_m = opaque_depth(&rendered.depth_m, &rendered.opacity);
     let [width, height] = [view.camera.width_px, view.camera.height_px].map(|side| side as usize);
