@@ -1,7 +1,7 @@
 //! Directories of twins, episodes and uploads, and names of twins, on the command line.
 
 use std::env;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::cli::limits;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
@@ -77,6 +77,11 @@ pub(super) struct Scenarios {
 }
 
 impl Scenarios {
+    /// The directory that was given, if it does not exist.
+    pub(super) fn missing(&self) -> Option<&Path> {
+        self.scenarios.as_deref().filter(|dir| !dir.is_dir())
+    }
+
     /// The directory of `--scenarios`, or the user's own.
     pub(super) fn dir(&self) -> anyhow::Result<PathBuf> {
         if let Some(dir) = &self.scenarios {

@@ -196,6 +196,12 @@ impl Import {
         phases.end("publish");
         writeln!(std::io::stderr(), "{phases}")?;
 
+        if version.manifest.trajectories.is_empty() {
+            writeln!(
+                std::io::stderr(),
+                "note: there is no recorded drive, so sessions start at the origin: `wildcity twin drive` adds one"
+            )?;
+        }
         let manifest = &version.manifest;
         let stored_bytes = manifest.stored_bytes();
         writeln!(

@@ -60,9 +60,7 @@ fn description_in(folder: &Path) -> anyhow::Result<&'static str> {
     found.copied().with_context(|| {
         let names = SOG_DESCRIPTIONS.join(" or ");
         let folder = folder.display();
-        format!(
-            "{folder} is a folder without {names}: give a scene file, and the files that it names"
-        )
+        format!("{folder} is a folder without {names}: give the scene's file")
     })
 }
 

@@ -16,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{ActorBox, ActorClass};
+use wildcity_score::own;
 use wildcity_sim::contact::{CollisionType, Contact};
 use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox};
 
@@ -231,6 +232,21 @@ pub struct EpisodeResult {
     pub not_judged: Vec<String>,
     /// The scores, each with its name and version.
     pub scores: BTreeMap<String, ScoreLine>,
+}
+
+impl FaultLine {
+    /// The fault in words, with the values of the episode's scores: `contact.pedestrian with walker at 4.615 s`.
+    pub fn text(&self, scores: &BTreeMap<String, ScoreLine>) -> String {
+        let actor = self.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
+        let text = format!("{}{actor} at {:.3} s", self.fault, self.time_us as f64 * 1e-6);
+        let part = |name: &str| scores.get(own::NAME)?.parts.get(name).copied().flatten();
+        match (&*self.fault, part("progress"), part("least_progress")) {
+            ("progress", Some(progress), Some(least)) => {
+                format!("{text}: {progress:.3} of the recorded drive, and {least} is the least")
+            }
+            _ => text,
+        }
+    }
 }
 
 /// A fault of the ego.

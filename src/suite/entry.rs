@@ -159,7 +159,7 @@ impl EpisodeEntry {
 
     /// The faults in words, by time: `contact.pedestrian with walker at 4.615 s`.
     pub(crate) fn fault_texts(&self) -> Vec<String> {
-        self.faults.iter().map(|fault| self.fault_text(fault)).collect()
+        self.faults.iter().map(|fault| fault.text(&self.scores)).collect()
     }
 
     /// The name of the first episode that was driven alike, which may be its own.
@@ -171,18 +171,6 @@ impl EpisodeEntry {
     pub fn duplicate_text(&self) -> Option<String> {
         let first = self.duplicate_of.as_ref()?;
         Some(format!("driven as {first} was, and not counted"))
-    }
-
-    fn fault_text(&self, fault: &FaultLine) -> String {
-        let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
-        let text = format!("{}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6);
-        let part = |name: &str| self.scores.get(own::NAME)?.parts.get(name).copied().flatten();
-        match (&*fault.fault, part("progress"), part("least_progress")) {
-            ("progress", Some(progress), Some(least)) => {
-                format!("{text}: {progress:.3} of the recorded drive, and {least} is the least")
-            }
-            _ => text,
-        }
     }
 }
 

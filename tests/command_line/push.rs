@@ -79,8 +79,10 @@ async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
     assert_eq!(post(&server, "/v1/twins/test/edits", &twice).await.status, 200);
     let twin = push("in\nmetres", &["--cells", "0,0"]);
     assert!(twin.contains("it was aligned") && twin.contains("need --frame capture"), "{twin}");
+    assert!(twin.contains("warning: twin test was aligned"), "{twin}");
     let capture = push("epoch 30", &["--cells", "0,0", "--frame", "capture"]);
     assert!(capture.contains("frame       the capture's; turned, moved"), "{capture}");
+    assert!(!capture.contains("warning"), "{capture}");
     let (ok, wrong) = wildcity(&["push", block, "--twin", "test", "--frame", "world"]);
     assert!(!ok && wrong.contains("--frame"), "{wrong}");
 

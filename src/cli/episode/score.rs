@@ -56,8 +56,7 @@ impl Score {
 fn table(out: &mut impl Write, name: &str, scored: &EpisodeResult) -> io::Result<()> {
     writeln!(out, "{name}: {}", scored.verdict)?;
     for fault in &scored.faults {
-        let actor = fault.actor.as_ref().map(|actor| format!(" with {actor}")).unwrap_or_default();
-        writeln!(out, "  fault   {}{actor} at {:.3} s", fault.fault, fault.time_us as f64 * 1e-6)?;
+        writeln!(out, "  fault   {}", fault.text(&scored.scores))?;
     }
     for reason in &scored.not_judged {
         writeln!(out, "  not judged: {reason}")?;

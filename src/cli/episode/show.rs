@@ -54,6 +54,12 @@ impl Show {
         }
         if let Some(result) = &episode.result {
             writeln!(out, "verdict     {}", result.verdict)?;
+            for fault in &result.faults {
+                writeln!(out, "fault       {}", fault.text(&result.scores))?;
+            }
+            for reason in &result.not_judged {
+                writeln!(out, "not judged  {reason}")?;
+            }
         }
         Ok(())
     }

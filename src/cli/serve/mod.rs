@@ -199,6 +199,9 @@ impl Serve {
             let dir = twins.display();
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
+        if let Some(dir) = self.directories.scenarios.missing() {
+            tracing::warn!("--scenarios {} is not a directory: it has no scenarios", dir.display());
+        }
         let tokens = self
             .tokens
             .as_deref()

@@ -55,9 +55,15 @@ impl Tokens {
         let wrong =
             |location: String, reason: &str| TokensError { location, reason: reason.to_owned() };
         let file: File = serde_json::from_slice(text).map_err(|error| {
-            // serde's message could quote a token that is in the wrong place.
+            // serde's message could quote a token that is in the wrong place; what it expected there quotes nothing.
             let location = format!("line {}, column {}", error.line(), error.column());
-            wrong(location, "not {\"tokens\": [{\"name\", \"role\", \"token\" or \"hash\", ..}]}")
+            let message = error.to_string();
+            let expected =
+                message.rsplit_once("expected ").and_then(|(_, rest)| rest.split_once(" at line "));
+            let expected = expected.map(|(expected, _)| format!("expected {expected}; "));
+            let form =
+                "the file is {\"tokens\": [{\"name\", \"role\", \"token\" or \"hash\", ..}]}";
+            wrong(location, &format!("{}{form}", expected.unwrap_or_default()))
         })?;
         if file.tokens.is_empty() {
             return Err(wrong("tokens".to_owned(), "there is none: no client could connect"));

@@ -65,7 +65,9 @@ impl Quota {
         let size = upload.announced().size;
         let most = self.of_token(upload.owner()).bytes;
         if size > most {
-            let reason = format!("{size} bytes, and a token may keep {most}; send it in parts");
+            let reason = format!(
+                "{size} bytes, and the limit upload_bytes is {most}: send less, or raise the limit"
+            );
             return Err(Fault::StorageFull { reason });
         }
         let bytes = size.min(limits::RESERVED_BYTES);
