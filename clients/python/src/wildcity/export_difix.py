@@ -227,7 +227,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--attention", choices=["plain", "fused"], default="plain", help="fused: an operator of onnxruntime [default: plain]"
     )
-    parser.add_argument("--compare", action="store_true", help="run the graph on the processor and compare it")
+    parser.add_argument("--compare", action="store_true", help="compare the graph on the processor with PyTorch")
     parser.add_argument("--name", help="what sessions ask for [default: difix-ref, or difix]")
     parser.add_argument("--providers", default="cuda", help="of the manifest, with commas [default: cuda]")
     chosen = parser.parse_args(arguments)

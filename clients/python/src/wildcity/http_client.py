@@ -15,7 +15,7 @@ from .errors import ConnectFailed, ProtocolError, Refused
 from .protocol import to_json
 
 ATTEMPTS = 6
-"""How many attempts in a row may fail without transferring a byte."""
+"""Largest number of attempts in a row that fail without transferring a byte."""
 RETRY_DELAY_S = 0.2
 """Delay before the first repetition of a failed attempt; it doubles with each further repetition."""
 

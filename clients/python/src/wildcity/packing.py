@@ -62,7 +62,7 @@ def _named_files(folder: Path, meta: str) -> set[str]:
         try:
             blocks, images = _files_of(json.loads((folder / name).read_bytes()))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise ValueError(f"{folder / name} is not a description of a SOG: {error}") from error
+            raise ValueError(f"{folder / name} is no description of a SOG: {error}") from error
         beside = name[: name.rfind("/") + 1]
         for named in blocks + images:
             path = beside + named

@@ -21,7 +21,7 @@ from .protocol import Drive, decode
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are read at a time."""
 POLL_INTERVAL_S = 0.1
-"""How often the client asks for the state of a push."""
+"""Time between two requests for the state of a push."""
 
 State = Literal[
     "uploading",
@@ -197,7 +197,7 @@ def _checked_cells(
 ) -> Literal["all"] | list[tuple[int, int]] | None:
     """The cells as a request has them.
 
-    Raises `ValueError` for what is no list of cells.
+    Raises `ValueError` if it is not a list of cells.
     """
     if cells is None or (isinstance(cells, str) and cells == "all"):
         return cells
