@@ -254,7 +254,7 @@ def test_bad_arguments_are_refused(changes: dict[str, Any], message: str) -> Non
 )
 def test_arguments_of_a_drive_are_refused_with_a_scenario(changes: dict[str, Any]) -> None:
     names = ", ".join(sorted(changes, reverse=True))
-    with pytest.raises(ValueError, match=f"scenario has no use for {names}:"):
+    with pytest.raises(ValueError, match=f"with scenario, {names} cannot be set:"):
         DriveConfig(scenario="follow", **changes)
     DriveConfig(**changes)
     DriveConfig(scenario="follow", dt_us=50_000, horizon=10, speed=5.0)

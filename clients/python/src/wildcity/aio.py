@@ -67,7 +67,7 @@ async def connect(
 
     With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must run
     on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
-    views of that memory: at most two observations can be kept beside the one that is asked for, and while arrays of an
+    views of that memory: at most two observations can be kept in addition to the requested one, and while arrays of an
     older one exist, calls raise `SlotInUse`.
 
     Raises `ConnectFailed`, `ProtocolError` if the server speaks another protocol, or `Refused` with the code
@@ -168,8 +168,8 @@ class Client:
     ) -> dict[str, Observation | Refused]:
         """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
 
-        Returns by name the observation of each, or the `Refused` of one whose step was refused, which stops no other.
-        Raises `Refused` if the list itself is refused; then no session was stepped.
+        Returns, by session name, the observation or the `Refused` of that session's step. A refused step does not stop
+        the others. Raises `Refused` if the list itself is refused; then no session was stepped.
         """
         return await self._run(self._protocol.step_many(steps))
 
@@ -261,7 +261,7 @@ class Session:
     def opened(self) -> Opened:
         """All settings of the session: cameras, start, hashes."""
         if self._opened is None:
-            raise WildCityError("the server did not tell the settings of the resumed session")
+            raise WildCityError("the server did not send the settings of the resumed session")
         return self._opened
 
     async def step(
@@ -299,7 +299,7 @@ class Session:
     ) -> Observation:
         """Starts a new episode at `start`, or at the session's start if it is None.
 
-        `dynamics`, and `speed` (m/s) in place of theirs, hold for this episode alone.
+        `dynamics`, and `speed` (m/s) in place of their speed, apply to this episode only.
         """
         return await self._client._run(self._protocol.reset(seed, start, dynamics, speed, on=self.name))
 

@@ -75,7 +75,7 @@ def cameras(model: Model, task: str = "trajectory") -> tuple[str, ...]:
 def session_options(
     model: Model = "1.5", task: str = "trajectory", *, size: tuple[int, int] | None = None
 ) -> dict[str, Any]:
-    """Arguments of `Client.open` with which every observation, the first one too, has what the model reads.
+    """Arguments of `Client.open` with which every observation, including the first, has the inputs of the model.
 
     The rig is a preset of the real car's cameras. `size` is the (width, height) to render, in pixels, 1920x1080 if
     None. The models shrink images to about 576x320, and a small image is rendered several times faster.
@@ -91,7 +91,7 @@ def session_options(
 
 
 def inputs(seen: Observation, model: Model = "1.5", task: str = "trajectory") -> dict[str, Any]:
-    """What a model reads, as fresh C-contiguous arrays.
+    """The inputs of a model, as new C-contiguous arrays.
 
     `image_frames` uint8 (N, 4, 3, H, W), by camera index, oldest first; `camera_indices` int64 (N);
     `ego_history_xyz` float32 (1, 1, 16, 3) and `ego_history_rot` float32 (1, 1, 16, 3, 3), metres in the rig frame
@@ -113,7 +113,7 @@ def inputs(seen: Observation, model: Model = "1.5", task: str = "trajectory") ->
             f"the ego history has {driven} driven poses at t0 = {t0_us} us, the model reads {HISTORY_POSES}: "
             "open the session with warm_up_us=1_500_000 or more, or drive that long first"
         )
-    # [4, H, W, 3] to [4, 3, H, W], copied, because models and DLPack want writable memory without strides.
+    # [4, H, W, 3] to [4, 3, H, W], copied, because models and DLPack need writable memory without strides.
     frames = [np.ascontiguousarray(seen.frames(name).transpose(0, 3, 1, 2)) for name in names]
     absolute = np.array([[i.shutter_end_us for i in infos[name]] for name in names], np.int64)
     earliest = int(absolute.min())
@@ -132,7 +132,7 @@ def inputs(seen: Observation, model: Model = "1.5", task: str = "trajectory") ->
 
 
 def as_torch(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The same with every array as a `torch.Tensor` of the same memory (DLPack), on the CPU."""
+    """The inputs with every array as a `torch.Tensor` in the same memory (DLPack), on the CPU."""
     torch = importlib.import_module("torch")
     return {
         key: torch.from_dlpack(value) if isinstance(value, np.ndarray) else value
@@ -141,7 +141,7 @@ def as_torch(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def trajectory(pred_xyz: Any, pred_rot: Any, sample: int = 0) -> Trajectory:
-    """A model's answer as what `Session.step` takes: 64 poses in the rig frame at t0, 0.1 to 6.4 s later.
+    """A model's answer as a trajectory for `Session.step`: 64 poses in the rig frame at t0, 0.1 to 6.4 s later.
 
     `pred_xyz` is (1, 1, S, 64, 3) in metres, `pred_rot` is (1, 1, S, 64, 3, 3); arrays or tensors on any device.
     Raises `ValueError` if a shape differs, a number is not finite, or a rotation is not one within 1e-3.

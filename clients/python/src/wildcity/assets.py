@@ -1,4 +1,4 @@
-"""Assets of actors over HTTP: what other vehicles and pedestrians are drawn from."""
+"""Assets of actors over HTTP, from which other vehicles and pedestrians are drawn."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ActorBox:
 
 @dataclass(frozen=True)
 class ActorProvenance:
-    """What an asset was made from: the BLAKE3 of the files, the program that made it, and the options."""
+    """The origin of an asset: the BLAKE3 of the files, the program that made it, and the options."""
 
     source: str
     builder: str
@@ -47,7 +47,7 @@ class ActorLevel:
 
 @dataclass(frozen=True)
 class ActorAsset:
-    """An asset of an actor. Scenarios name it by its hash, or by its name if no other asset has that.
+    """An asset of an actor. Scenarios name it by its hash, or by its name if no other asset has this name.
 
     provenance: None for a token that is limited to some twins, since it may name others.
     """
@@ -69,8 +69,8 @@ class ActorAsset:
 class DamagedActor:
     """An asset that differs from what was stored or cannot be read, or a folder of assets that cannot be listed.
 
-    hash: of a folder, the two digits that the hashes of its assets begin with.
-    name: the name that it states, if that can be read.
+    hash: for a folder, the two digits that the hashes of its assets begin with.
+    name: the name in its file, if that can be read.
     """
 
     hash: str
@@ -104,7 +104,7 @@ def push_actor(
     with the same options gives the same hash.
 
     files: one or more files of Gaussians, or a glTF mesh with the files that it names.
-    name: name of the asset. It must not be that of an asset of another content.
+    name: name of the asset. It must not be the name of an asset with other content.
     kind: what it is.
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`. It needs the role `push`, and
@@ -116,7 +116,7 @@ def push_actor(
     progress: is called with every change of the progress of the upload, and with the state "ready" at the end.
     timeout: how long the answer to one part of an upload may take, in seconds.
 
-    An interrupted upload continues where it stopped, and an asset that is there already is not made again.
+    An interrupted upload continues where it stopped, and an asset that exists already is not made again.
 
     Raises `Refused` if the files or the request are refused, and `ConnectFailed` if the server does not answer.
     """
@@ -152,9 +152,9 @@ def actors(
 def actor(
     name: str, *, server: str = "http://127.0.0.1:8080", token: str | None = None, timeout: float = 60.0
 ) -> ActorAsset:
-    """The asset of a name, of a hash, or of a hash that begins with at least 4 digits.
+    """The asset with a name, with a hash, or with a hash that begins with the given digits (at least 4).
 
-    Raises `Refused` if there is none or more than one, and `ConnectFailed` if the server does not answer.
+    Raises `Refused` if there is no such asset or more than one, and `ConnectFailed` if the server does not answer.
     """
     path = f"/v1/actors/{urllib.parse.quote(name, safe='')}"
     return _actor(HttpClient(server, token, timeout).json("GET", path, None), "actor")

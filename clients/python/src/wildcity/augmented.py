@@ -28,12 +28,12 @@ Item = dict[str, npt.NDArray[Any]]
 
 
 class AugmentedError(WildCityError):
-    """A folder is not of `wildcity augment`, is not complete, or a file of it differs from its hash."""
+    """A folder was not made by `wildcity augment`, is not complete, or has a file that differs from its hash."""
 
 
 @dataclass(frozen=True)
 class AugmentedSample:
-    """What is known of one view beside its pixels. Distances are in metres."""
+    """Properties of one view except its pixels. Distances are in metres."""
 
     folder: Path
     """Folder of its round."""
@@ -57,7 +57,7 @@ class AugmentedSample:
     """SHA-256 by path below `folder`."""
     K: npt.NDArray[np.float64]
     distortion: npt.NDArray[np.float64]
-    """k1, k2, p1, p2 or, of a fisheye, k1 to k4; empty for a pinhole."""
+    """k1, k2, p1, p2 or, for a fisheye, k1 to k4; empty for a pinhole."""
     world_from_camera: npt.NDArray[np.float64]
 
 
@@ -65,7 +65,7 @@ class AugmentedViews:
     """The views of some rounds.
 
     An item has `image` uint8 [h, w, 3], `mask` bool [h, w] (which pixels count), `depth` float32 [h, w] (metres, 0 for
-    none: z, of a fisheye the distance), `K` float64 [3, 3] (pixels, centres at 0.5), `world_from_camera` and
+    none: z, or the distance for a fisheye), `K` float64 [3, 3] (pixels, centres at 0.5), `world_from_camera` and
     `camera_from_world` float64 [4, 4] (the twin's axes; camera x right, y down, z forward), `weight` and `trust`
     float32; with lenses also `distortion`. Images of cameras of different sizes do not fit into one batch: choose `cameras`, or
     take a batch size of 1.

@@ -82,7 +82,7 @@ def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
 def sky(source: str | PathLike[str]) -> _Arrays:
     """The sky network of a checkpoint as float32, with the names that `wildcity import --sky` reads.
 
-    Empty if there is none.
+    Empty if there is no sky.
     """
     for arrays in _mappings(load(source)):
         prefixes = {key.removesuffix(_SKY_TENSORS[0]) for key in arrays if key.endswith(_SKY_TENSORS[0])}

@@ -80,7 +80,7 @@ class Attention(nn.Module):
         super().__init__()
         self.heads = heads
         self.upcast = upcast
-        # Of self-attention, which has as many scores as pairs of places; set by `Difix.fuse_attention`.
+        # For self-attention, which has a score for each pair of places; set by `Difix.fuse_attention`.
         self.fused = False
         self.to_q = nn.Linear(width, width, bias=has_bias)
         self.to_k = nn.Linear(context, width, bias=has_bias)

@@ -1,8 +1,8 @@
-"""What the JSON files of a Difix folder say, checked: the sizes of the two networks, and the one step of the scheduler.
+"""Reads and checks the JSON files of a Difix folder: the sizes of the two networks, and the one step of the scheduler.
 
 Needs no PyTorch. Difix (Wu et al., "Difix3D+: Improving 3D Reconstructions with Single-Step Diffusion Models", CVPR 2025;
 code: nv-tlabs/Difix3D) is SD-Turbo with skip connections in its autoencoder. Its folder has the layout of diffusers:
-`vae/config.json`, `unet/config.json`, `scheduler/scheduler_config.json`, and the weights beside them.
+`vae/config.json`, `unet/config.json`, `scheduler/scheduler_config.json`, and the weights next to them.
 """
 
 from __future__ import annotations

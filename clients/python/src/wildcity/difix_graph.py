@@ -4,11 +4,11 @@ One run repairs an image, with a second view of the same place as reference:
 
 1. Both views are encoded. A latent is the mean that the encoder predicts (the first 4 of 8 channels), times 0.18215.
    NVIDIA draws a random sample around that mean; a repaired image that differs from run to run has no hash.
-2. The denoiser sees both views. Self-attention goes over the tokens of both together, cross-attention of each view to the
-   prompt by itself (src/mv_unet.py of nv-tlabs/Difix3D).
+2. The denoiser gets both views. Self-attention is over the tokens of both views together, cross-attention to the prompt
+   is separate for each view (src/mv_unet.py of nv-tlabs/Difix3D).
 3. One step of the scheduler gives clean latents (`difix_config.Step`).
-4. The latent of the image alone is decoded. Before each level of the decoder a 1x1 convolution of the encoder's activations
-   of the same size is added (src/model.py of nv-tlabs/Difix3D, after pix2pix-turbo, Parmar et al. 2024).
+4. Only the latent of the image is decoded. Before each level of the decoder a 1x1 convolution of the encoder's
+   activations of the same size is added (src/model.py of nv-tlabs/Difix3D, after pix2pix-turbo, Parmar et al. 2024).
 
 The two networks are SD-Turbo's: Rombach et al. 2022, version 2.1.
 """
@@ -68,7 +68,7 @@ class Difix(nn.Module):
                 module.attn1.fused = True
 
     def _check(self, image: Tensor, reference: Tensor | None) -> None:
-        """What a graph cannot say: sizes, and whether there is a reference."""
+        """Checks what a graph cannot express: sizes, and whether there is a reference."""
         if (reference is not None) != self.with_reference:
             raise ExportError("reference", "needed" if self.with_reference else "given, but this model has none")
         if torch.jit.is_tracing():

@@ -1,6 +1,6 @@
 """Reads the tensors of a Difix folder into the network, and computes the embedding of the prompt.
 
-nvidia/difix and nvidia/difix_ref keep the decoder's adapters (LoRA, Hu et al. 2021) beside the weights that they change:
+nvidia/difix and nvidia/difix_ref keep the decoder's adapters (LoRA, Hu et al. 2021) next to the weights they change:
 `decoder.conv_in.base_layer.weight`, `decoder.conv_in.lora_A.vae_skip.weight`, `decoder.conv_in.lora_B.vae_skip.weight`. The graph
 has their sum.
 """
@@ -25,7 +25,7 @@ __all__ = ["folder", "load", "merge_adapters", "prompt_embedding"]
 
 LORA_ALPHA = 8
 """The sum is base + alpha / rank * B A. src/model.py of nv-tlabs/Difix3D gives a rank (4) and no alpha: the default of peft's
-LoraConfig counts. `lora_alpha` in vae/config.json comes before it."""
+LoraConfig applies. `lora_alpha` in vae/config.json takes precedence."""
 
 F16_MAX = 65504.0
 
@@ -47,7 +47,7 @@ def folder(weights: str | os.PathLike[str]) -> Path:
 
     try:
         return Path(snapshot_download(os.fspath(weights), allow_patterns=_HUB_FILES))
-    except Exception as error:  # Of many kinds: no network, no licence accepted, no such repository.
+    except Exception as error:  # Many types: no network, no licence accepted, no such repository.
         raise ExportError("--weights", f"{weights}: {error}") from error
 
 
@@ -76,7 +76,7 @@ def load(path: Path, with_reference: bool, dtype: torch.dtype) -> Difix:
 
 
 def prompt_embedding(path: Path) -> Tensor:
-    """What the folder's text encoder makes of the prompt: [1, tokens, context]. Raises `ExportError`.
+    """The embedding of the prompt by the folder's text encoder: [1, tokens, context]. Raises `ExportError`.
 
     As diffusers does for Stable Diffusion: padded to the longest prompt (77 tokens), the last hidden state.
     """
@@ -91,7 +91,7 @@ def prompt_embedding(path: Path) -> Tensor:
     try:
         tokenizer = CLIPTokenizer.from_pretrained(path / "tokenizer", local_files_only=True)
         encoder = CLIPTextModel.from_pretrained(path / "text_encoder", local_files_only=True, dtype=torch.float32)
-    except Exception as error:  # Of many kinds, by version of transformers.
+    except Exception as error:  # The type depends on the version of transformers.
         raise ExportError("text_encoder", f"transformers cannot read it: {error}") from error
     finally:
         if had_bar:

@@ -4,9 +4,9 @@
     python -m wildcity.export_difix --weights nvidia/difix --out difix.onnx --no-reference --dtype f32
 
 `--weights` is a folder in the layout of diffusers, as nvidia/difix_ref and nvidia/difix have it: tokenizer, text_encoder, unet,
-vae, scheduler. A name of a repository that is no folder here is downloaded from huggingface.co. The weights may be used
-non-commercially only; wildcity has none. Needs `pip install 'wildcity[difix]'` (PyTorch), no GPU, and for f16
-10 GB of memory.
+vae, scheduler. If there is no such folder, the name is that of a repository, which is downloaded from huggingface.co.
+The weights may be used non-commercially only; wildcity has none. Needs `pip install 'wildcity[difix]'` (PyTorch), no
+GPU, and for f16 10 GB of memory.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ __all__ = ["ExportError", "export", "main", "manifest"]
 OPSET = 17
 
 EXTERNAL_ABOVE_BYTES = 2_000_000_000
-"""A file of the ONNX format ends at 2 GiB. Larger weights are in a second file."""
+"""A file of the ONNX format has at most 2 GiB. Larger weights are in a second file."""
 
 LARGEST_DIFFERENCE = {"f32": 1e-3, "f16": 0.1}
-"""Between graph and modules, of values from -1 to 1. Both round, in another order."""
+"""Largest difference between graph and modules, for values from -1 to 1. Both round, in different orders."""
 
 MULTIPLE = 64
 """Sides of images, in pixels: `difix_config.image_multiple` of SD-Turbo."""
@@ -154,7 +154,7 @@ def _write_graph(model: Difix, folder: Path, name: str, external_above: int) -> 
     # The smallest image. The graph is the same for all sizes: no shape of the trace is kept.
     images = tuple(torch.zeros(1, 3, model.multiple, model.multiple, dtype=dtype) for _ in inputs)
     axes = {0: "batch", 2: "height", 3: "width"}
-    # Of more than 2 GiB, PyTorch writes a file for each tensor.
+    # PyTorch writes weights above 2 GiB as a file for each tensor.
     with tempfile.TemporaryDirectory(dir=folder) as traced, _quiet(), torch.no_grad():
         torch.onnx.export(
             model,
@@ -198,7 +198,7 @@ def _difference(model: Difix, graph: Path) -> float:
     options.log_severity_level = 3
     try:
         session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # Of many kinds, all private to onnxruntime.
+    except Exception as error:  # Many types, all private to onnxruntime.
         raise ExportError("--compare", f"onnxruntime cannot run the graph on the processor: {error}") from error
     kind = np.float16 if model.prompt.dtype == torch.float16 else np.float32
     feed = {port.name: random.uniform(-1, 1, shape).astype(kind) for port in session.get_inputs()}
@@ -221,13 +221,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m wildcity.export_difix", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--weights", required=True, help="folder of the weights, or a repository of huggingface.co")
-    parser.add_argument("--out", required=True, help="the .onnx file; the manifest is written beside it")
-    parser.add_argument("--no-reference", action="store_true", help="for nvidia/difix, which sees the image alone")
+    parser.add_argument("--out", required=True, help="the .onnx file; the manifest is written next to it")
+    parser.add_argument("--no-reference", action="store_true", help="for nvidia/difix, whose only input is the image")
     parser.add_argument("--dtype", choices=["f16", "f32"], default="f16", help="[default: f16]")
     parser.add_argument(
         "--attention", choices=["plain", "fused"], default="plain", help="fused: an operator of onnxruntime [default: plain]"
     )
-    parser.add_argument("--compare", action="store_true", help="run the graph on the processor, beside PyTorch")
+    parser.add_argument("--compare", action="store_true", help="compare the graph on the processor with PyTorch")
     parser.add_argument("--name", help="what sessions ask for [default: difix-ref, or difix]")
     parser.add_argument("--providers", default="cuda", help="of the manifest, with commas [default: cuda]")
     chosen = parser.parse_args(arguments)

@@ -33,7 +33,7 @@ __all__ = ["NETS", "ExportError", "export", "main", "manifest"]
 Arrays = dict[str, npt.NDArray[Any]]
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of the colours, for images in [-1, 1]: `ScalingLayer` in lpips/lpips.py."""
+"""Shift and scale of the colours, for images in [-1, 1]: `ScalingLayer` in lpips/lpips.py."""
 
 EPSILON = 1e-10
 """Added to the length of a feature vector before the division: `normalize_tensor` in lpips 0.1.4."""
@@ -43,7 +43,7 @@ LICENCE = "BSD-2-Clause (lpips); BSD-3-Clause (torchvision)"
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution with the ReLU behind it. index: of torchvision's `features`."""
+    """A convolution with the ReLU after it. index: its index in torchvision's `features`."""
 
     index: int
     inputs: int
@@ -348,7 +348,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m wildcity.export_lpips", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--net", required=True, choices=list(NETS), help="the network; numbers of two cannot be compared")
-    parser.add_argument("--out", required=True, help="the .onnx file; the manifest is written beside it")
+    parser.add_argument("--out", required=True, help="the .onnx file; the manifest is written next to it")
     parser.add_argument("--weights", nargs="+", default=[], help="files of weights [default: the installed package lpips]")
     parser.add_argument("--providers", default="cpu", help="of the manifest, with commas [default: cpu]")
     chosen = parser.parse_args(arguments)

@@ -15,9 +15,9 @@ from .errors import ConnectFailed, ProtocolError, Refused
 from .protocol import to_json
 
 ATTEMPTS = 6
-"""How many attempts in a row may fail without transferring a byte."""
+"""Largest number of attempts in a row that fail without transferring a byte."""
 RETRY_DELAY_S = 0.2
-"""Delay before the first repetition of a failed attempt; it doubles with each further one."""
+"""Delay before the first repetition of a failed attempt; it doubles with each further repetition."""
 
 
 class HttpClient:
@@ -56,7 +56,7 @@ class HttpClient:
         connection = self._connection_type(self._host, self._port, timeout=self._timeout)
         try:
             connection.connect()
-            # A server that refuses may close before it has read the whole body. Its answer says why.
+            # A server that refuses may close before it has read the whole body. Its answer has the reason.
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 connection.request(method, path, content, sent)
             response = connection.getresponse()

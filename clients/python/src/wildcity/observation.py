@@ -33,7 +33,8 @@ DTYPES: dict[str, np.dtype[Any]] = {
 
 
 class Observation:
-    """What the ego sees at one time. Arrays are read-only views of the frame; JPEG and PNG are decoded on demand.
+    """Images and state of the ego at one time. Arrays are read-only views of the frame; JPEG and PNG are decoded on
+    demand.
 
     `images["front"]` is uint8 [height, width, 3]. `depth` (metres) and `opacity` are float32 [height, width],
     if the session asked for them. Depth is camera z, or distance for the lenses that can see 90° and more:
@@ -75,7 +76,7 @@ class Observation:
     @property
     def imu(self) -> NDArray[np.float32]:
         """float32 [n, 6]: specific force (m/s²) and angular velocity (rad/s) in the rig's axes, for each step since
-        the observation before; the last is at `metadata.time_us`. Raises `KeyError` unless the session asked for it."""
+        the previous observation; the last at `metadata.time_us`. Raises `KeyError` unless the session asked for it."""
         return self._sensor("sensor.imu", "imu=Imu()")
 
     @property
@@ -111,14 +112,14 @@ class Observation:
 
     @property
     def instances(self) -> Mapping[str, NDArray[np.uint16]]:
-        """Whose Gaussian each pixel shows, by camera: 0 none, 1 the twin, else `Actor.instance` of an actor."""
+        """The owner of the Gaussian that each pixel shows, by camera: 0 none, 1 the twin, else `Actor.instance`."""
         return self.views[0].instances
 
     def frames(self, camera: str) -> NDArray[np.uint8]:
         """uint8 [k, height, width, 3]: the last k frames of a camera, oldest first.
 
         There are `Outputs.frames` of them, or fewer at the start of an episode. `frame_infos` has their times.
-        Raises `KeyError` if there are none.
+        Raises `KeyError` if there are no frames.
         """
         frames = [_decode_image(self._content, image) for image in self.frame_infos(camera)]
         if not frames:
@@ -132,7 +133,7 @@ class Observation:
         return tuple(sorted(infos, key=lambda image: -image.back))
 
     def tensor(self, name: str) -> NDArray[Any]:
-        """A tensor of the frame by name, without a copy. Raises `KeyError` if there is none."""
+        """A tensor of the frame by name, without a copy. Raises `KeyError` if there is no such tensor."""
         return self._content.tensor(name)
 
     def encoded(self, image: ImageInfo) -> memoryview:
@@ -253,7 +254,7 @@ class View:
 
 
 class _LazyArrays(Mapping[str, NDArray[Any]]):
-    """Arrays by camera, made at the first access. `have` says what there is, for the error of a camera without one."""
+    """Arrays by camera, made at the first access. `have` says which arrays exist, for errors."""
 
     def __init__(
         self, infos: Mapping[str, ImageInfo], make: Callable[[ImageInfo], NDArray[Any]], have: str
@@ -356,7 +357,7 @@ def _read_table(header: dict[str, Any], data_start: int, frame_bytes: int) -> di
     end = 0
     for (start, stop), name, info in sorted(rows, key=lambda row: row[0]):
         if start != end:
-            raise BadFrame(f"tensor {name!r} has offset {start}, the one before it ends at {end}")
+            raise BadFrame(f"tensor {name!r} has offset {start}, the previous one ends at {end}")
         tensor = _Tensor(_dtype(name, info), _shape(name, info), data_start + start)
         wanted = math.prod(tensor.shape) * tensor.dtype.itemsize
         if stop - start != wanted:
@@ -392,5 +393,5 @@ def _dtype(name: str, info: dict[str, Any]) -> np.dtype[Any]:
 
 
 def _are_counts(values: Any) -> TypeGuard[list[int]]:
-    """Whether a list of integers that are not negative. True and False are not integers here."""
+    """Whether a value is a list of integers that are not negative. True and False are not integers here."""
     return isinstance(values, list) and all(type(v) is int and v >= 0 for v in values)

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 DESCRIPTION_BYTES = 64 << 20
-"""Most bytes of a description: the limit of the server."""
+"""Largest size of a description, in bytes: the limit of the server."""
 
 METAS = ("lod-meta.json", "meta.json")
-"""Files that describe a SOG; the first is that of a streamed one."""
+"""Files that describe a SOG; the first describes a streamed SOG."""
 
 
 @contextlib.contextmanager
@@ -51,7 +51,7 @@ def packed(path: Path, is_only: bool) -> Iterator[Path]:
 def _named_files(folder: Path, meta: str) -> set[str]:
     """The description and the files that it names, and those that these name, relative to the folder.
 
-    What is named and does not exist is left out: a server needs the finest blocks alone, and says what it misses.
+    Named files that do not exist are left out: a server needs only the finest blocks, and reports which it misses.
     """
     names = {meta}
     unread = [meta]

@@ -104,7 +104,7 @@ class Station:
 
 @dataclass(frozen=True)
 class RandomStart:
-    """A start along a recorded drive that is drawn anew for each episode with its seed; every draw is uniform.
+    """A random start along a recorded drive, sampled uniformly for each episode from its seed.
 
     `trajectory` is the first one if None, `from_m` and `to_m` its ends (or where a warm-up ends). `lateral_m` is
     the largest distance to the left or right of the drive, `heading_rad` the largest angle to it.
@@ -220,8 +220,8 @@ class Camera:
     """A camera on the vehicle: a pinhole unless it has a lens. Sizes and intrinsics are in pixels.
 
     `camera_to_rig` transforms camera coordinates (x right, y down, z forward) to the rig frame. The polynomial of
-    an f-theta lens determines its focal lengths: leave fx and fy None there. `overlay` is the part of the own
-    car that the camera sees: `png_data_uri(bytes)` of a PNG with alpha, of the image's size. Answers omit it.
+    an f-theta lens determines its focal lengths: leave fx and fy None there. `overlay` is the part of the ego
+    vehicle that the camera sees: `png_data_uri(bytes)` of a PNG with alpha, of the image's size. Answers omit it.
     `native_size` is the width and height of what the image shows, in pixels of the camera's native size: an image below
     its native size is the native image shrunk. None if the image has native size.
     """
@@ -264,8 +264,8 @@ class Outputs:
 
     `images` has crops and sizes that differ from the rig's, by camera name. `frames` is how many of the newest
     frames of each camera an observation has, 1 if None. `period_us` is the time between two frames of a camera, by
-    name, for cameras that do not take one with every step. `trust` adds a confidence to each image. `actors` tells
-    where the actors of the scenario are. `instances` adds whose Gaussian each pixel shows.
+    name, for cameras that do not take one with every step. `trust` adds a confidence to each image. `actors` adds
+    the poses of the scenario's actors. `instances` adds the owner of the Gaussian that each pixel shows.
     """
 
     cameras: tuple[str, ...] | None = None
@@ -286,9 +286,10 @@ class Outputs:
 class Repair:
     """Which images a model of the server repairs. Fields that are None have the server's default.
 
-    A camera is repaired from trust below `below` on, until its trust is above `above`; never under `at_least`. At
-    most `per_step` images of one pose are, those with the least trust. If the model fails, the image is delivered
-    as rendered with the status `failed`, or with `on_failure="error"` the request is refused as `repair_failed`.
+    Repair of a camera begins when its trust falls below `below`, and ends when it rises above `above`. Images with a
+    trust below `at_least` are not repaired. At most `per_step` images of one pose are repaired: those with the lowest
+    trust. If the model fails, the image is delivered as rendered with the status `failed`, or with `on_failure="error"`
+    the request is refused as `repair_failed`.
     """
 
     model: str
@@ -317,7 +318,7 @@ class FrozenFrames:
 
 @dataclass(frozen=True)
 class ImageNoise:
-    """Shot and read noise in linear light: `full_well` electrons at white, and the deviation `read` in electrons."""
+    """Shot and read noise in linear light: `full_well` electrons at white, standard deviation `read` in electrons."""
 
     full_well: float
     read: float
@@ -325,7 +326,7 @@ class ImageNoise:
 
 @dataclass(frozen=True)
 class ExposureDrift:
-    """An exposure that wanders with the deviation `stops`; a new value is drawn every `period_us`."""
+    """An exposure that drifts with the standard deviation `stops`; a new value is sampled every `period_us`."""
 
     stops: float
     period_us: int
@@ -333,7 +334,7 @@ class ExposureDrift:
 
 @dataclass(frozen=True)
 class LensDirt:
-    """Dark, round spots on the lens. `radius` is a fraction of the width, `opacity` of the light that is taken."""
+    """Dark, round spots on the lens. `radius` is a fraction of the width, `opacity` of the light that is absorbed."""
 
     spots: int
     radius: float
@@ -371,7 +372,7 @@ class Imu:
 
 @dataclass(frozen=True)
 class WheelSpeed:
-    """The measured speed of the wheels: `noise` in m/s, and the deviation `scale` of its scale."""
+    """The speed that the wheels measure: `noise` in m/s, and `scale`, the standard deviation of its scale error."""
 
     noise: float = 0.0
     scale: float = 0.0
@@ -379,7 +380,7 @@ class WheelSpeed:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Effects of the sensors, drawn with the episode's seed, and the delay after which a decision takes effect.
+    """Sensor effects, sampled from the episode's seed, and the delay after which a decision takes effect.
 
     `cameras` has effects by the camera's name. With `imu` and `wheel_speed` observations have `Observation.imu` and
     `Observation.wheel_speed`.
@@ -448,7 +449,7 @@ class Welcome:
 
 @dataclass(frozen=True)
 class OpenedRepair:
-    """The repair of a session's images. `repair_hash` is BLAKE3 of what decides the bytes beside the image.
+    """The repair of a session's images. `repair_hash` is BLAKE3 of all that determines the bytes, except the image.
 
     `references`: whether a model that compares with images of the drive gets recorded or rendered ones.
     """
@@ -468,7 +469,7 @@ class OpenedRepair:
 
 @dataclass(frozen=True)
 class OpenedScenario:
-    """The scenario of a session. `hash` is what its first episode is: the scenario with seed, values and hashes."""
+    """The scenario of a session. `hash` identifies its first episode: the scenario with seed, values and hashes."""
 
     name: str
     hash: str
@@ -629,11 +630,11 @@ class Trust:
 
 @dataclass(frozen=True)
 class ImageRepair:
-    """What became of an image in a session that asked for repair.
+    """Whether an image was repaired, in a session that asked for repair.
 
     `kept`: not selected. `repaired`: by the model. `failed`: the model failed, because of `failure`. `rendered_hash`
     is BLAKE3 of the pixels before the repair, which is the image's `hash` unless it was repaired. `references` names
-    the recorded images that the model saw beside it, at most 8.
+    the recorded images that were inputs of the model, at most 8.
     """
 
     status: Literal["kept", "repaired", "failed"]
@@ -644,7 +645,7 @@ class ImageRepair:
 
 @dataclass(frozen=True)
 class ImageSensor:
-    """What a camera with effects did to an image.
+    """The effects of a camera's sensor on an image.
 
     `due_us` is when the frame was due, and `taken_us` when its picture was taken. `clean_hash` is BLAKE3 of the pixels
     before noise, exposure and dirt; None if the camera has none of them.
@@ -663,8 +664,8 @@ class ImageInfo:
     """Metadata of one image: its camera, the index of the request's pose, size, intrinsics, times, hash.
 
     `tensor` is the name of its colour tensor, and `hash` is BLAKE3 of its pixels before encoding. `back` counts the
-    frames of this camera back from the newest, which is 0. `seen` is the fraction of the image that the lens sees,
-    if that is not all of it; the rest is 0.
+    frames of this camera back from the newest, which is 0. `seen` is the fraction of the image inside the valid
+    field of the lens, if that is not the whole image; pixels outside are 0.
     """
 
     camera: str
@@ -722,7 +723,7 @@ class Residency:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in a scenario since the observation before."""
+    """Something that happened in a scenario since the previous observation."""
 
     time_us: int
     kind: Literal["contact", "trigger", "appeared", "left", "end"]
@@ -762,7 +763,7 @@ class Actor:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Everything that an observation holds beside its tensors."""
+    """Everything in an observation except its tensors."""
 
     seq: int
     step: int
@@ -798,7 +799,7 @@ class SessionRefusal:
 
 @dataclass(frozen=True)
 class SessionAnswer:
-    """What one step of `step_many` gave: the tensor that is its observation, or an error."""
+    """The result of one step of `step_many`: the tensor that is its observation, or an error."""
 
     session: str
     tensor: str | None = None
@@ -807,7 +808,7 @@ class SessionAnswer:
 
 @dataclass(frozen=True)
 class ManyMetadata:
-    """What the answer to `step_many` has beside the observations."""
+    """Everything in the answer to `step_many` except the observations."""
 
     seq: int
     answers: tuple[SessionAnswer, ...]
@@ -820,7 +821,7 @@ class SharedMemoryOffer:
     seq: int
     path: str
     target: str
-    """Target of the symbolic link `path`. If it has another one, the path is of another machine or container."""
+    """Target of the symbolic link `path`. With another target, the path belongs to another machine or container."""
     proof_bytes: int
     slots: int
     slot_bytes: int
@@ -858,7 +859,7 @@ def parse_json(text: str | bytes, what: str) -> Any:
 
 
 def to_json(value: Any) -> str:
-    """The JSON of a request. Raises `ValueError` with the field if a number is NaN or infinite: JSON has none."""
+    """The JSON of a request. Raises `ValueError` with the field if a number is NaN or infinite: JSON has neither."""
     try:
         return json.dumps(value, allow_nan=False)
     except ValueError as error:
@@ -958,7 +959,7 @@ def _decode_dataclass(kind: Any, value: Any, path: str) -> Any:
 
 @functools.cache
 def _fields(kind: type[Any]) -> tuple[tuple[str, Any, bool], ...]:
-    """Name and type of each field, and whether it has no default. Python evaluates the types anew each time it is asked."""
+    """Name and type of each field, and whether it has no default. Cached: Python evaluates the types at each call."""
     hints = typing.get_type_hints(kind)
     fields = dataclasses.fields(kind)
     return tuple((field.name, hints[field.name], field.default is dataclasses.MISSING) for field in fields)

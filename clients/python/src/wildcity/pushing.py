@@ -22,7 +22,7 @@ from .protocol import Drive, decode
 CHUNK_BYTES = 1 << 20
 """Bytes of a file that are read at a time."""
 POLL_INTERVAL_S = 0.1
-"""How often the client asks for the state of a push."""
+"""Time between two requests for the state of a push."""
 
 State = Literal[
     "uploading",
@@ -79,20 +79,20 @@ def push(
 ) -> Push:
     """Uploads scene files, makes them the next version of a twin, and returns when that version is ready.
 
-    files: one or more files, which are merged into one scene; or a folder with a SOG, or its `meta.json` or
-        `lod-meta.json` alone.
+    files: one or more files, which are merged into one scene; or a folder with a SOG, or only its `meta.json` or
+        `lod-meta.json`.
     twin: name of the twin; it is created if it does not exist.
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
     axes, scale: axis convention and metres per unit of the files, as in `wildcity import`.
     frame: "twin", which is the default, or "capture": the axes and the unit with which the capture was imported, before
-        `wildcity twin align`. `report["frame"]` is the one that was taken; `report["aligned"]` says whether they differ.
+        `wildcity twin align`. `report["frame"]` is the frame that was used; `report["aligned"]` is true if they differ.
     cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.
     base: the version that the scene was trained from; cells that changed since then are not overwritten.
     record, levels, profile, note: storage format, levels of detail, changes of the render profile as
         `["near=0.2"]`, and a description for people, of up to 1,000 characters.
-    min_psnr_db: refuse the push if a view along the twin's drives has a lower PSNR than this, in dB, or if none shows
-        anything.
+    min_psnr_db: refuse the push if a view along the twin's drives has a lower PSNR than this, in dB, or if no view
+        shows anything.
     push_id: id of the push; sending the same id again does not make a second version.
     progress: is called with every change of the progress.
     timeout: how long one HTTP answer may take, in seconds.
@@ -136,7 +136,7 @@ def push(
         try:
             answer = http_client.json_with_retries("GET", f"{path}/{answer['id']}", None)
         except Refused as refused:
-            # The server was restarted and does not know the push any more. The uploads are still there.
+            # The server was restarted and has lost the push, but not the uploads.
             if refused.code != "unknown_push" or repetitions >= ATTEMPTS:
                 raise
             repetitions += 1
@@ -205,7 +205,7 @@ def _checked_cells(
 ) -> Literal["all"] | list[tuple[int, int]] | None:
     """The cells as a request has them.
 
-    Raises `ValueError` for what is no list of cells.
+    Raises `ValueError` if it is not a list of cells.
     """
     if cells is None or (isinstance(cells, str) and cells == "all"):
         return cells
@@ -222,8 +222,8 @@ def upload_all(
     scale: float,
     report: Callable[[PushProgress], None],
 ) -> list[dict[str, Any]]:
-    """Uploads files, and returns them as a request has them. A file in a folder beside the first one is named with
-    that folder, as the first one names it. A folder with a SOG is one archive."""
+    """Uploads files, and returns them in the form that a request needs. A file in a subfolder next to the first file is
+    named with this subfolder, as in the first file. A folder with a SOG is one archive."""
     files: list[dict[str, Any]] = []
     for path in map(Path, paths):
         with packed(path, is_only=len(paths) == 1) as sent:

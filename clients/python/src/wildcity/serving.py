@@ -1,4 +1,4 @@
-"""Starts the server program for the time of a `with` block."""
+"""Starts the server program for the duration of a `with` block."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .errors import WildCityError
 __all__ = ["LocalServer", "ServeFailed", "binary", "serve"]
 
 LOG_LINES = 20
-"""How many of the last lines of the server's log an error repeats."""
+"""Number of the last lines of the server's log that an error contains."""
 
 
 class ServeFailed(WildCityError):
@@ -44,7 +44,7 @@ class LocalServer:
 def binary() -> Path:
     """The server program: `$WILDCITY_BIN`, the one of this Python environment, or the first on the path.
 
-    Raises `ServeFailed` if there is none.
+    Raises `ServeFailed` if it is not found.
     """
     named = os.environ.get("WILDCITY_BIN")
     if named:
@@ -112,13 +112,13 @@ def _start(command: list[str], log: int) -> subprocess.Popen[str]:
 
 
 def _listening_url(process: subprocess.Popen[str], log_path: Path, timeout: float) -> str:
-    """Waits for the line that says that agents can connect."""
+    """Waits for the line `listening on ...`: agents can then connect."""
     lines: queue.Queue[str] = queue.Queue()
     stdout = process.stdout
     assert stdout is not None
 
     def read() -> None:
-        # To the end, so that the server never blocks on a full pipe.
+        # Read to the end, so that the server never blocks on a full pipe.
         for line in stdout:
             lines.put(line)
 

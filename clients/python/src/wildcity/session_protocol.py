@@ -89,7 +89,7 @@ class SessionProtocol:
         return offer
 
     def use_memory(self, memory: SharedMemory) -> Exchange[None]:
-        """Proves that the memory was opened: the observations come in it from then on."""
+        """Proves that the memory was opened: observations are then delivered in it."""
         yield from self._ask("share_memory", self.first_seq, Ok, {"proof": memory.proof})
         self._begin(self.first_seq + 1)
         self.memory = memory
@@ -218,7 +218,7 @@ class SessionProtocol:
         return closed.summary
 
     def resume(self, session: str, last_seq: int, also: Sequence[str] = ()) -> Exchange[Resumed]:
-        """Continues sessions on a new connection, of which this is the first request after those that begin it."""
+        """Resumes sessions on a new connection. Must be the first request after `hello` (and `share_memory`)."""
         fields: dict[str, Any] = {"session": session, "last_seq": last_seq}
         if also:
             fields["also"] = list(also)
@@ -316,7 +316,7 @@ CONNECT_OPTIONS: dict[str, Any] = {
 
 
 def connect_failed(url: str, error: Exception) -> ConnectFailed:
-    """Why there is no connection; and what an address looks like, if this one does not look so."""
+    """The reason why there is no connection, with the form of an address if this one has another form."""
     is_session = url.startswith(("ws://", "wss://")) and url.endswith("/v1/session")
     hint = "" if is_session else "; the address of a server is ws://HOST:PORT/v1/session"
     reason = refusal_of(error) if isinstance(error, InvalidStatus) else None

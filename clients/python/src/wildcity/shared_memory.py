@@ -45,8 +45,8 @@ class SharedMemory:
             gc.collect()
         if slot.is_in_use():
             raise SlotInUse(
-                f"the next observation takes the memory of the one {len(self._slots)} before it, of which arrays still "
-                "exist: copy what is to be kept, or connect without copy=False"
+                f"the next observation overwrites the one of {len(self._slots)} observations ago, of which arrays "
+                "still exist: copy what is to be kept, or connect without copy=False"
             )
 
     def read(self, place: InMemory) -> bytes | memoryview:
@@ -68,7 +68,7 @@ class SharedMemory:
 
 
 class _Slot:
-    """A slot that is mapped, and what is still in use of it."""
+    """A slot of the memory: its mapping, and its latest observation."""
 
     def __init__(self) -> None:
         self._mapped: NDArray[Any] | None = None
@@ -94,7 +94,7 @@ class _Slot:
 def _open(offer: SharedMemoryOffer) -> tuple[int, str]:
     """The descriptor of the memory, and the text at its beginning."""
     try:
-        # The server of another machine or container may name what is another file here: it is not opened.
+        # A path of another machine or container may be another file on this one: it is not opened.
         found = os.readlink(offer.path)
         if found != offer.target:
             raise OSError(f"it is {found}, not {offer.target}")

@@ -69,7 +69,7 @@ def connect(
 
     With `shared_memory`, observations come in memory that the server shares, in place of the socket. The server must run
     on this machine, in the same container and as the same user. With `copy=False` the arrays of an observation are
-    views of that memory: at most two observations can be kept beside the one that is asked for, and while arrays of an
+    views of that memory: at most two observations can be kept in addition to the requested one, and while arrays of an
     older one exist, calls raise `SlotInUse`.
 
     Raises `ConnectFailed`, `ProtocolError` if the server speaks another protocol, or `Refused` with the code
@@ -119,8 +119,8 @@ class Client:
 
         A connection can have 64 sessions; while one is open, the next needs a name, `session`.
 
-        `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
-        `repair` is the name of a model of the server's that repairs images, or a `Repair`. `sensors` has effects of
+        `scenario` is the name of a scenario of the server, `{"name": .., "values": {..}}`, or the scenario itself.
+        `repair` is the name of a model of the server that repairs images, or a `Repair`. `sensors` has effects of
         cameras and other sensors: lost frames, noise and the like.
 
         Raises `Refused` if the server refuses.
@@ -171,8 +171,8 @@ class Client:
     ) -> dict[str, Observation | Refused]:
         """Steps several sessions of this connection, 1 to 64, in one message: `steps` has their movements by name.
 
-        Returns by name the observation of each, or the `Refused` of one whose step was refused, which stops no other.
-        Raises `Refused` if the list itself is refused; then no session was stepped.
+        Returns, by session name, the observation or the `Refused` of that session's step. A refused step does not stop
+        the others. Raises `Refused` if the list itself is refused; then no session was stepped.
         """
         return self._run(self._protocol.step_many(steps))
 
@@ -263,7 +263,7 @@ class Client:
 
 
 class Session:
-    """An open session, one of those of its client. A `with` block closes it at its end, if the connection is still open."""
+    """An open session of its client. A `with` block closes it at its end, if the connection is still open."""
 
     def __init__(self, client: Client, name: str, opened: Opened | None) -> None:
         self.name = name
@@ -275,7 +275,7 @@ class Session:
     def opened(self) -> Opened:
         """All settings of the session: cameras, start, hashes."""
         if self._opened is None:
-            raise WildCityError("the server did not tell the settings of the resumed session")
+            raise WildCityError("the server did not send the settings of the resumed session")
         return self._opened
 
     def step(
@@ -289,9 +289,9 @@ class Session:
         """Moves the ego, advances the simulated time by one step, and returns the observation there.
 
         A `Pose` is the next `world_from_rig` of an ego that teleports, an `Action` moves a car, and a `Trajectory`
-        moves both. `until_us` is for how long a trajectory or an action is followed, in whole steps; the observation
-        is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into the
-        record. `terminate` ends the episode with this step.
+        moves both. `until_us` is the time for which a trajectory or an action is followed, in whole steps; the
+        observation is the one at its end. `notes` is anything that `json` can write, up to 65,536 bytes, and goes into
+        the record. `terminate` ends the episode with this step.
         """
         return self._client._run(self._protocol.step(movement, terminate, until_us, notes, on=self.name))
 
@@ -313,7 +313,7 @@ class Session:
     ) -> Observation:
         """Starts a new episode at `start`, or at the session's start if it is None.
 
-        `dynamics`, and `speed` (m/s) in place of theirs, hold for this episode alone.
+        `dynamics`, and `speed` (m/s) in place of their speed, apply to this episode only.
         """
         return self._client._run(self._protocol.reset(seed, start, dynamics, speed, on=self.name))
 

@@ -27,10 +27,10 @@ class ModelInputError(ValueError):
 
 
 class Alpamayo:
-    """Answers a circular arc for every input that Alpamayo's published drivers accept.
+    """Returns a circular arc for every input that Alpamayo's published drivers accept.
 
     Checks what AlpaSim's driver checks (set of cameras, four frames each, 1.5 s of poses that reach t0, no frame after
-    t0) and what AlpaGym's does (rising times, one image shape, 20 waypoints of a route if there is one), and besides the
+    t0) and what AlpaGym's does (rising times, one image shape, 20 waypoints of a route if there is one), and also the
     type and shape of every array and the order of the cameras.
     """
 
@@ -43,7 +43,7 @@ class Alpamayo:
         curvature: float = 0.0,
         samples: int = 1,
     ) -> None:
-        """`speed` in m/s and `curvature` in 1/m (positive to the left) of the arc; `samples` is how many it answers."""
+        """`speed` in m/s and `curvature` in 1/m (positive to the left) of the arc; `samples` is the number of arcs."""
         self.indices = [alpamayo.CAMERAS[name] for name in alpamayo.cameras(model, task)]
         self.speed = speed
         self.curvature = curvature

@@ -9,7 +9,7 @@ from ..protocol import Drive, Pose
 
 BEHIND_M = 20.0
 AHEAD_M = 40.0
-"""How far from the last station the next one is looked for: a step of 0.5 s at 60 m/s, and more."""
+"""Largest distance from the last station at which the next one is searched: more than a step of 0.5 s at 60 m/s."""
 
 
 class Route:
@@ -25,7 +25,7 @@ class Route:
     def locate(self, pose: Pose, near_m: float | None = None) -> tuple[float, float]:
         """The station of the nearest point of the route, and the distance from it, both in metres.
 
-        With `near_m`, a station before, only its neighbourhood is searched: a route may cross itself.
+        With `near_m`, the previous station, only its neighbourhood is searched, because a route may cross itself.
         """
         first = 0
         last = len(self.station_m) - 1

@@ -29,13 +29,13 @@ from .route import Route
 
 ACCELERATION_M_S2 = 9.8
 CURVATURE_1_M = 0.2
-"""What an action of 1 stands for: the limits of the protocol."""
+"""Acceleration and curvature of an action of 1: the limits of the protocol."""
 
 WAYPOINTS = 20
 HISTORY_POSES = 16
 SPEED_M_S = 60.0
 CONTACT_M = 10.0
-"""What a contact costs, in metres of progress."""
+"""Penalty for a contact, in metres of progress."""
 HISTORY_M = 200.0
 """16 poses at 0.1 s and 60 m/s are 90 m."""
 ROUTE_M = 1000.0
@@ -50,7 +50,7 @@ Seen = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True)
 class DriveState:
-    """Where the ego is on the recorded drive, or on the scenario's route: what a reward may depend on."""
+    """State of the ego on the recorded drive or on the scenario's route, for rewards."""
 
     station_m: float
     """Distance along the drive of the point that is nearest to the ego."""
@@ -76,13 +76,14 @@ class DriveConfig:
 
     server, token, timeout: as `wildcity.connect`.
     twin, version, trajectory: the twin and the recorded drive to follow; the latest version and the first drive if None.
-    scenario: a scenario to drive in, as of `Client.open`. Route, start, dynamics and end are then those of the scenario,
-        and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m must have their defaults.
-    rig, cameras, size: the rig (the twin's own if None), the cameras to see, and the (width, height) of each image.
+    scenario: a scenario to drive in, as for `Client.open`. Route, start, dynamics and end are then those of the
+        scenario, and trajectory, dynamics, speed, off_route_m, start_m and waypoint_m must have their defaults.
+    rig, cameras, size: the rig (the twin's own if None), the cameras to render, and the (width, height) of each image.
     dynamics, speed, dt_us: the motion model, the speed at the start in m/s, the time of a step.
     horizon: steps after which an episode is truncated.
     off_route_m: distance from the drive at which an episode terminates.
-    start_m: episodes start at a random distance along the drive within these two; the default ends 20 m before the end.
+    start_m: episodes start at a random distance along the drive between these two; the default ends 20 m before its
+        end.
     waypoint_m: distance between two of the 20 points of the route ahead.
     reward: a function of the states before and after a step; `default_reward` if None.
 
@@ -116,7 +117,7 @@ class DriveConfig:
             own = [one for one in fields(self) if one.name in OF_A_DRIVE]
             given = [one.name for one in own if getattr(self, one.name) != one.default]
             if given:
-                raise ValueError(f"scenario has no use for {', '.join(given)}: the scenario itself says these")
+                raise ValueError(f"with scenario, {', '.join(given)} cannot be set: the scenario defines them")
         if self.dynamics == "teleport":
             raise ValueError("dynamics is 'teleport'; actions need 'kinematic' or 'dynamic'")
         if self.horizon < 1:
@@ -157,7 +158,7 @@ class DriveConfig:
         )
 
     def action_space(self) -> spaces.Box:
-        """Acceleration by 9.8 m/s² and curvature by 0.2 1/m (positive to the left)."""
+        """Acceleration in units of 9.8 m/s² and curvature in units of 0.2 1/m (positive to the left)."""
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def _drive_name(self, welcome: Welcome) -> str:
@@ -191,7 +192,7 @@ class Task(ABC):
         self._steps = 0
 
     def start(self, numbers: np.random.Generator, options: Mapping[str, Any] | None) -> Station | None:
-        """Where the next episode starts: at the option `start`, or where the task says.
+        """The start of the next episode: the option `start`, or the default of the task.
 
         Raises `ValueError` if an option is unknown.
         """
@@ -227,11 +228,11 @@ class Task(ABC):
 
     @abstractmethod
     def _start(self, numbers: np.random.Generator, start: Any) -> Station | None:
-        """Where the next episode starts; `start` is the option of this name."""
+        """The start of the next episode; `start` is the option of this name."""
 
     @abstractmethod
     def _state_of(self, seen: Observation, near_m: float | None) -> DriveState:
-        """Where the ego is; `near_m` is the station before."""
+        """The state of the ego; `near_m` is its previous station."""
 
     @abstractmethod
     def _ended(self, state: DriveState) -> tuple[bool, bool]:
@@ -292,7 +293,7 @@ class DriveTask(Task):
 
 
 class ScenarioTask(Task):
-    """Episodes of a scenario. Progress and ends are what the server says."""
+    """Episodes of a scenario. The server determines progress and end."""
 
     def __init__(self, config: DriveConfig, opened: Opened) -> None:
         super().__init__(config)
@@ -331,7 +332,7 @@ class ScenarioTask(Task):
 
 
 def end_of(seen: Observation) -> str | None:
-    """Which of its rules has ended the scenario with this observation, if one has."""
+    """The rule of the scenario that ended the episode with this observation, if there is one."""
     return next((event.name for event in seen.metadata.events if event.kind == "end"), None)
 
 

@@ -177,7 +177,7 @@ async def _open_all(config: DriveConfig, count: int) -> list[_Lane]:
 
 
 async def _gather(work: list[Coroutine[Any, Any, T]]) -> list[T]:
-    """The results of all. Raises the first error when all have ended, so that no call is under way after it."""
+    """The results of all awaitables. Raises the first error after all have ended, so that no call is under way then."""
     tasks = [asyncio.ensure_future(one) for one in work]
     await asyncio.gather(*tasks, return_exceptions=True)
     return [task.result() for task in tasks]
