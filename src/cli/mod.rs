@@ -19,6 +19,8 @@ mod backend_options;
 mod bench;
 mod bisect;
 mod demo;
+#[cfg(unix)]
+mod desktop;
 mod devices;
 mod directories;
 mod doctor;
@@ -109,6 +111,8 @@ enum Command {
 /// for a recording that is cut (`replay --verify`). A
 /// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
+    #[cfg(unix)]
+    desktop::start_without_device_selection();
     let arguments = Arguments::parse();
     let result = match arguments.command {
         Command::Demo(command) => command.run(),

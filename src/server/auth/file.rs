@@ -151,7 +151,12 @@ mod tests {
                 r#"{"tokens": [{"name": "a", "role": "secret", "token": "secretsecretsecret"}]}"#,
                 "tokens[0].role: no such role; the roles are metrics, drive, push, admin",
             ),
-            (r#"{"tokens": ["secretsecretsecret"]}"#, "line"),
+            (r#"{"tokens": ["secretsecretsecret"]}"#, "line 1, column 32: expected struct Entry; "),
+            (
+                r#"{"tokens": [{"name": "a", "role": "drive", "token": "secretsecretsecret",
+                    "limits": {"secret": 1}}]}"#,
+                "line 2, column 39: expected one of `sessions`, ",
+            ),
             (
                 r#"{"tokens": [{"name": "a", "role": "drive", "token": "secret"}]}"#,
                 "tokens[0].token",
