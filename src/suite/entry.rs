@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
-use wildcity_score::own;
 use wildcity_session::Engine;
 
 use crate::case::Case;
