@@ -118,7 +118,7 @@ fn refused(reason: String) -> PushError {
     PushError::Content { reason, cells: Vec::new() }
 }
 
-/// Waits for the push's turn, makes the asset, and stores it. Dropping the future before the asset is written abandons
+/// Waits for the push's permit, makes the asset, and stores it. Dropping the future before the asset is written abandons
 /// the push: nothing of it is visible. The caller ends the push with [`Push::close`].
 ///
 /// # Errors
@@ -135,23 +135,23 @@ pub async fn publish_asset(
     // is being written is not taken by another.
     let name = format!(".actors/{}", request.settings.name);
     let file_bytes = files.iter().map(|file| file.bytes).sum();
-    let turn = queue.turn_with(&name, request.memory_bytes(file_bytes)).await?;
+    let permit = queue.permit_with(&name, request.memory_bytes(file_bytes)).await?;
 
     push.enter(State::Ingesting)?;
     let record = request.settings.record;
     let bounds = ReadBounds {
-        memory_bytes: turn.memory_bytes(),
+        memory_bytes: permit.memory_bytes(),
         mesh_gaussians: request.settings.mesh_gaussians,
         most_gaussians: ActorAsset::MOST_GAUSSIANS as u64,
         too_many_fix: "an actor is one vehicle or person; reduce its Gaussians",
     };
-    // Threads hold the turn: they end a moment after their push does.
+    // Blocking threads hold a clone of the permit, because they may outlive their push for a moment.
     let stopping = StopWhenDropped(push.stop_flag().clone());
     let made = {
-        let turn = turn.clone();
+        let permit = permit.clone();
         let push = push.clone();
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             let scene = read(&push, &request.files, &files, bounds)?;
             let (hashes, options) = (scene.hashes, scene.options);
             let source = AssetSource { gaussians: scene.gaussians, hashes, options };
@@ -167,7 +167,7 @@ pub async fn publish_asset(
     push.enter(State::Committing)?;
     let catalog = catalog.clone();
     run_blocking(move || {
-        let _turn = turn;
+        let _permit = permit;
         Ok(catalog.add_actor(&asset, record, SameName::Refused)?)
     })
     .await

@@ -96,7 +96,8 @@ fn of_path(error: PathError) -> PushError {
     PushError::InvalidField { field, reason: error.to_string() }
 }
 
-/// Makes the version in the twin's turn among its pushes, and loads what sessions see before it is the latest.
+/// Makes the version when no other push of the twin runs, and loads the sections that sessions see before the version is
+/// the latest.
 ///
 /// # Errors
 /// The request cannot be used; [`wildcity_twin::store::StoreError::Overlap`]; or as a commit.
@@ -115,12 +116,12 @@ pub async fn publish_edit(
     };
     let needed =
         if edit.alignment == Alignment::IDENTITY { 0 } else { base.manifest.stored_bytes() };
-    let turn = queue.turn(&twin, needed).await?;
+    let permit = queue.permit(&twin, needed).await?;
     let (version, held) = {
         let engine = engine.clone();
         let twin = twin.clone();
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             let held = pin_latest(&engine, &twin)?;
             let version = engine.catalog().edit(&base, edit, &mut |_, _| {})?;
             Ok((version, held))
@@ -155,10 +156,10 @@ pub async fn survey(
     version: Option<u64>,
 ) -> Result<Survey, PushError> {
     // One at a time for each twin, as its pushes.
-    let turn = queue.turn(&twin, 0).await?;
+    let permit = queue.permit(&twin, 0).await?;
     let catalog = engine.catalog().clone();
     run_blocking(move || {
-        let _turn = turn;
+        let _permit = permit;
         let version = catalog.version(&twin, version)?;
         let stride =
             version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;

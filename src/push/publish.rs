@@ -29,7 +29,7 @@ use crate::commit::{NewContent, commit};
 use crate::error::PushError;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
-use crate::queue::{PushQueue, Turn};
+use crate::queue::{PushPermit, PushQueue};
 use crate::read::{PushedScene, ReadBounds, read};
 use crate::report::{CellChanges, PushReport};
 use crate::request::{CellSelection, PushRequest};
@@ -47,7 +47,7 @@ struct CheckedScene {
     report: PushReport,
 }
 
-/// Waits for the push's turn, carries it out, and returns the version that it made. Dropping the future
+/// Waits for the push's permit, carries it out, and returns the version that it made. Dropping the future
 /// abandons the push: before the commit nothing of it is visible. The caller ends the push with
 /// [`Push::end`].
 ///
@@ -62,14 +62,15 @@ pub async fn publish(
     viewpoints: Viewpoints<'_>,
 ) -> Result<PushedVersion, PushError> {
     let file_bytes = files.iter().map(|file| file.bytes).sum();
-    let turn = queue.turn(&request.twin, file_bytes).await?;
+    let permit = queue.permit(&request.twin, file_bytes).await?;
     let request = Arc::new(request);
 
     let limit = queue.check_timeout();
     let deadline = Instant::now() + limit;
-    // Later than the push itself: a push that takes too long ends as `TimedOut`, not by a late frame.
+    // The frames have a later deadline than the push, so that a push that takes too long fails with `TimedOut` and not
+    // with the error of a frame.
     let frames_by = deadline + engine.step_timeout();
-    let checked = read_and_check(engine, push, &request, files, &turn, frames_by);
+    let checked = read_and_check(engine, push, &request, files, &permit, frames_by);
     let Ok(checked) = timeout_at(deadline, checked).await else {
         push.stop_flag().stop();
         return Err(PushError::TimedOut { limit });
@@ -82,9 +83,9 @@ pub async fn publish(
         let engine = engine.clone();
         let push = push.clone();
         let request = request.clone();
-        let turn = turn.clone();
+        let permit = permit.clone();
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             commit_held(&engine, &push, &request, &scene, base.as_deref())
         })
         .await?
@@ -98,24 +99,26 @@ pub async fn publish(
     Ok(PushedVersion { number: version.number, hash: version.hash })
 }
 
-/// Everything before the commit. Frames of the preview have until `frames_by`. Threads hold the turn: they end a moment
-/// after their push does.
+/// Everything before the commit. `frames_by` is the deadline of the preview's frames.
+///
+/// The blocking threads hold a clone of the permit, because they may still run for a moment after the push was cancelled:
+/// the next push of the twin must not begin before they end.
 async fn read_and_check(
     engine: &Arc<Engine>,
     push: &Arc<Push>,
     request: &Arc<PushRequest>,
     files: Vec<SourceFile>,
-    turn: &Turn,
+    permit: &PushPermit,
     frames_by: Instant,
 ) -> Result<(CheckedScene, Option<Arc<Version>>), PushError> {
     push.enter(State::Ingesting)?;
     let scene = {
         let push = push.clone();
         let request = request.clone();
-        let turn = turn.clone();
-        let bounds = ReadBounds::of_twin(turn.memory_bytes());
+        let permit = permit.clone();
+        let bounds = ReadBounds::of_twin(permit.memory_bytes());
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             read(&push, &request.files, &files, bounds)
         })
         .await?

@@ -11,7 +11,7 @@
 //! readiness      whether sessions can be opened
 //! state          what all connections share
 //! listen         accepts connections, a bounded number
-//! newcomers      the slots of connections, before and after authentication
+//! admission      the slots of connections, before and after authentication
 //! idle_deadline  closes HTTP connections that make no progress
 //! routes         HTTP routes, and the upgrade to WebSocket
 //! auth           tokens, their roles, twins and limits
@@ -33,6 +33,7 @@
 //!
 //! The pipeline of pushes is the package `wildcity-push`; the routes only carry requests to it.
 
+mod admission;
 mod audit;
 mod auth;
 mod blocking;
@@ -47,7 +48,6 @@ pub mod limits;
 mod listen;
 mod memory;
 mod metrics;
-mod newcomers;
 mod origins;
 mod readiness;
 mod reload;

@@ -39,14 +39,14 @@ pub const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
 pub const SPARE_CONNECTIONS: usize = 64;
 
 /// Connections that have not sent a request that a token allows. Each takes a file descriptor and 20 kB.
-pub const NEWCOMERS: usize = 512;
+pub const UNAUTHENTICATED_CONNECTIONS: usize = 512;
 
-/// Connections of one address among those, beyond which its oldest one is closed for the next.
-pub const NEWCOMERS_OF_ADDRESS: usize = 256;
+/// Unauthenticated connections of one address. Beyond this number the oldest one is closed when a new one arrives.
+pub const UNAUTHENTICATED_OF_ADDRESS: usize = 256;
 
 /// How long a new connection is not closed for another one. A client sends its request with its connection, and 512
 /// requests are read in a few milliseconds.
-pub const NEWCOMER_GRACE: Duration = Duration::from_millis(250);
+pub const UNAUTHENTICATED_GRACE: Duration = Duration::from_millis(250);
 
 /// Bytes of pongs and of the close frame that a client has not read; each has at most 129 bytes.
 pub const PONGS_BYTES: usize = 4 << 10;

@@ -105,7 +105,7 @@ pub const SENSOR_REACH_US: i64 = 10_000_000;
 pub const SENSOR_DROPS: i64 = 8;
 
 /// Shortest and longest time between two values of an exposure or a bias that wanders, in microseconds: up to an hour.
-pub const WANDER_PERIOD_US: std::ops::RangeInclusive<i64> = 1_000..=3_600_000_000;
+pub const DRIFT_PERIOD_US: std::ops::RangeInclusive<i64> = 1_000..=3_600_000_000;
 
 /// Time between two biases of an inertial measurement unit unless the session names another, in microseconds.
 pub const BIAS_PERIOD_US: i64 = 60_000_000;

@@ -42,7 +42,7 @@ pub(crate) struct SessionSettings {
     /// The scenario of every episode.
     pub(crate) scenario: Option<SessionScenario>,
     /// Whether observations tell where the actors are.
-    pub(crate) tells_actors: bool,
+    pub(crate) reports_actors: bool,
     /// The repair of the images, if the session asked for it.
     pub(crate) repair: Option<Arc<SessionRepair>>,
 }

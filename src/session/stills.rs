@@ -94,19 +94,19 @@ impl Stills {
     /// most [`PlacedChunk::MAX_ACTORS`].
     ///
     /// # Errors
-    /// Names what was not ready within `patience`, or what the backend refuses.
+    /// Names what was not ready within `max_wait`, or what the backend refuses.
     pub async fn render(
         &self,
         stills: Vec<Still>,
         actors: &[StillActor],
-        patience: Duration,
+        max_wait: Duration,
     ) -> Result<Vec<Vec<u8>>, SessionError> {
         let most = PlacedChunk::MAX_ACTORS;
         if actors.len() > most {
             let must = format!("{}; at most {most} are accepted", actors.len());
             return Err(SessionError::OutOfRange { field: "actors", must });
         }
-        let deadline = Instant::now() + patience;
+        let deadline = Instant::now() + max_wait;
         let mut images = Vec::with_capacity(stills.len());
         for part in stills.chunks(MAX_VIEWS) {
             images.append(&mut self.render_frame(part.to_vec(), actors, deadline).await?);

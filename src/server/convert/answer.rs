@@ -90,7 +90,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         instances: instances.then_some(true),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
-        actors: session.tells_actors().then_some(true),
+        actors: session.reports_actors().then_some(true),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
         cameras: Some(names),
         images: BTreeMap::new(),

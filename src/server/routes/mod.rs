@@ -23,9 +23,9 @@ use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 use axum::{Json, Router};
 
+use crate::admission::ConnectionSlot;
 use crate::auth::Grant;
 use crate::fault::Fault;
-use crate::newcomers::ConnectionSlot;
 use crate::state::ServerState;
 
 use refusal::Refusal;
@@ -86,7 +86,7 @@ async fn authorize(
         grant.require_more_than_metrics()?;
     }
     if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
-        slot.become_known()?;
+        slot.mark_authenticated()?;
     }
     request.extensions_mut().insert(grant);
     Ok(next.run(request).await)

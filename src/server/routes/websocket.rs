@@ -11,11 +11,11 @@ use hyper_util::rt::TokioIo;
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
+use crate::admission::ConnectionSlot;
 use crate::auth::{Grant, Role};
 use crate::connection;
 use crate::convert;
 use crate::fault::Fault;
-use crate::newcomers::ConnectionSlot;
 use crate::socket::Socket;
 use crate::state::ServerState;
 use crate::stream::Stream;

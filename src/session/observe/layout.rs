@@ -16,7 +16,7 @@ use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
 use crate::options::PixelMaps;
-use crate::repair::drawn::TOLD;
+use crate::repair::drawn::MAX_REPORTED_REFERENCES;
 use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
@@ -40,7 +40,7 @@ const REPAIR_IMAGE_BYTES: usize = 256;
 
 /// Room in the header per image for the names of references: each has the names of a drive and of a camera, of 64 bytes,
 /// and a number.
-const REFERENCES_IMAGE_BYTES: usize = TOLD * 160;
+const REFERENCES_IMAGE_BYTES: usize = MAX_REPORTED_REFERENCES * 160;
 
 /// Room in the header per image for what is told of its camera's effects: five reasons, three numbers and a hash.
 const SENSOR_IMAGE_BYTES: usize = 512;
@@ -88,27 +88,27 @@ pub(crate) struct RigCapture {
     pub(crate) world_from_rig: Pose,
     /// When the pictures are taken, in microseconds since the episode's start.
     pub(crate) time_us: i64,
-    /// When the frames are due. Only a camera with effects shows a picture of an earlier time.
+    /// When the frames are due. Only a camera with sensor effects shows a picture of an earlier time.
     pub(crate) due_us: i64,
-    /// Whether sensors take them: not for `observe`, which shows the scene.
-    pub(crate) sensed: bool,
+    /// Whether the effects of sensors apply. They do not for `observe`, which shows the scene.
+    pub(crate) has_sensor_effects: bool,
     /// Indices of the cameras; there may be none.
     pub(crate) cameras: Vec<usize>,
-    /// Indices of the cameras, rising, for whose views the levels of detail are chosen: these ones, or more.
+    /// Ascending indices of the cameras for whose views the levels of detail are chosen: at least [`Self::cameras`].
     pub(crate) detail_for: Vec<usize>,
     /// Whether the observation shows the images now. Otherwise they are rendered for the frame history.
     pub(crate) shown: bool,
 }
 
-/// What the effects of an episode's sensors depend on, beside the time.
+/// Seed and start time of the episode, from which the sensor effects are derived.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct EpisodeKey {
+pub(crate) struct EffectSeed {
     pub(crate) seed: u64,
-    /// Where the episode or its warm-up begins, in microseconds.
+    /// Start of the episode or of its warm-up, in microseconds.
     pub(crate) begin_us: i64,
 }
 
-impl EpisodeKey {
+impl EffectSeed {
     pub(crate) fn of(episode: &Episode) -> Self {
         Self { seed: episode.seed(), begin_us: episode.begin_us() }
     }
@@ -240,14 +240,14 @@ impl ObservationLayout {
     }
 
     /// What a camera delivers in an episode when a frame is due, in microseconds.
-    pub(crate) fn delivery(&self, camera: usize, of: EpisodeKey, due_us: i64) -> Delivery {
+    pub(crate) fn delivery(&self, camera: usize, of: EffectSeed, due_us: i64) -> Delivery {
         let changed = self.sensor(camera).filter(|sensor| sensor.changes_times());
         let Some(sensor) = changed else {
             return Delivery { stamp_us: due_us, taken_us: due_us, missing: None };
         };
         let name = &self.cameras[camera].name;
         let period_us = self.schedule.period_us(camera);
-        let EpisodeKey { seed, begin_us } = of;
+        let EffectSeed { seed, begin_us } = of;
         FrameSource { sensor, name, seed, period_us, begin_us }.at(due_us)
     }
 
@@ -255,7 +255,7 @@ impl ObservationLayout {
     pub(crate) fn pixel_effects(
         &self,
         camera: usize,
-        of: EpisodeKey,
+        of: EffectSeed,
         taken_us: i64,
     ) -> Option<PixelEffects> {
         let sensor = self.sensor(camera)?;
@@ -305,7 +305,7 @@ impl ObservationLayout {
         for camera in 0..self.cameras.len() {
             for due_us in self.schedule.due(camera, now_us) {
                 if due_us >= episode.begin_us() && !is_kept(camera, due_us) {
-                    let taken_us = self.delivery(camera, EpisodeKey::of(episode), due_us).taken_us;
+                    let taken_us = self.delivery(camera, EffectSeed::of(episode), due_us).taken_us;
                     cameras_by_time.entry([due_us, taken_us]).or_default().push(camera);
                 }
             }
@@ -314,7 +314,7 @@ impl ObservationLayout {
             world_from_rig: episode.pose_at(time_us),
             time_us,
             due_us,
-            sensed: true,
+            has_sensor_effects: true,
             detail_for: self.detail_for(&cameras),
             cameras,
             shown: due_us == now_us && self.schedule.is_decision(now_us),
@@ -329,7 +329,7 @@ impl ObservationLayout {
             world_from_rig,
             time_us: episode.time_us(),
             due_us: episode.time_us(),
-            sensed: false,
+            has_sensor_effects: false,
             detail_for: cameras.clone(),
             cameras: cameras.clone(),
             shown: true,

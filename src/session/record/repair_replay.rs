@@ -18,7 +18,7 @@ use super::format::EpisodeHeader;
 use super::repairs::RecordedRepair;
 use super::replay_report::{ProvenanceChange, ReplayError};
 use crate::observe::trust::TrainingCoverage;
-use crate::repair::drawn::{Beside, CameraRays};
+use crate::repair::drawn::{CameraRays, ReferenceInputs};
 use crate::repair::offline::{NeededReferences, OfflineView, ReferenceSupply};
 use crate::repair::references::ReferenceViews;
 use crate::repair::rendered_image::RenderedImage;
@@ -182,25 +182,25 @@ impl<'a> RepairReplay<'a> {
         drawing: Drawing<'_>,
     ) -> Result<Option<Vec<u8>>, RepairError> {
         let Some(model) = self.model.clone() else { return Ok(None) };
-        let beside = self
-            .beside(&model, image, drawing)
+        let inputs = self
+            .reference_inputs(&model, image, drawing)
             .map_err(|message| RepairError::Input { field: "reference".to_owned(), message })?;
-        let repaired = session_repair::repair(&model, image.mounted, image.rendered, &beside)?;
+        let repaired = session_repair::repair(&model, image.mounted, image.rendered, &inputs)?;
         if !image.is_observe {
-            self.state.references[image.camera] = beside.nearest;
+            self.state.references[image.camera] = inputs.nearest;
         }
         Ok(Some(repaired))
     }
 
     /// What the model gets beside an image.
-    fn beside(
+    fn reference_inputs(
         &self,
         model: &Model,
         image: &ImageToRepair<'_>,
         Drawing { resident, profile, backend }: Drawing<'_>,
-    ) -> Result<Beside, String> {
+    ) -> Result<ReferenceInputs, String> {
         let ImageToRepair { camera, mounted, rendered, view, world_from_rig, is_observe } = *image;
-        let Some(references) = &self.references else { return Ok(Beside::default()) };
+        let Some(references) = &self.references else { return Ok(ReferenceInputs::default()) };
         let kept = match is_observe {
             true => None,
             false => self.state.references[camera].as_deref(),

@@ -15,7 +15,7 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Resident;
 use wildcity_twin::store::Catalog;
 
-use super::drawn::{self, Beside, Sight};
+use super::drawn::{self, ReferenceInputs, WarpQuery};
 use super::references::{ReferenceSource, ReferenceView, ReferenceViews, without};
 use super::rendered_image::RenderedImage;
 use super::session_repair;
@@ -83,7 +83,7 @@ pub struct OfflineView<'a> {
 /// The images beside a view; none without a twin.
 #[derive(Debug, Default)]
 pub struct ViewReferences {
-    pub(crate) beside: Beside,
+    pub(crate) beside: ReferenceInputs,
     /// Time to read and draw those that were not in memory.
     pub read: Duration,
     /// How many those were.
@@ -127,9 +127,9 @@ impl ReferenceSupply<'_> {
             }
         }
         if needed.warped {
-            let sight = Sight { camera, rays, view, image: rendered };
+            let query = WarpQuery { camera, rays, view, image: rendered };
             let started = Instant::now();
-            let overlapping = sight.overlapping(views.around(world_from_rig));
+            let overlapping = query.overlapping(views.around(world_from_rig));
             found.warp = started.elapsed();
             let mut around = Vec::new();
             for view in overlapping {
@@ -137,7 +137,7 @@ impl ReferenceSupply<'_> {
                 around.push((view.name, reference));
             }
             let started = Instant::now();
-            sight.warped(&around, &mut found.beside);
+            query.warped(&around, &mut found.beside);
             found.warp += started.elapsed();
         }
         Ok(found)

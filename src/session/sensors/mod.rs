@@ -3,7 +3,7 @@
 //!
 //! Every effect is a function of the episode's seed, the sensor's name and a time. There is no running state, so a
 //! branch, a restored snapshot and a replay draw the same numbers, alone or among other sessions. Biases and the
-//! exposure wander all the same: they are [interpolated](draw::wandering) between numbers that are drawn for
+//! exposure wander all the same: they are [interpolated](draw::drift) between numbers that are drawn for
 //! multiples of a period. What an episode does keep is in [`EpisodeSensors`]: decisions that wait, and the motion
 //! since the last observation.
 //!

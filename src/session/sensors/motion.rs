@@ -9,7 +9,7 @@
 //! speed             v = (1 + s) v_x + σ n               m/s along the rig, at the rear axle
 //! ```
 //!
-//! n are normal and independent, the biases β [wander](super::draw::wandering), and s is drawn once for an episode. The
+//! n are normal and independent, the biases β [wander](super::draw::drift), and s is drawn once for an episode. The
 //! terms are those of IEEE Std 952 (angle random walk and bias instability), with a bias of a bounded variance.
 
 use glam::DVec3;
@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use wildcity_scene::random::Random;
 use wildcity_sim::Ego;
 
-use super::draw::{normal, wandering};
+use super::draw::{drift, standard_normal};
 use super::settings::{AxisNoise, Imu, WheelSpeed};
 
 /// Standard gravity, in m/s².
@@ -66,18 +66,18 @@ impl MotionSample {
                 _ => (self.angular_velocity[index - 3], "rpy"),
             };
             let name = format!("imu/bias/{}", &axis[index % 3..index % 3 + 1]);
-            let wandered = wandering(seed, &name, imu.bias_period_us, self.time_us);
-            (ideal + noise * normal(&mut random) + bias * wandered) as f32
+            let drifted = drift(seed, &name, imu.bias_period_us, self.time_us);
+            (ideal + noise * standard_normal(&mut random) + bias * drifted) as f32
         };
         std::array::from_fn(&mut axis)
     }
 
     /// What the wheels measure.
     pub(crate) fn wheel_speed(&self, wheels: &WheelSpeed, seed: u64) -> f32 {
-        let scale = normal(&mut Random::new(seed, "wheels/scale", 0));
+        let scale = standard_normal(&mut Random::new(seed, "wheels/scale", 0));
         let mut random = Random::new(seed, "wheels/noise", self.time_us as usize);
         let WheelSpeed { noise, scale: deviation } = wheels;
-        (self.speed * (1.0 + deviation * scale) + noise * normal(&mut random)) as f32
+        (self.speed * (1.0 + deviation * scale) + noise * standard_normal(&mut random)) as f32
     }
 }
 

@@ -8,7 +8,7 @@ use wildcity_scene::rig::overlay_bytes;
 use super::Session;
 use super::open::{frame_bytes, rig_extent, training_coverage};
 use super::recording::traffic_lines;
-use super::requests::Moment;
+use super::requests::SimulationState;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::episode::Outcome;
@@ -65,8 +65,8 @@ impl Session {
         let layout = &self.settings.layout;
         let earlier = state.frame_history.before(episode.time_us());
         let captures = layout.captures(&episode, &earlier);
-        let moment = Moment { episode: &episode, traffic: state.traffic.as_ref() };
-        let rendered = self.render(version, moment, captures, Some(earlier)).await?;
+        let simulation = SimulationState { episode: &episode, traffic: state.traffic.as_ref() };
+        let rendered = self.render(version, simulation, captures, Some(earlier)).await?;
         let mut bytes = None;
         if !version.is_version_of(&self.version) {
             let resident = version.resident.clone();
@@ -196,7 +196,7 @@ impl Session {
             deadline,
             drive: None,
             scenario: None,
-            tells_actors: false,
+            reports_actors: false,
             repair: None,
         };
 
@@ -235,8 +235,8 @@ impl Session {
             let version = PinnedVersion::new(version, profile, coverage);
             let history = Some(self.state.frame_history.clone());
             let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
-            let moment = Moment { episode: &episode, traffic: None };
-            let rendered = self.render(&version, moment, captures, history).await?;
+            let simulation = SimulationState { episode: &episode, traffic: None };
+            let rendered = self.render(&version, simulation, captures, history).await?;
             for (frame, now) in frames.iter().zip(&rendered.hashes) {
                 if now.to_hex().as_str() != frame.hash {
                     let camera = self.cameras()[frame.camera].name.clone();

@@ -137,7 +137,7 @@ impl Session {
 
     /// Whether images come with their trust.
     pub fn trust(&self) -> bool {
-        let is_told = self.settings.repair.as_ref().is_none_or(|repair| repair.tells_trust);
+        let is_told = self.settings.repair.as_ref().is_none_or(|repair| repair.reports_trust);
         self.version.coverage.is_some() && is_told
     }
 
@@ -212,8 +212,8 @@ impl Session {
     }
 
     /// Whether observations tell where the actors are.
-    pub fn tells_actors(&self) -> bool {
-        self.settings.tells_actors
+    pub fn reports_actors(&self) -> bool {
+        self.settings.reports_actors
     }
 
     /// Name of the current episode's record; `None` before its first frame.

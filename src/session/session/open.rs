@@ -52,7 +52,7 @@ impl Session {
 
         // The scenario, whose ego section fills in what the request leaves open.
         let scenario = options.scenario.take();
-        let tells_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
+        let reports_actors = scenario.as_ref().is_some_and(|scenario| scenario.actors);
         let mut loaded = None;
         let mut solids = None;
         let scenario = match scenario {
@@ -108,9 +108,9 @@ impl Session {
             Some(asked) => {
                 let models = engine.repairs().clone();
                 let cameras = rig.cameras.clone();
-                let tells_trust = outputs.trust;
+                let reports_trust = outputs.trust;
                 let open =
-                    move || SessionRepair::open(&models, &asked, &cameras, deadline, tells_trust);
+                    move || SessionRepair::open(&models, &asked, &cameras, deadline, reports_trust);
                 Some(Arc::new(run_blocking(open).await??))
             }
         };
@@ -137,7 +137,7 @@ impl Session {
         }
         if let Some(found) = &loaded {
             let actors = found.loaded.scenario.traffic.actors.len();
-            layout.reserve_header(if tells_actors { actors } else { 0 })?;
+            layout.reserve_header(if reports_actors { actors } else { 0 })?;
         }
 
         // Where episodes start, and the recorded drive that the ego may follow from there.
@@ -187,7 +187,7 @@ impl Session {
             deadline,
             drive,
             scenario,
-            tells_actors,
+            reports_actors,
             repair,
         };
         let references = match &settings.repair {

@@ -34,9 +34,9 @@ use crate::scenario::{EpisodeScenario, EpisodeTraffic};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 
-/// What a frame shows beside the twin: the ego and its past, and the actors.
+/// State that a frame shows in addition to the twin: the ego and its past, and the actors.
 #[derive(Clone, Copy)]
-pub(super) struct Moment<'a> {
+pub(super) struct SimulationState<'a> {
     pub(super) episode: &'a Episode,
     pub(super) traffic: Option<&'a EpisodeTraffic>,
 }
@@ -81,8 +81,8 @@ impl Session {
 
         let frame_history = self.state.frame_history.clone();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
-        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
+        let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
+        let rendered = self.render(&self.version, simulation, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = match now.is_delayed() {
@@ -135,8 +135,9 @@ impl Session {
         }
         let episode = self.state.episode.clone();
         let captures = self.settings.layout.captures_at(&episode, poses);
-        let moment = Moment { episode: &episode, traffic: self.state.traffic.as_ref() };
-        let rendered = self.render(&self.version, moment, captures, None).await?;
+        let simulation =
+            SimulationState { episode: &episode, traffic: self.state.traffic.as_ref() };
+        let rendered = self.render(&self.version, simulation, captures, None).await?;
         let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
         self.record(record, None).instrument(debug_span!("record")).await?;
         Ok(rendered.observation)
@@ -210,8 +211,8 @@ impl Session {
 
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
-        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
+        let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
+        let rendered = self.render(&self.version, simulation, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let before = traffic.as_ref();
@@ -250,11 +251,11 @@ impl Session {
     pub(super) async fn render(
         &self,
         version: &PinnedVersion,
-        moment: Moment<'_>,
+        simulation: SimulationState<'_>,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
     ) -> Result<RenderedObservation, SessionError> {
-        let Moment { episode, traffic } = moment;
+        let SimulationState { episode, traffic } = simulation;
         let layout = &self.settings.layout;
         let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(

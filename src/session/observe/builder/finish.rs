@@ -107,7 +107,7 @@ impl ObservationBuilder {
                 encoded += 1;
             }
             // A step has one pose, even if a camera shows a picture that was taken from another.
-            pose += usize::from(capture.shown && !capture.sensed);
+            pose += usize::from(capture.shown && !capture.has_sensor_effects);
         }
         shown
     }
@@ -119,11 +119,11 @@ impl ObservationBuilder {
         camera: usize,
         encoded: usize,
     ) -> (i64, Option<ImageSensor>) {
-        if !capture.sensed || self.layout.sensor(camera).is_none() {
+        if !capture.has_sensor_effects || self.layout.sensor(camera).is_none() {
             return (capture.time_us, None);
         }
         let Delivery { stamp_us, taken_us, missing } =
-            self.layout.delivery(camera, self.key, capture.due_us);
+            self.layout.delivery(camera, self.effect_seed, capture.due_us);
         let has_effects = |sensor: &CameraSensor| {
             [
                 missing,

@@ -13,7 +13,7 @@ use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 use super::buffer::ObservationBuffer;
 use super::encode::{AppliedEffects, EncodedImage, Encoding, encode, hashed};
-use super::layout::{EpisodeKey, InPlaceBytes, ObservationLayout, RigCapture};
+use super::layout::{EffectSeed, InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
@@ -38,7 +38,7 @@ pub(crate) struct ObservationBuilder {
     buffer: ObservationBuffer,
     history_count: usize,
     /// What the effects of the sensors depend on.
-    key: EpisodeKey,
+    effect_seed: EffectSeed,
     /// Number of samples of the inertial measurement unit and of the wheels; `None` without.
     motion_samples: [Option<usize>; 2],
     /// Where the next shown image's floats go, in bytes from the buffer's start.
@@ -68,7 +68,7 @@ impl ObservationBuilder {
         let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let mut history = history.concat();
-        let motion_samples = match captures.iter().any(|capture| capture.sensed) {
+        let motion_samples = match captures.iter().any(|capture| capture.has_sensor_effects) {
             true => add_motion(&mut history, &layout, episode),
             false => [None; 2],
         };
@@ -95,7 +95,7 @@ impl ObservationBuilder {
             repair: None,
             buffer,
             history_count: count,
-            key: EpisodeKey::of(episode),
+            effect_seed: EffectSeed::of(episode),
             motion_samples,
             floats_at,
             instances_at,
@@ -125,17 +125,17 @@ impl ObservationBuilder {
         let coverage = self.coverage.clone();
 
         let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
-        let gate = match &mut self.repair {
-            Some(repair) => Some(repair.gate(&self.budget, capture, pixels)?),
+        let filter = match &mut self.repair {
+            Some(repair) => Some(repair.candidate_filter(&self.budget, capture, pixels)?),
             None => None,
         };
-        let tells_trust = gate.as_ref().is_none_or(|gate| gate.session.tells_trust);
+        let reports_trust = filter.as_ref().is_none_or(|filter| filter.session.reports_trust);
 
         // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
         // normals are computed from depth, and a repair model may need each of them.
         let PixelMaps { depth, opacity, normals, .. } = layout.maps();
         let model_needs = |needs: fn(&SessionRepair) -> bool| {
-            gate.as_ref().is_some_and(|gate| needs(&gate.session))
+            filter.as_ref().is_some_and(|filter| needs(&filter.session))
         };
         let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
         let uses_depth = (normals && capture.shown) || model_needs(SessionRepair::needs_depth);
@@ -145,9 +145,9 @@ impl ObservationBuilder {
         let extra_values =
             u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
         // Noise and the like are computed on copies.
-        let key = self.key;
-        let effects = |camera: &usize| match capture.sensed {
-            true => layout.pixel_effects(*camera, key, capture.time_us),
+        let effect_seed = self.effect_seed;
+        let effects = |camera: &usize| match capture.has_sensor_effects {
+            true => layout.pixel_effects(*camera, effect_seed, capture.time_us),
             false => None,
         };
         let effects: Vec<Option<PixelEffects>> = capture.cameras.iter().map(effects).collect();
@@ -156,7 +156,7 @@ impl ObservationBuilder {
         let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
 
         // Where the renderer writes.
-        let raw_at = match gate.is_some() || has_effects {
+        let raw_at = match filter.is_some() || has_effects {
             true => self.raw_places(capture),
             false => Vec::new(),
         };
@@ -191,8 +191,8 @@ impl ObservationBuilder {
                 let opacity = target.opacity.as_deref().unwrap_or_default();
                 coverage.trust(&capture.world_from_rig, &frame.views[index], opacity)
             });
-            let repair = gate.as_ref().zip(trust);
-            let repair = repair.map(|(gate, trust)| gate.finished(index, trust.value, target));
+            let repair = filter.as_ref().zip(trust);
+            let repair = repair.map(|(filter, trust)| filter.finished(index, trust.value, target));
             let mut image = match &repair {
                 Some(Finished { candidate: Some(_), .. }) => Ok(hashed(pixels)),
                 _ => {
@@ -201,7 +201,7 @@ impl ObservationBuilder {
                 }
             };
             if let Ok(image) = &mut image {
-                image.trust = trust.filter(|_| tells_trust);
+                image.trust = trust.filter(|_| reports_trust);
                 let rendered_hash = image.effects.map_or(image.hash, |effects| effects.clean_hash);
                 image.repair = repair.is_some().then(|| ImageRepair::kept(rendered_hash));
             }
@@ -230,10 +230,10 @@ impl ObservationBuilder {
             self.timings.encode += image.took;
             self.encoded.push(image);
         }
-        if let (Some(repair), Some(gate)) = (&mut self.repair, &gate) {
+        if let (Some(repair), Some(filter)) = (&mut self.repair, &filter) {
             let rendered =
                 RenderedCapture { finished: repairs, views: frame.views, raw_at: &raw_at, first };
-            repair.decide(capture, gate, rendered);
+            repair.decide(capture, filter, rendered);
         }
         Ok(())
     }
