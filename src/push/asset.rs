@@ -21,7 +21,7 @@ use crate::request::{RequestedFile, check_files};
 use crate::source::{SourceFile, provenance};
 use crate::status::{Push, State};
 
-/// What a push of an asset asks for.
+/// Request for a push of an asset.
 #[derive(Clone, Debug)]
 pub struct AssetRequest {
     /// The files, which become one scene.
@@ -30,7 +30,7 @@ pub struct AssetRequest {
     pub settings: AssetSettings,
 }
 
-/// What an asset is made with, beside its Gaussians.
+/// Settings of an asset in addition to its Gaussians.
 #[derive(Clone, Debug)]
 pub struct AssetSettings {
     /// Its name.
@@ -43,7 +43,7 @@ pub struct AssetSettings {
     pub record: RecordFormat,
 }
 
-/// Gaussians in the directions and the unit of the actor's axes, and where they come from.
+/// Gaussians in the directions and the unit of the actor's axes, and their sources.
 #[derive(Clone, Debug)]
 pub struct AssetSource {
     /// The Gaussians. Their origin may be anywhere.
@@ -74,7 +74,7 @@ impl AssetRequest {
         Ok(())
     }
 
-    /// Bytes of memory that making the asset of files of so many bytes may take.
+    /// Bytes of memory that making the asset may use, for files of `file_bytes` bytes.
     fn memory_bytes(&self, file_bytes: u64) -> u64 {
         let mesh_gaussians = u64::from(self.settings.mesh_gaussians);
         limits::push_memory_bytes(file_bytes)
@@ -131,8 +131,8 @@ pub async fn publish_asset(
     request: AssetRequest,
     files: Vec<SourceFile>,
 ) -> Result<AddedActor, PushError> {
-    // A name of a twin does not start with a dot. Assets of one name wait for each other, so that the name of one that
-    // is being written is not taken by another.
+    // A name of a twin does not start with a dot. Pushes of assets with one name run one after the other, so that two
+    // assets cannot be stored under the same name.
     let name = format!(".actors/{}", request.settings.name);
     let file_bytes = files.iter().map(|file| file.bytes).sum();
     let permit = queue.permit_with(&name, request.memory_bytes(file_bytes)).await?;
@@ -163,7 +163,7 @@ pub async fn publish_asset(
     let asset = made.map_err(|error| push.cause(error))?;
     drop(stopping);
 
-    // From here on the push cannot be cancelled.
+    // From here on, the push cannot be cancelled.
     push.enter(State::Committing)?;
     let catalog = catalog.clone();
     run_blocking(move || {

@@ -1,5 +1,5 @@
-//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig. What a person places with the
-//! mouse.
+//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig, which a person has placed with
+//! the mouse.
 
 use std::sync::Arc;
 
@@ -20,7 +20,7 @@ use crate::publish::{Viewpoints, pin_latest, preload};
 use crate::queue::PushQueue;
 use crate::status::PushedVersion;
 
-/// What an edit asks for. Points are in the axes and the unit of the base.
+/// Request for an edit. Points are in the axes and the unit of the base.
 #[derive(Clone, Debug)]
 pub struct EditRequest {
     /// Name of the twin.
@@ -52,7 +52,7 @@ impl EditRequest {
     /// The edit of the store.
     ///
     /// # Errors
-    /// Names the field that cannot be used, and what must hold instead.
+    /// Names the field that cannot be used, and the requirement.
     pub fn edit(&self) -> Result<Edit, PushError> {
         let Self { ground, scale, drive, rig, .. } = self;
         let is_empty = ground.is_none() && scale.is_none() && drive.is_none() && rig.is_none();
@@ -134,7 +134,7 @@ pub async fn publish_edit(
     Ok(PushedVersion { number: version.number, hash: version.hash })
 }
 
-/// What is known of a version before it is edited.
+/// Properties of a version before it is edited.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Survey {
     /// Number of the version.

@@ -7,9 +7,8 @@
 //! queue of the sessions. Until the new version is loaded, `latest` remains the previous version for
 //! sessions that open the twin ([`Engine::pin_latest`]).
 //!
-//! **A push needs no state that survives the server**, because its content is compared with the twin's. A
-//! client that got no answer sends its push again, and the same content as the latest version's is that
-//! version.
+//! **A push needs no state that survives the server**, because its content is compared with the twin's. A client that
+//! got no answer sends its push again, and a push with the content of the latest version makes no new version.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -77,7 +76,7 @@ pub async fn publish(
     };
     let (scene, base) = checked.map_err(|error| push.cause(error))?;
 
-    // From here on the push cannot be cancelled.
+    // From here on, the push cannot be cancelled.
     push.enter(State::Committing)?;
     let committed = {
         let engine = engine.clone();
@@ -210,8 +209,8 @@ fn commit_held(
     scene: &CheckedScene,
     base: Option<&Version>,
 ) -> Result<Committed, PushError> {
-    // Until the new version is ready, sessions that open the latest version get the one that is the latest
-    // now. It may be later than the base, because another version may have been committed during the preview.
+    // Until the new version is ready, sessions that open the latest version get the present latest version. It may be
+    // later than the base, because another version may have been committed during the preview.
     let held = pin_latest(engine, &request.twin)?;
     let content =
         NewContent { gaussians: &scene.gaussians, hashes: &scene.hashes, options: &scene.options };
@@ -229,8 +228,8 @@ pub(crate) fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<Late
     Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
-/// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they
-/// switch. The version is already committed: what cannot be loaded now is loaded when it is opened.
+/// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they switch. The
+/// version is already committed: sections that cannot be loaded now are loaded when it is opened.
 pub(crate) async fn preload(
     engine: &Arc<Engine>,
     twin: &str,

@@ -1,4 +1,4 @@
-//! The pushes of a server: those that wait, those that run, and those that ended not long ago.
+//! The pushes of a server: waiting, running, and recently ended ones.
 //!
 //! The pushes of one twin run one after the other, in the order of their requests. Pushes of different twins wait for
 //! each other only while memory is short.
@@ -26,7 +26,7 @@ pub struct PushQueue {
     limits: QueueLimits,
 }
 
-/// What the pushes of a server may use.
+/// Limits of the pushes of a server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct QueueLimits {
     /// How many may wait or run.
@@ -101,7 +101,7 @@ impl PushQueue {
     /// have been removed.
     ///
     /// # Errors
-    /// The id belongs to a push that asked for something else, too many pushes are open, or `files`
+    /// The id belongs to a push with a different request, too many pushes are open, or `files`
     /// found a file missing.
     pub fn begin<E: From<PushError>>(
         &self,
@@ -176,11 +176,12 @@ impl PushQueue {
     ) -> Result<PushPermit, PushError> {
         let lock = {
             let mut twins = self.twins.lock();
-            // Locks that no push holds or waits for are forgotten.
+            // Remove locks that no push holds or waits for.
             twins.retain(|_, lock| Arc::strong_count(lock) > 1);
             twins.entry(twin.to_owned()).or_default().clone()
         };
-        // Lock the twin first, so that a push that waits for its twin holds no memory, which pushes of other twins need.
+        // Lock the twin first, so that a push that waits for its twin reserves no memory, which pushes of other twins
+        // may need.
         let twin = lock.lock_owned().await;
         let needed = memory_bytes.min(self.limits.memory_bytes);
         let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;
@@ -209,7 +210,7 @@ impl Entries {
         self.pushes.values().filter(|push| push.is_open()).count() + actors.count()
     }
 
-    /// Forgets the oldest pushes that ended while there are too many.
+    /// Removes the oldest ended pushes while there are too many.
     fn forget_oldest(&mut self) {
         while self.pushes.len() > limits::REMEMBERED_PUSHES {
             let ended = self.pushes.iter().filter(|(_, push)| !push.is_open());
@@ -284,7 +285,7 @@ mod tests {
         let missing = || Err(PushError::Unreadable { name: "a".into(), reason: "gone".into() });
         assert!(queue.begin(&request("a"), "x", missing).is_err());
         assert_eq!(queue.open_count(), 0);
-        // A known push needs its files no more.
+        // A known push no longer needs its files.
         new(begin(&queue, "a", "x"));
         assert!(matches!(queue.begin(&request("a"), "x", missing), Ok(Begun::Known(_))));
     }

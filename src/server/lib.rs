@@ -9,7 +9,7 @@
 //! certificate    when a certificate expires
 //! reload         reading the certificate and the tokens again at SIGHUP
 //! readiness      whether sessions can be opened
-//! state          what all connections share
+//! state          state that all connections share
 //! listen         accepts connections, a bounded number
 //! admission      the slots of connections, before and after authentication
 //! idle_deadline  closes HTTP connections that make no progress
@@ -22,7 +22,7 @@
 //! spool          uploads on disk
 //! metrics        counters for Prometheus
 //! socket         WebSocket messages, with a time-out on every wait
-//! inbox          what a client sends while its last request is carried out
+//! inbox          messages that a client sends while its last request is carried out
 //! connection     one agent, in lock step: read a request, answer it
 //! memory         observations in memory that a client on the same machine maps
 //! watchers       clients that look at a session without taking part in it

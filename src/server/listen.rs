@@ -33,7 +33,7 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
             accepted = accepted => match accepted {
                 Ok(accepted) => accepted,
                 Err(error) => {
-                    // Most likely there are no file descriptors left; some will be closed.
+                    // Most likely no file descriptors are left; connections that end will free some.
                     tracing::warn!("cannot accept a connection: {error}");
                     tokio::time::sleep(Duration::from_millis(100)).await;
                     continue;

@@ -139,7 +139,7 @@ async fn hosts_and_origins_are_there_once_and_a_foreign_host_is_told_how_to_be_l
     }
     let (_, body) = ask(&server, &get("Host: evil.example.org")).await;
     let message = body["message"].as_str().unwrap();
-    assert!(message.contains("not called \"evil.example.org\""), "{message}");
+    assert!(message.contains("host name \"evil.example.org\" is not accepted"), "{message}");
     assert!(message.contains("--origin") && !message.contains("token"), "{message}");
 }
 

@@ -50,7 +50,7 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .with_state(state)
 }
 
-/// What guards a route.
+/// Access control of a route.
 #[derive(Clone)]
 struct Guard {
     state: Arc<ServerState>,
@@ -92,7 +92,7 @@ async fn authorize(
     Ok(next.run(request).await)
 }
 
-/// Refuses a header that is there more than once: which one counts would be a guess.
+/// Refuses a header that occurs more than once, because its values may contradict each other.
 fn check_once(request: &Request, name: HeaderName, header: &'static str) -> Result<(), Fault> {
     match request.headers().get_all(name).iter().count() {
         0 | 1 => Ok(()),

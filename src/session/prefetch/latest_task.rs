@@ -19,7 +19,7 @@ struct State {
 type Task = Box<dyn FnOnce() + Send>;
 
 impl LatestTask {
-    /// Runs a task soon, in place of one that still waits.
+    /// Runs a task soon, instead of a task that still waits.
     pub(crate) fn submit(&self, task: impl FnOnce() + Send + 'static) {
         let replaced = {
             let mut state = self.0.lock();

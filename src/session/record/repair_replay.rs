@@ -31,7 +31,7 @@ pub(super) struct RepairReplay<'a> {
     /// The recorded model.
     model: Option<Arc<Model>>,
     coverage: TrainingCoverage,
-    /// By camera, after the frames so far.
+    /// Hysteresis state of each camera after the frames so far.
     state: RepairState,
     rays: CameraRays,
     /// The images that the model compares with, of the present version; if it needs some.
@@ -47,11 +47,11 @@ pub(super) struct ImageToRepair<'a> {
     pub(super) rendered: &'a RenderedImage,
     pub(super) view: &'a View,
     pub(super) world_from_rig: &'a Pose,
-    /// The ego is not at the pose: there is no history.
+    /// Whether the frame is of `observe`: the ego is not at its pose, so there is no history.
     pub(super) is_observe: bool,
 }
 
-/// What references are drawn with.
+/// Renderer settings for references.
 #[derive(Clone, Copy)]
 pub(super) struct Drawing<'a> {
     pub(super) resident: &'a Arc<Resident>,
@@ -60,8 +60,8 @@ pub(super) struct Drawing<'a> {
 }
 
 impl<'a> RepairReplay<'a> {
-    /// None if the episode was not repaired. Loads the model if `models` has it; what differs from the recorded
-    /// one is added to `changes`.
+    /// `None` if the episode was not repaired. Loads the model if `models` has it, and adds its differences from the
+    /// recorded model to `changes`.
     ///
     /// # Errors
     /// The model cannot be loaded, or the twin has no recorded drive any more.
@@ -172,7 +172,7 @@ impl<'a> RepairReplay<'a> {
         (0..selected.len()).map(|view| decision.cameras.contains(&view)).collect()
     }
 
-    /// The repaired pixels; none without the recorded model.
+    /// The repaired pixels; `None` without the recorded model.
     ///
     /// # Errors
     /// The model fails, or a reference cannot be read or drawn.
@@ -192,7 +192,7 @@ impl<'a> RepairReplay<'a> {
         Ok(Some(repaired))
     }
 
-    /// What the model gets beside an image.
+    /// References that the model gets in addition to an image.
     fn reference_inputs(
         &self,
         model: &Model,

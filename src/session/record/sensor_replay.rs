@@ -35,8 +35,8 @@ impl SensorReplay {
         Ok(Some(Self { layout, effect_seed }))
     }
 
-    /// The first camera of a pose of a frame whose picture, by the settings, was taken at another time or place than the
-    /// recorded ones; with these times, in microseconds.
+    /// The first camera of a pose whose picture, by the settings, was taken at a time or place that differs from the
+    /// recorded one, and the computed times, in microseconds.
     pub(super) fn wrong_delivery(
         &self,
         frame: &FrameRecord,

@@ -185,7 +185,7 @@ fn decoded(
     Ok(image)
 }
 
-/// Draws the depth of a reference, and its pixels if it has no recorded ones.
+/// Renders the depth of a reference, and its pixels if it has no recorded ones.
 pub(crate) fn draw(
     view: &ReferenceView,
     recorded: Option<ReadImage>,
@@ -219,7 +219,7 @@ pub(crate) fn draw(
             *depth_m = 0.0;
         }
     }
-    // What does not count has no depth: it fits to no point.
+    // Pixels that the mask excludes have no depth, so that they match no point.
     for (depth_m, _) in
         depth_m.iter_mut().zip(counts.flatten().iter().flatten()).filter(|(_, counts)| !**counts)
     {

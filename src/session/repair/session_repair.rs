@@ -22,11 +22,11 @@ pub struct SessionRepair {
     pub model: Arc<Model>,
     /// Which images.
     pub selection: Selection,
-    /// What happens when the model fails.
+    /// Behaviour when the model fails.
     pub on_failure: OnFailure,
-    /// Whether observations tell the trust, by which the images are selected.
+    /// Whether observations contain the trust, by which the images are selected.
     pub(crate) reports_trust: bool,
-    /// Of the cameras, for references.
+    /// Rays of the cameras, for references.
     rays: CameraRays,
 }
 
@@ -68,7 +68,7 @@ impl SessionRepair {
         self.model.needs(InputRole::Depth) || self.needs_normals() || self.needs_warped()
     }
 
-    /// Whether the model needs images brought into the view.
+    /// Whether the model needs images warped into the view.
     pub(crate) fn needs_warped(&self) -> bool {
         needs_warped(&self.model)
     }
@@ -78,7 +78,7 @@ impl SessionRepair {
         self.model.needs(InputRole::Reference)
     }
 
-    /// Whether the model needs images beside the rendered one.
+    /// Whether the model needs images in addition to the rendered one.
     pub(crate) fn needs_images(&self) -> bool {
         self.needs_warped() || self.needs_reference()
     }
@@ -116,7 +116,7 @@ impl SessionRepair {
     }
 }
 
-/// Whether a model needs images brought into the view.
+/// Whether a model needs images warped into the view.
 pub(crate) fn needs_warped(model: &Model) -> bool {
     model.needs(InputRole::ReferenceWarped) || model.needs(InputRole::ReferenceValid)
 }
@@ -184,7 +184,7 @@ pub(crate) fn repair(
     repair_timed(model, camera, rendered, inputs).map(|(repaired, _)| repaired)
 }
 
-/// The same, and how long the parts of it took.
+/// As [`repair`], and also returns how long its parts took.
 pub(crate) fn repair_timed(
     model: &Model,
     camera: &RigCamera,

@@ -1,4 +1,4 @@
-//! Reads scenarios, and what they name, from one directory.
+//! Reads scenarios, and the files that they name, from one directory.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -68,7 +68,7 @@ pub enum ScenarioError {
         field: &'static str,
         /// The name of the file.
         file: String,
-        /// What the operating system says.
+        /// The operating system's message.
         reason: String,
     },
     /// A mistake in a file.
@@ -79,7 +79,7 @@ pub enum ScenarioError {
         /// The place and the mistake.
         cause: FileError,
     },
-    /// Something is not what the scenario was made for.
+    /// A file or a twin differs from the one that the scenario was made for.
     #[error(
         "{field} is {wanted}, and there is {found}: take what the scenario names, correct the hash, or use \
          --latest"

@@ -1,4 +1,4 @@
-//! Checks what a session asks of its sensors.
+//! Checks the sensor settings of a session.
 
 use std::ops::RangeInclusive;
 

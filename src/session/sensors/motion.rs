@@ -1,16 +1,17 @@
-//! What an inertial measurement unit and the wheels measure.
+//! Samples of the inertial measurement unit and of the wheel speed sensor.
 //!
 //! There is a sample for each step, at its end. With the rig's rotation R (world from rig), its acceleration a in world
 //! axes and gravity g = 9.80665 m/s² (ISO 80000-3), at a step of Δt:
 //!
 //! ```text
 //! specific force    f = R⁻¹ (a + g ẑ) + σ n + β(t)      m/s², in the axes of the rig: (0, 0, g) at rest
-//! angular velocity  ω = log(R₀⁻¹ R) / Δt + σ n + β(t)   rad/s, R₀ that of the step before
+//! angular velocity  ω = log(R₀⁻¹ R) / Δt + σ n + β(t)   rad/s, R₀ that of the previous step
 //! speed             v = (1 + s) v_x + σ n               m/s along the rig, at the rear axle
 //! ```
 //!
-//! n are normal and independent, the biases β [wander](super::draw::drift), and s is drawn once for an episode. The
-//! terms are those of IEEE Std 952 (angle random walk and bias instability), with a bias of a bounded variance.
+//! The samples n are standard normal and independent, the biases β [drift](super::draw::drift), and s is sampled once
+//! per episode. The terms are those of IEEE Std 952 (angle random walk and bias instability), with a bias of a bounded
+//! variance.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};

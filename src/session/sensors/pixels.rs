@@ -120,7 +120,7 @@ impl PixelEffects {
         }
     }
 
-    /// Multiplies the light of a row of pixels with what passes the spots.
+    /// Multiplies the light of a row of pixels with the share that passes the spots.
     fn pass_spots(&self, row: usize, passing: &mut [f32]) {
         let width = passing.len() as f32;
         let y = (row as f32 + 0.5) / width;

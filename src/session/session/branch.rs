@@ -1,5 +1,5 @@
-//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a recorded
-//! episode. A branch that is driven as its original was gives the same bytes.
+//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a recorded episode. A
+//! branch that gets the same commands as its original gives the same bytes.
 
 use std::sync::Arc;
 
@@ -50,8 +50,8 @@ impl Session {
         }
     }
 
-    /// Returns to a snapshot, and renders it. From here on the session is as it was then: version of the twin,
-    /// ego, time, frames of bundles. Its steps go into a new file.
+    /// Returns to a snapshot, and renders it. This restores the state of the session: version of the twin, ego, time,
+    /// frames of bundles. Later steps are recorded in a new file.
     ///
     /// # Errors
     /// There is no such snapshot; otherwise as [`Session::step`].
@@ -138,10 +138,10 @@ impl Session {
     /// Opens a session in the state that a recorded episode had after one of its steps, with its settings. The
     /// new session has that state as its snapshot `start`.
     ///
-    /// Drives the recorded commands again, and renders the frames that coming bundles show.
+    /// Executes the recorded commands again, and renders the frames that coming bundles show.
     ///
     /// # Errors
-    /// The poses and frames of the record are not those of this build, twin and backend.
+    /// The poses and frames of the record differ from those of this build, twin and backend.
     pub async fn continued(
         engine: Arc<Engine>,
         name: String,

@@ -1,7 +1,7 @@
-//! The requests that are answered with images: step, observe, reset. And close.
+//! The requests that are answered with images (step, observe, reset), and close.
 //!
-//! Each request first renders, then records, and only then changes the session. If it fails or its future
-//! is dropped before that, nothing has happened, and the client can repeat it.
+//! Each request first renders, then records, and only then changes the session. If it fails or its future is dropped
+//! before that, the session is unchanged, and the client can repeat the request.
 
 use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
@@ -45,8 +45,8 @@ impl Session {
     /// Moves the ego by one step of `dt_us` and renders.
     ///
     /// # Errors
-    /// The step has not happened then and can be repeated. If the future is dropped, the step may be on
-    /// record but has not happened either.
+    /// The session is then unchanged, and the step can be repeated. If the future is dropped, the step may be on
+    /// record, but the session is unchanged as well.
     pub async fn step(
         &mut self,
         command: impl Into<Command>,
@@ -55,8 +55,8 @@ impl Session {
         self.follow(command.into(), StepOptions { terminate, ..StepOptions::default() }).await
     }
 
-    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of then, and
-    /// those since its start that the observation shows.
+    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of that time, and
+    /// the frames since the start of the plan that the observation shows.
     ///
     /// # Errors
     /// As [`Session::step`], and if the notes or the number of steps are out of range.
@@ -155,7 +155,7 @@ impl Session {
         self.reset_with(ResetOptions { seed, start, ..ResetOptions::default() }).await
     }
 
-    /// As [`Session::reset`], with dynamics for this episode alone.
+    /// As [`Session::reset`], with dynamics for only this episode.
     ///
     /// # Errors
     /// As [`Session::reset`], and if the speed is out of range.
@@ -245,7 +245,7 @@ impl Session {
         self.state.episode.summary(outcome)
     }
 
-    /// Renders captures of a version one after the other, each in its turn among the other sessions' frames.
+    /// Renders captures of a version one after the other, each scheduled among the other sessions' frames.
     ///
     /// With a history, the observation also shows its earlier frames; without one (`observe`), it does not.
     pub(super) async fn render(

@@ -19,25 +19,25 @@ use crate::sensors::delivery::Delivery;
 use crate::sensors::settings::CameraSensor;
 use crate::sensors::{ImageSensor, SensorReason};
 
-/// A finished observation, and what it leaves for its record and for later observations.
+/// A finished observation, and the data of it that its record and later observations need.
 pub(crate) struct RenderedObservation {
     pub(crate) observation: Observation,
     /// The history after this observation; empty if it was built without one.
     pub(crate) frame_history: FrameHistory,
-    /// What was rendered, in order.
+    /// The rendered captures, in order.
     pub(crate) captures: Vec<RigCapture>,
     /// The hash of each rendered image.
     pub(crate) hashes: Vec<blake3::Hash>,
-    /// What became of each rendered image; empty unless the session asked for repair.
+    /// Result of the repair of each rendered image; empty unless the session asked for repair.
     pub(crate) repairs: Vec<ImageRepair>,
-    /// What the repair keeps after this observation. None without repair, and for poses that the ego is not at.
+    /// State of the repair after this observation. `None` without repair, and for poses that the ego is not at.
     pub(crate) repair_state: Option<RepairState>,
     trusts: Vec<Option<Trust>>,
 }
 
 impl RenderedObservation {
-    /// The trusts of the rendered images, those that only later observations show included. None if the
-    /// session's images come without.
+    /// The trusts of the rendered images, including images that only later observations show. Empty if the session's
+    /// images come without trust.
     pub(crate) fn trusts(&self) -> impl Iterator<Item = f64> {
         self.trusts.iter().flatten().map(|trust| trust.value)
     }
@@ -112,7 +112,7 @@ impl ObservationBuilder {
         shown
     }
 
-    /// When an image was taken by its camera's clock, in microseconds, and what the camera did to it.
+    /// When an image was taken by its camera's clock, in microseconds, and the effects of the camera on it.
     fn delivered(
         &self,
         capture: &RigCapture,
@@ -202,8 +202,8 @@ impl ObservationBuilder {
         tensors
     }
 
-    /// Moves the images that later observations show into the history, appends those of earlier times that
-    /// this one shows, and drops from the history what no later one shows.
+    /// Moves the images that later observations show into the history, appends images of earlier times that this one
+    /// shows, and drops images from the history that no later one shows.
     fn append_earlier_frames(
         &mut self,
         history: &mut FrameHistory,

@@ -31,13 +31,13 @@ use self::repair::{Finished, ObservationRepair, RenderedCapture};
 pub(crate) struct ObservationBuilder {
     layout: Arc<ObservationLayout>,
     budget: AnswerBudget,
-    /// Where the twin was recorded, if images come with their trust or may be repaired.
+    /// Poses where the twin was recorded, if images come with their trust or may be repaired.
     coverage: Option<Arc<TrainingCoverage>>,
     /// Set if images may be repaired.
     repair: Option<ObservationRepair>,
     buffer: ObservationBuffer,
     history_count: usize,
-    /// What the effects of the sensors depend on.
+    /// Seed and start time from which the sensor effects are derived.
     effect_seed: EffectSeed,
     /// Number of samples of the inertial measurement unit and of the wheels; `None` without.
     motion_samples: [Option<usize>; 2],
@@ -48,7 +48,7 @@ pub(crate) struct ObservationBuilder {
     /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
     raw_at: usize,
     captures: Vec<RigCapture>,
-    /// The images of all captures so far, camera by camera.
+    /// The images of all captures so far, in order of the cameras.
     encoded: Vec<EncodedImage>,
     timings: Timings,
     residency: ResidencyStats,
@@ -107,7 +107,7 @@ impl ObservationBuilder {
         })
     }
 
-    /// The same with images that may be repaired.
+    /// Enables the repair of images.
     #[must_use]
     pub(crate) fn with_repair(self, repair: Option<ObservationRepair>) -> Self {
         Self { repair, ..self }
@@ -255,8 +255,8 @@ impl ObservationBuilder {
         capture.cameras.iter().map(place).collect()
     }
 
-    /// Where the renderer writes a capture's images: into the buffer what the observation holds as
-    /// rendered, and into `images` what is encoded first.
+    /// Targets of a capture's images: the buffer for maps and pixels that the observation contains as rendered, and
+    /// `images` for pixels that are encoded first.
     fn targets<'a>(
         &'a mut self,
         capture: &RigCapture,
@@ -335,11 +335,11 @@ impl ObservationBuilder {
     }
 }
 
-/// What a render thread leaves of a view: the image, and what the selection needs if there is one.
+/// Result of a render thread for a view: the image, and the data that the selection needs if there is one.
 type FinishedView = (Result<EncodedImage, String>, Option<Finished>);
 
-/// The hash and the file of a camera's image after the effects on its pixels; of raw pixels a copy if there are
-/// effects, and another if a later observation shows them.
+/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy if there are
+/// effects, and another copy if a later observation shows them.
 fn encoded(
     layout: &ObservationLayout,
     camera: usize,
@@ -372,8 +372,8 @@ fn encoded(
     Ok(image)
 }
 
-/// Appends the samples of an episode's motion as the sensors measure it: those of the inertial measurement unit, then
-/// those of the wheels. Returns how many each has; `None` without.
+/// Appends the samples of the motion sensors of an episode: first of the inertial measurement unit, then of the wheels.
+/// Returns the number of samples of each; `None` if the session does not have the sensor.
 fn add_motion(
     bytes: &mut Vec<u8>,
     layout: &ObservationLayout,
@@ -400,13 +400,13 @@ fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
     front
 }
 
-/// The same bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's
-/// room, the ego history and the maps before them are multiples of 4 bytes.
+/// The bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's room, the ego
+/// history and the maps before them are multiples of 4 bytes.
 fn as_floats(bytes: &mut [u8]) -> &mut [f32] {
     bytemuck::cast_slice_mut(bytes)
 }
 
-/// The same bytes as instances. They are aligned: all bytes before them are of floats, and of other instances.
+/// The bytes as instances. They are aligned: all bytes before them are of floats, and of other instances.
 fn as_ids(bytes: &mut [u8]) -> &mut [u16] {
     bytemuck::cast_slice_mut(bytes)
 }

@@ -153,7 +153,7 @@ impl ObservationRepair {
 }
 
 impl Candidate {
-    /// What the model gets beside the image.
+    /// References that the model gets in addition to the image.
     fn reference_inputs(
         &self,
         session: &SessionRepair,
@@ -182,7 +182,7 @@ impl Candidate {
 }
 
 impl CandidateFilter {
-    /// What the selection needs of a finished view.
+    /// Returns the data of a finished view that the selection needs.
     pub(super) fn finished(&self, view: usize, trust: f64, target: &Target<'_>) -> Finished {
         if !self.session.selection.is_candidate(self.was_on[view], trust) {
             return Finished { trust, candidate: None };
