@@ -46,7 +46,7 @@ impl From<Technical> for NotDriven {
 
 /// Starts the command and waits for it and for the end of its record.
 ///
-/// The command finds in its environment `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as JSON, which it sends
+/// The environment of the command has `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as JSON, which it sends
 /// with outputs of its own), `WILDCITY_SEED` (for `reset`) and `WILDCITY_STEPS` (after which it terminates).
 pub(crate) async fn drive(
     process: &AgentProcess<'_>,
@@ -102,7 +102,7 @@ struct Running(Child);
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // It may have ended; then there is nothing to kill.
+        // The process may have ended already; then these calls fail.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }

@@ -7,9 +7,9 @@
 //! | module | what it does |
 //! |---|---|
 //! | `file` | the format `wildcity.suite/1` |
-//! | `case` | one scenario with one seed: what is opened, what is recorded about it |
+//! | `case` | one scenario with one seed: the options of its session, and its properties in the results |
 //! | `driver` | the built-in agents: `log`, `stand`, `idm` |
-//! | `cameras` | what a suite says about cameras, checked against a twin |
+//! | `cameras` | the cameras of a suite, checked against a twin |
 //! | `agent_process`, `stderr` | external agents: their processes, and the text that these print |
 //! | `run` | drives all cases, some at once, technical failures once more |
 //! | `finish` | judges the record of a driven episode |

@@ -125,7 +125,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         suite: settings.suite,
         agent: settings.agent.name().to_owned(),
         latest: settings.latest,
-        // That of the suite, alike for all of its cases.
+        // The step of the suite, which is the same for all cases.
         dt_us: cases.first().and_then(|case| case.options.dt_us),
         at_least: settings.at_least,
     };
@@ -191,7 +191,7 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
     Ok(Engine::start(EngineSettings {
         cache: Cache::new(settings.catalog.clone()),
         episodes: settings.episodes.clone(),
-        // Scenarios come with their sessions; files that they name are beside the suite.
+        // Scenarios come with their sessions; files that they name are in the directory of the suite.
         scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
@@ -273,7 +273,7 @@ impl Shared {
 
     /// Drives a case. Returns the file of its record.
     async fn attempt(&self, case: &Case, attempt: u64) -> Result<PathBuf, NotDriven> {
-        // Each attempt has a session of its own: the server keeps one that was lost for a while.
+        // Each attempt has a session of its own: the server keeps a lost session for a while.
         let session = match attempt {
             1 => case.name.clone(),
             attempt => format!("{}.{attempt}", case.name),

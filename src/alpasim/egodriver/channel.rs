@@ -42,7 +42,8 @@ impl Channel {
         stream.set_nodelay(true).map_err(|error| error.to_string())?;
         let handshake = http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await;
         let (sender, connection) = handshake.map_err(|error| error.to_string())?;
-        // Ends when the last clone of the sender is dropped, or the driver is gone: then calls fail.
+        // The task ends when the last clone of the sender is dropped, or the driver disconnects, after which calls
+        // fail.
         tokio::spawn(connection);
         Ok(Self(sender))
     }

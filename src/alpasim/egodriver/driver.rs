@@ -20,7 +20,7 @@ const CONTRACT: (&str, &str) = ("carla-driver-interface-contract", "2");
 /// Why a driver did not answer as it must.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum DriverError {
-    /// The address is not one.
+    /// The address is invalid.
     #[error("{0:?} is no address of a driver; expected HOST:PORT")]
     Address(String),
     /// It cannot be reached, or went away.

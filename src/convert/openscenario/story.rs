@@ -1,4 +1,4 @@
-//! What happens: `Init`, the events of the stories, and when it stops.
+//! Reads the storyboard: `Init`, the events of the stories, and the stop trigger.
 
 use std::collections::BTreeMap;
 
@@ -275,7 +275,7 @@ fn trajectory_of(action: Element<'_>, entities: &Entities) -> Result<TimedPoints
     }
 }
 
-/// Adds the conditions of a trigger, all of which must hold.
+/// Adds the conditions of a trigger, all of which must be true.
 fn add_conditions(
     start: Element<'_>,
     own: &str,
