@@ -294,7 +294,8 @@ async fn connecting_without_a_server_fails() {
     }
 }
 
-/// A server elsewhere names a path that is another file here, or none: it is not opened.
+/// A server on another machine names a path that is a different file on this machine, or does not exist: it is not
+/// opened.
 #[tokio::test]
 async fn memory_that_is_not_the_servers_is_not_opened() {
     for (path, target) in [("/proc/self/exe", "/memfd:wildcity (deleted)"), ("/none/such", "x")] {

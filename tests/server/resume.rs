@@ -72,7 +72,7 @@ async fn an_agent_killed_in_mid_step_finds_its_answer() {
         server.painter.begins(begun + 1).await;
         let last_seq = agent.seq - 2;
         if reset {
-            // What the kernel does for a killed process that left bytes unread.
+            // Reset the connection, as the kernel does for a killed process that left bytes unread.
             let socket = socket2::SockRef::from(&*agent.tcp()).set_linger(Some(Duration::ZERO));
             socket.unwrap();
         }

@@ -1,4 +1,4 @@
-//! Effects of sensors: what they change, that a seed decides it, and that branches, replays and records have it.
+//! Effects of sensors: their changes, which depend only on a seed, and are the same in branches, replays and records.
 
 use std::collections::BTreeSet;
 
@@ -136,7 +136,7 @@ async fn a_branch_with_every_effect_gives_the_same_bytes_over_200_steps() {
     }
 }
 
-/// The same with numbers that are floats, as answers have them.
+/// Converts numbers to floats, as they are in answers.
 fn json_with_floats(sensors: Value) -> Value {
     let typed: wildcity_protocol::message::Sensors = serde_json::from_value(sensors).unwrap();
     serde_json::to_value(typed).unwrap()
@@ -356,7 +356,7 @@ async fn a_delayed_plan_must_be_long_enough() {
         (&json!("session_state"), &json!("pose")),
         "refused now, not later"
     );
-    // Actions take effect after two steps: until then the car rolls on.
+    // Actions take effect after two steps: until then the car keeps its speed.
     let mut agent = server.agent().await;
     open(&mut agent, "acting", "kinematic", json!({ "delay_us": 200_000 })).await;
     agent.look(json!({ "type": "reset" })).await;
@@ -398,7 +398,7 @@ async fn a_replay_decides_again() {
     assert!(report.difference.is_some() && report.wrong_value.is_none());
 }
 
-/// Room for the header is reserved before the header is known, also for what is told of every image.
+/// Room for the header is reserved before the header is known, also for the sensor effects of every image.
 #[tokio::test]
 async fn the_longest_header_of_sensors_fits() {
     let server = TestServer::start().await;

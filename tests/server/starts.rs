@@ -1,4 +1,4 @@
-//! Starts that are drawn with a seed, and episodes with dynamics of their own.
+//! Starts that are sampled with a seed, and episodes with their own dynamics.
 
 use serde_json::{Value, json};
 
@@ -131,7 +131,7 @@ async fn what_is_no_start_is_refused() {
     }
 }
 
-/// After a switch of version and a reset, `resumed` tells what holds now.
+/// After a switch of version and a reset, `resumed` has the present settings.
 #[tokio::test]
 async fn resumed_tells_the_settings_of_now() {
     let server = TestServer::start().await;
