@@ -89,7 +89,7 @@ pub struct SceneContent<'a> {
 /// The files of a scene, by name. `hash` is that of the version's manifest.
 ///
 /// # Errors
-/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors are present at the same time.
+/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors are present at once.
 pub fn files(
     id: &SceneId,
     manifest: &Manifest,

@@ -1,6 +1,5 @@
 //! Off-trajectory views: views with a lateral offset from a twin's recorded drives, repaired by a model, as a data set
-//! for
-//! training.
+//! for training.
 //!
 //! ```text
 //! plan          poses of the views: rounds, offsets, stations

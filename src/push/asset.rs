@@ -118,8 +118,8 @@ fn refused(reason: String) -> PushError {
     PushError::Content { reason, cells: Vec::new() }
 }
 
-/// Waits for the push's permit, makes the asset, and stores it. Dropping the future before the asset is written abandons
-/// the push: nothing of it is visible. The caller ends the push with [`Push::close`].
+/// Waits for the push's permit, makes the asset, and stores it. Dropping the future before the asset is written
+/// abandons the push: nothing of it is visible. The caller ends the push with [`Push::close`].
 ///
 /// # Errors
 /// The content is refused, an asset of another content has the name, or the server could not do it; see

@@ -100,7 +100,7 @@ pub async fn publish(
 
 /// Everything before the commit. `frames_by` is the deadline of the preview's frames.
 ///
-/// The blocking threads hold a clone of the permit, because they may still run for a moment after the push was cancelled:
+/// Blocking threads hold a clone of the permit, because they may still run for a moment after the push was cancelled:
 /// the next push of the twin must not begin before they end.
 async fn read_and_check(
     engine: &Arc<Engine>,

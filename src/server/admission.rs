@@ -3,8 +3,8 @@
 //! A connection counts as unauthenticated until it sends a request that its token allows (any request, on a server
 //! without tokens). Unauthenticated and authenticated connections have separate slots, so that neither can take all.
 //! While all slots for unauthenticated connections are in use, the oldest connection of the address with the most of
-//! them is closed for the next one. So a client that opens connections without using them loses them, and a health check,
-//! which sends its request at once, gets its answer.
+//! them is closed for the next one. So a client that opens connections without using them loses them, and a health
+//! check, which sends its request at once, is answered.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;

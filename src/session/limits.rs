@@ -12,8 +12,8 @@ pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
 /// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
 pub const ACTOR_HEADER_BYTES: usize = 640;
 
-/// Most episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work. Further episodes are not exported, and
-/// the listing says so.
+/// Largest number of episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work. Further episodes are not
+/// exported, and the listing says so.
 pub const WAITING_EXPORTS: usize = 1024;
 
 /// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times its size. A day at
@@ -26,8 +26,8 @@ pub const FAILED_EXPORTS: usize = 1024;
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
-/// An episode ends as `off_model` if the mean trust of one of its observations was below this. It is reached 11.5 m
-/// beside the recorded drive, two lanes beyond the neighbouring one.
+/// An episode ends as `off_model` if the mean trust of one of its observations was below this. It is reached at a
+/// lateral offset of 11.5 m from the recorded drive, two lanes beyond the neighbouring one.
 pub const OFF_MODEL_TRUST: f64 = 0.1;
 
 /// JPEG quality unless the session requests another.

@@ -82,7 +82,8 @@ fn name_whole(temporary: NamedTempFile, dir: &Path, path: &Path) -> io::Result<(
 /// [`limits::LEFTOVER_AGE`] before `now`. The directory need not exist. Returns how many were removed.
 ///
 /// # Errors
-/// The directory cannot be read, or a file cannot be removed: returns the first error, and still removes the other files.
+/// The directory cannot be read, or a file cannot be removed: returns the first error, and still removes the other
+/// files.
 pub fn remove_leftovers(dir: &Path, now: SystemTime) -> io::Result<usize> {
     let entries = match fs::read_dir(dir) {
         Ok(entries) => entries,

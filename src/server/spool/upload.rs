@@ -186,7 +186,8 @@ impl Upload {
     /// Checks the bytes that arrived against the digest, and makes the upload durable. The bytes are durable already.
     ///
     /// # Errors
-    /// [`Fault::SpoolRead`]: the disk cannot be read now, and the upload is kept. After any other error the caller removes the upload.
+    /// [`Fault::SpoolRead`]: the disk cannot be read now, and the upload is kept. After any other error the caller
+    /// removes the upload.
     fn finish(&self) -> Result<(), Fault> {
         let disk = &*self.medium.disk;
         let part = self.file("part");

@@ -77,8 +77,8 @@ impl Exports {
         let _ = self.records.send(record);
     }
 
-    /// Waits until `episode` is not being exported, or until nothing is if it is `None`; at most `longest`. Returns
-    /// whether that is so.
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns
+    /// whether they have ended.
     pub(crate) async fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
         let is_over = |_: &u64| !self.shared.state.lock().is_waiting(episode);
         let mut ended = self.shared.ended.subscribe();

@@ -34,8 +34,8 @@ impl Leases {
 
     /// Takes a lease of a version unless there is one already. Blocks.
     ///
-    /// A failure is only logged: on a store without write access, the process that collects garbage must know by other
-    /// means what is in use.
+    /// A failure is only logged: on a store without write access, the process that collects garbage must get the
+    /// versions in use by other means.
     pub(crate) fn take(&self, resident: &Arc<Resident>) {
         let version = &resident.version;
         let name = &version.manifest.twin;

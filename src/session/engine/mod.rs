@@ -379,8 +379,8 @@ impl Engine {
         self.exports.is_some()
     }
 
-    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns whether
-    /// that is so.
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns
+    /// whether they have ended.
     pub async fn wait_for_exports(&self, episode: Option<&str>, longest: Duration) -> bool {
         match &self.exports {
             Some(exports) => exports.wait(episode, longest).await,

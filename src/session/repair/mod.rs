@@ -5,7 +5,7 @@
 //! exception is a model that fails, for example because it runs too long: its image is delivered as rendered, and is
 //! marked so in the observation and in the record.
 //!
-//! The overlay of a camera is in the rendered image, so the model sees it. Afterwards it is restored: a repaired image
+//! The overlay of a camera is in the rendered image, which the model gets. Afterwards it is restored: a repaired image
 //! has the rendered pixels where the overlay is opaque, and a mixture where it is in part.
 //!
 //! A model may get recorded images in addition to the rendered one. `references` chooses them, `drawn` reads or renders

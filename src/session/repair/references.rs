@@ -1,13 +1,13 @@
 //! Chooses the recorded images that a repair model compares a view with.
 //!
 //! They are chosen by the rig's station on the nearest drive. For a warp these are the images at five places from 8 m
-//! behind the rig to 2 m ahead, of all cameras whose images overlap with the view. More of the places are behind the rig,
-//! because the scene ahead of the rig was seen from there. For the role `reference` it is the nearest image of the same
-//! camera that looks in about the same direction.
+//! behind the rig to 2 m ahead, of all cameras whose images overlap with the view. Most of the places are behind the
+//! rig, because the scene ahead of the rig was seen from there. For the role `reference` it is the nearest image of the
+//! same camera that looks in about the same direction.
 //!
-//! Recorded images of a twin may be at any stations. If a twin has none, the twin itself is rendered every [`STEP_M`] on
-//! its drive, with the session's cameras. These images contain nothing new, but the twin is accurate on its drive, and
-//! inaccurate off the trajectory.
+//! Recorded images of a twin may be at any stations. If a twin has none, the twin itself is rendered every [`STEP_M`]
+//! along its drive, with the session's cameras. These images contain nothing new, but the twin is accurate on its
+//! drive, and inaccurate off the trajectory.
 
 use std::sync::Arc;
 
@@ -126,8 +126,8 @@ impl ReferenceView {
         self
     }
 
-    /// Returns this image for a view of a camera: halved until it has about as many pixels per radian as the view. Of an
-    /// image with more, the view samples only some pixels, and others from one view to the next. A smaller image also
+    /// Returns this image for a view of a camera: halved until it has about as many pixels per radian as the view. From
+    /// an image with more, a view would sample only some pixels, and the next view different ones. A smaller image also
     /// takes less time and memory.
     pub(crate) fn reduced_for(mut self, camera: &Camera) -> Self {
         let px_per_rad = |camera: &Camera| (camera.pinhole.fx * camera.pinhole.fy).sqrt();
@@ -164,8 +164,8 @@ impl ReferenceView {
 }
 
 impl ReferenceViews {
-    /// The references of a version. `table` has its recorded images; if it is empty, the twin is rendered with `cameras`.
-    /// `None` without a recorded drive.
+    /// The references of a version. `table` has the recorded images; if it is empty, the twin is rendered with
+    /// `cameras`. `None` without a recorded drive.
     pub(crate) fn of(
         version: Arc<Version>,
         table: Vec<RecordedView>,
@@ -240,7 +240,7 @@ impl ReferenceViews {
     }
 
     /// The image for the role `reference`: of the same camera, nearest along the drive among those that look in the
-    /// same direction within 30°. The image that was used before, whose name is `kept`, stays until another is 0.5 m nearer.
+    /// same direction within 30°. The previous image, whose name is `kept`, stays until another is 0.5 m nearer.
     pub(crate) fn nearest(
         &self,
         camera: &RigCamera,

@@ -86,8 +86,7 @@ mod tests {
 
     #[test]
     fn a_drift_keeps_its_variance_and_forgets() {
-        let of_seed =
-            |time_us: i64| (0..20_000).map(move |seed| drift(seed, "x", 1000, time_us));
+        let of_seed = |time_us: i64| (0..20_000).map(move |seed| drift(seed, "x", 1000, time_us));
         for time_us in [0, 250, 500, 999, -700] {
             let mean = of_seed(time_us).sum::<f64>() / 2e4;
             let variance = of_seed(time_us).map(|x| x * x).sum::<f64>() / 2e4;

@@ -137,8 +137,8 @@ impl Session {
 
     /// Whether images come with their trust.
     pub fn trust(&self) -> bool {
-        let is_told = self.settings.repair.as_ref().is_none_or(|repair| repair.reports_trust);
-        self.version.coverage.is_some() && is_told
+        let is_reported = self.settings.repair.as_ref().is_none_or(|repair| repair.reports_trust);
+        self.version.coverage.is_some() && is_reported
     }
 
     /// The repair of its images, if it asked for it.

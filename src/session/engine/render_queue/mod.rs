@@ -8,8 +8,8 @@
 //! the small ones, if the backend can do both at once: the operating system shares the cores among them.
 //!
 //! **A frame that cannot be ready in time is not started.** The time that large frames take per pixel is measured. A
-//! frame that cannot be done before its deadline is refused when it arrives, or when it is next: otherwise a server with
-//! too many large frames would discard most of its results.
+//! frame that cannot be done before its deadline is refused when it arrives, or when it is next: otherwise a server
+//! with too many large frames would discard most of its frames.
 
 mod fair;
 mod scratch;

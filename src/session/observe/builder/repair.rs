@@ -72,7 +72,7 @@ pub(super) struct RenderedCapture<'a> {
 /// Decides, for each view of a capture, whether it is a repair candidate. Shared by the threads that finish the views.
 pub(super) struct CandidateFilter {
     pub(super) session: Arc<SessionRepair>,
-    /// For each view of the capture, whether its camera was repaired so far.
+    /// For each view of the capture, whether the repair of its camera is on.
     was_on: Vec<bool>,
 }
 
