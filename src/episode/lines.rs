@@ -3,7 +3,7 @@
 //! ```text
 //! {"kind":"scenario", ...}  after the header: the resolved scenario, the ego's size, the route
 //! {"kind":"actors", ...}    one before each frame that a step rendered: the poses of the actors
-//! {"kind":"event", ...}     contacts, and the reason of the end
+//! {"kind":"event", ...}     contacts, and the reason for the end
 //! {"kind":"result", ...}    before the end: verdict and scores
 //! ```
 //!

@@ -122,7 +122,7 @@ fn refused(reason: String) -> PushError {
 /// abandons the push: nothing of it is visible. The caller ends the push with [`Push::close`].
 ///
 /// # Errors
-/// The content is refused, an asset of another content has the name, or the server could not do it; see
+/// The content is refused, an asset with different content has the name, or the server could not do it; see
 /// [`PushError::is_refusal`].
 pub async fn publish_asset(
     catalog: &Catalog,

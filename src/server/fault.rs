@@ -409,7 +409,7 @@ fn list(names: &[String]) -> String {
     }
 }
 
-/// Whether an error says that a disk, or a user's quota of it, is full.
+/// Whether an error means that a disk, or a user's quota of it, is full.
 pub(crate) fn is_full(cause: &io::Error) -> bool {
     matches!(cause.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }

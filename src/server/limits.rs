@@ -120,7 +120,7 @@ pub const UPLOAD_WRITE_BYTES: usize = 1 << 20;
 /// Largest file of tokens: 200 B each.
 pub const TOKENS_FILE_BYTES: u64 = 1 << 20;
 
-/// How long a ticket is good: a page uses it at once.
+/// How long a ticket is valid: a page uses it at once.
 pub const TICKET_AGE: Duration = Duration::from_secs(30);
 
 /// Largest number of unused tickets: one for each connection, and some for pages that were closed meanwhile.

@@ -1,8 +1,8 @@
 //! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
-//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues
-//! exactly as the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
-//! new one before it replaces the old, so that a step which fails on the way has not happened.
+//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues exactly as
+//! the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records
+//! the new one before it replaces the old, so that a step which fails on the way changes nothing.
 
 use std::collections::VecDeque;
 
@@ -48,7 +48,7 @@ pub struct Episode {
     /// By camera, whether its images are being repaired; empty if none is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     repairing: Vec<bool>,
-    /// By camera, the recorded image that its repair model compares with; empty if there is none.
+    /// For each camera, the recorded image that its repair model compares with; empty if there is none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     references: Vec<Option<String>>,
     /// State of its sensors, if the session has sensor effects.

@@ -91,7 +91,7 @@ pub enum SessionError {
     /// A recorded episode cannot be continued.
     #[error("the recorded episode cannot be continued: {reason}")]
     Branch {
-        /// What prevents it.
+        /// The reason.
         reason: String,
     },
     /// A camera was requested twice.

@@ -32,7 +32,7 @@ pub(crate) enum Plant {
     RecordBeforeObjects,
     /// A lease is not removed when its version is closed.
     LeakedLease,
-    /// In an object store, a log record is put in place of another one.
+    /// In an object store, a put of a log record replaces an existing one.
     RecordReplaced,
     /// A file that the process once failed to read counts as absent until the process ends.
     FailedReadIsAbsent,

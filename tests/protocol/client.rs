@@ -120,7 +120,7 @@ async fn several_sessions_of_one_connection() {
     assert_eq!(requests[1][1], resume);
 }
 
-/// A message that is not what its header says is refused.
+/// A message that differs from its header is refused.
 #[tokio::test]
 async fn damaged_answers_to_step_many() {
     let whole = read("vectors/many/two.bin");

@@ -296,7 +296,7 @@ async fn an_upload_is_that_of_its_token() {
     assert_eq!(begun.status, 201, "{begun:?}");
     let path = begun.header("location").unwrap().to_owned();
 
-    // What it does to that id is done to its own upload.
+    // Its requests with this id concern its own upload.
     let deleted = ask(&server, &format!("DELETE {path}"), Some(RIVAL), "").await;
     assert_eq!(deleted.status, 204);
     ask(&server, &format!("DELETE {path}"), Some(RIVAL), "").await.refused(404, "unknown_upload");

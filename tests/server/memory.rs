@@ -302,7 +302,7 @@ async fn memory_is_given_back() {
     agent.open(json!({ "session": "last" })).await;
     agent.place(step(1.0)).await;
     let target = memory.target.clone();
-    // The observation itself is gone with the next answer. What counts then is the shared memory.
+    // The observation itself is gone with the next answer. After that, only the shared memory counts.
     let prefetch = json!({ "type": "prefetch", "poses": [pose(1.0)] });
     assert_eq!(agent.ask(prefetch).await["type"], "ok");
     assert!(engine.reserve_answer_bytes(ANSWERS_BYTES).is_err(), "the memory is counted");

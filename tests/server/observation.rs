@@ -217,8 +217,8 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
 async fn trust_is_sent_if_it_is_requested() {
     let server = TestServer::start().await;
     let mut agent = open(&server, json!({ "encoding": "raw", "trust": true })).await;
-    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the
-    // horizon. What is looked at of the small rear image is above it.
+    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the horizon. The
+    // sampled pixels of the small rear image are above it.
     let seen = agent.step(20.0).await;
     for (image, low_coverage) in seen.meta["images"].as_array().unwrap().iter().zip([1.0, 0.0]) {
         let trust = &image["trust"];

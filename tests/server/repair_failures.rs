@@ -65,7 +65,7 @@ async fn what_cannot_be_repaired_is_refused_at_open_and_names_the_field() {
         assert_eq!(answer["field"], field, "{repair}: {answer}");
         assert!(answer["message"].as_str().unwrap().contains(message), "{repair}: {answer}");
     }
-    // The connection goes on.
+    // The connection continues.
     agent.open(opening("a", Value::Null)).await;
     step(&mut agent, 2.0).await;
     assert_eq!(server.recorded().len(), 1);

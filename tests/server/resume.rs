@@ -155,7 +155,7 @@ async fn a_lost_answer_to_close_can_be_repeated() {
         assert_eq!(found, [&json!("resumed"), &json!(seq), &json!(1), &json!(100_000)]);
         agent.seq = seq;
         assert_eq!(agent.ask(json!({ "type": "close" })).await, closed);
-        // The connection goes on with the next number.
+        // The connection continues with the next number.
         refused(&agent.ask(json!({ "type": "close" })).await, "session_state");
         agent.open(json!({ "session": "b" })).await;
         agent.ask(json!({ "type": "close" })).await;

@@ -97,7 +97,7 @@ async fn a_branch_with_every_effect_gives_the_same_bytes_over_200_steps() {
         }
         original.extend(drive(&mut agent, model, 101, 200).await);
 
-        // The session itself, and another one beside it.
+        // The session itself, and then another session.
         for done in [37, 0] {
             let name = format!("at-{done}");
             let restored = agent.look(json!({ "type": "restore", "name": name })).await;
@@ -371,7 +371,7 @@ async fn a_delayed_plan_must_be_long_enough() {
     }
 }
 
-/// A record whose image was taken at another time than the settings say is found out.
+/// A replay detects a record whose image was not taken at the time that the settings give.
 #[tokio::test]
 async fn a_replay_decides_again() {
     let server = TestServer::start().await;

@@ -37,7 +37,7 @@ async fn a_random_start_is_drawn_with_the_seed_of_the_episode() {
         }
         places.push([along_m, left_m, heading_rad]);
     }
-    // Each draw uses its whole range, and none follows from another one.
+    // Each sampled value uses its whole range, and is independent of the others.
     let spread = |axis: usize| {
         let values = || places.iter().map(|place| place[axis]);
         values().fold(f64::MIN, f64::max) - values().fold(f64::MAX, f64::min)

@@ -214,7 +214,7 @@ async fn a_late_frame_shows_the_actors_of_when_it_was_taken() {
         }
         assert_ne!(truth[2][0], truth[5][0], "the car must be seen to move");
 
-        // The same from a snapshot, and in a replay of both records.
+        // The images are the same from a snapshot, and in a replay of both records.
         assert_eq!(hashes(&session.restore("two").await.unwrap()), seen[2]);
         for (step, before) in seen.iter().enumerate().skip(3) {
             let again = hashes(&session.step(demo().at(EGO_M), false).await.unwrap());

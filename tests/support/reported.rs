@@ -18,7 +18,7 @@ pub(crate) fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Ar
     commit_reaching(dir, trajectories, None)
 }
 
-/// The same, drawn up to a distance from each camera, in metres.
+/// As [`commit`], drawn up to a distance from each camera, in metres.
 pub(crate) fn commit_reaching(
     dir: &std::path::Path,
     trajectories: Vec<Trajectory>,

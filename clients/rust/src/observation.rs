@@ -18,10 +18,10 @@ const HISTORY_ROT: &str = "ego.history_rot";
 const IMU: &str = "sensor.imu";
 const WHEEL_SPEED: &str = "sensor.wheel_speed";
 
-/// What the ego sees at one time: metadata, images, and the ego's past poses.
+/// An observation of the ego at one time: metadata, images, and the ego's past poses.
 ///
-/// [`Observation::decode`] checks everything but two things: the contents of JPEG and PNG files, which are
-/// decoded on demand by [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
+/// [`Observation::decode`] checks everything except the contents of JPEG and PNG files, which are decoded on demand by
+/// [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
 ///
 /// ```
 /// use wildcity_client::Observation;

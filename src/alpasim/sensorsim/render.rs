@@ -219,8 +219,8 @@ fn no_image() -> Image {
     Err(SensorsimError::Invalid("no image was made".to_owned()))
 }
 
-/// The same error for each of several requests. Errors cannot be cloned, because the operating system's errors cannot,
-/// so their messages for the client are.
+/// The same error for each of several requests. Errors of the operating system cannot be cloned, but the messages for
+/// the client can.
 fn repeated(error: &SensorsimError, count: usize) -> impl Iterator<Item = Image> + use<> {
     let status = error.status();
     (0..count).map(move |_| Err(SensorsimError::Repeated(status.clone())))

@@ -17,7 +17,7 @@ const LEAST_MPS2: f64 = 0.01;
 
 type Entities = BTreeMap<String, Entity>;
 
-/// Reads the actions before the start.
+/// Reads the actions of `Init`.
 pub(super) fn read_init(init: Element<'_>, entities: &mut Entities) -> Result<(), ConvertError> {
     init.only(&["Actions"])?;
     let actions = init.need("Actions")?;

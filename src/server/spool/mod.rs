@@ -228,7 +228,7 @@ impl Spool {
     }
 
     /// Reads the directory. Files of uploads that cannot be continued are removed; files of other names, and files that
-    /// cannot be read now, are left alone.
+    /// cannot be read now, are not changed.
     fn recover(&self) -> io::Result<()> {
         let names = self.medium.disk.list(&self.medium.dir)?;
         let upload_stem = |name: &String| {

@@ -185,8 +185,8 @@ impl Engine {
     /// Opens a version and loads the sections that some frames of it need, so that sessions at these viewpoints do not
     /// wait when they switch to it. `frames` has the viewpoints of each frame.
     ///
-    /// Loads only what fits beside the sections that sessions need now or soon, which go first, and
-    /// returns after [`limits::PRELOAD_TIMEOUT`] even if something is still missing.
+    /// Loads only sections that fit into memory in addition to those that sessions need now or soon, which are loaded
+    /// first, and returns after [`limits::PRELOAD_TIMEOUT`] even if something is still missing.
     ///
     /// # Errors
     /// The version cannot be opened.
@@ -263,7 +263,7 @@ impl Engine {
     /// while the asset is read, unless it is in memory already.
     ///
     /// # Errors
-    /// There is none, or it is damaged, or there is no room for it.
+    /// There is no such asset, or it is damaged, or there is too little memory.
     pub fn actor(&self, hash: &str) -> Result<Arc<ResidentActor>, SessionError> {
         Ok(self.cache.actor(hash)?)
     }
@@ -329,10 +329,10 @@ impl Engine {
         run_blocking(move || resident.worst_case_bytes_with(extent, &profile)).await
     }
 
-    /// Runs `work` on a render thread in its session's turn. Returns its result and how long it was queued.
+    /// Runs `work` on a render thread when its session is next. Returns its result and how long it was queued.
     ///
     /// # Errors
-    /// [`SessionError::Busy`] if the queue is full, or the frames before it leave it no time;
+    /// [`SessionError::Busy`] if the queue is full, or earlier frames leave it no time;
     /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
     /// result by the deadline. Work that has not
     /// started by then never starts; work that has is finished, and its result is discarded.

@@ -26,7 +26,7 @@ impl LatestTask {
             if !state.running {
                 state.running = true;
                 let shared = self.0.clone();
-                // Nothing waits for the thread's end.
+                // The end of the thread is not awaited.
                 drop(tokio::task::spawn_blocking(move || run_all(&shared)));
             }
             state.next.replace(Box::new(task))

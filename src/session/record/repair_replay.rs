@@ -1,8 +1,8 @@
-//! The repair of a recorded episode, decided and done again.
+//! Repeats the repair of a recorded episode and its decisions.
 //!
-//! The decisions depend on the trust of the rendered images, which is computed again, and are compared with the
-//! record always. Repaired pixels are compared if the model is at hand, has the recorded hash and repeats its
-//! bytes; otherwise the report says that they were not.
+//! The decisions depend on the trust of the rendered images, which is computed again, and are compared with the record
+//! always. Repaired pixels are compared if the model is available, has the recorded hash and is deterministic;
+//! otherwise the report mentions that they were not compared.
 
 use std::sync::Arc;
 

@@ -129,7 +129,7 @@ pub enum ReplayError {
         path: PathBuf,
         /// The line, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
     /// The recorded cameras are invalid.

@@ -36,7 +36,7 @@ pub(crate) struct ReferenceSupply<'a> {
 /// References of a view that are needed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct NeededReferences {
-    /// Those that are warped into the view by its depth.
+    /// Images that are warped into the view by its depth.
     pub warped: bool,
     /// The nearest of the same camera.
     pub nearest: bool,

@@ -127,7 +127,7 @@ impl Scenarios {
         let files = entries.map(|entry| entry.path());
         let scenarios = files.filter(|path| path.extension().is_some_and(|name| name == "json"));
         let is_scenario = |path: &PathBuf| {
-            // Tracks and maps are JSON too. A prefix tells them apart without reading them whole.
+            // Tracks and maps are JSON as well. They are distinguished by a prefix, without reading the whole files.
             let mut head = vec![0; 4096];
             let read = File::open(path).and_then(|mut file| file.read(&mut head));
             read.is_ok_and(|count| {

@@ -87,7 +87,7 @@ impl SessionScenario {
         }
     }
 
-    /// Where an episode starts, if the scenario says.
+    /// The start of an episode, if the scenario gives it.
     pub(crate) fn start_of(&self, loaded: &LoadedScenario) -> Option<Start> {
         let start = loaded.scenario.start.as_ref().filter(|_| self.gives_start)?;
         Some(match start {

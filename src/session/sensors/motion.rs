@@ -40,8 +40,8 @@ pub(crate) struct MotionSample {
 }
 
 impl MotionSample {
-    /// Of the step of `dt_us` that led from one state to another; at the start of an episode there is no step, and both
-    /// are the same.
+    /// The sample of a step of `dt_us` from one state to another. At the start of an episode there is no step, and both
+    /// are equal.
     pub(crate) fn new(from: &Ego, to: &Ego, dt_us: i64, time_us: i64) -> Self {
         let rig_from_world = to.world_from_rig().rotation.inverse();
         let turned =
@@ -56,7 +56,7 @@ impl MotionSample {
         }
     }
 
-    /// What the unit measures: specific force and angular velocity.
+    /// The sample of the unit: specific force and angular velocity.
     pub(crate) fn imu(&self, imu: &Imu, seed: u64) -> [f32; 6] {
         let mut random = Random::new(seed, "imu/noise", self.time_us as usize);
         let mut axis = |index: usize| {
@@ -73,7 +73,7 @@ impl MotionSample {
         std::array::from_fn(&mut axis)
     }
 
-    /// What the wheels measure.
+    /// The sample of the wheel speed.
     pub(crate) fn wheel_speed(&self, wheels: &WheelSpeed, seed: u64) -> f32 {
         let scale = standard_normal(&mut Random::new(seed, "wheels/scale", 0));
         let mut random = Random::new(seed, "wheels/noise", self.time_us as usize);

@@ -23,7 +23,7 @@ pub enum Change {
     Same,
     /// Had no verdict before, or failed before and has none now.
     Unknown,
-    /// The twin or the scenario differs: says nothing about the driver.
+    /// The twin or the scenario differs, so that the episodes say nothing about the driver.
     Changed,
     /// Was not driven now.
     OnlyBefore,

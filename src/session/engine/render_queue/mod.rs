@@ -105,7 +105,7 @@ impl RenderQueue {
     /// Runs `work` on a render thread. Returns its result and how long it was queued.
     ///
     /// # Errors
-    /// [`SessionError::Busy`] if the queue is full, or the frames before it leave it no time;
+    /// [`SessionError::Busy`] if the queue is full, or earlier frames leave it no time;
     /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
     /// result by the deadline. Work that has not started by then never starts; work that has is finished, and
     /// its result is discarded.
@@ -348,7 +348,7 @@ mod tests {
         FrameCost { session, pixels: 2 * limits::LARGE_PIXELS }
     }
 
-    /// Twelve sessions with large frames of 100 ms beside one with small frames of 1 ms.
+    /// Twelve sessions with large frames of 100 ms, and one with small frames of 1 ms.
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn small_frames_do_not_wait_for_large_ones() {
         let queue = RenderQueue::start(Arc::new(IdleBackend { frames_in_flight: 1 })).unwrap();
