@@ -28,7 +28,7 @@ pub const MOST_DEPTH_M: f32 = 65.0;
 /// pinhole of 120° has four times as many pixels per radian at its edge as in its middle.
 pub const MOST_SLOPE: f64 = 1.191_753_592_594_21;
 
-/// Default number of COLMAP's points: enough to initialise the training of a street.
+/// Default number of COLMAP's points: the number with which a trainer starts on a street.
 pub const POINTS: u32 = 100_000;
 
 /// Largest number of points: 51 MB of text.

@@ -237,7 +237,7 @@ async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError
     Ok(run_blocking(move || logged(recorder.append(&lines))).await??)
 }
 
-/// Logs a failure, because it concerns the operator, who may not learn of it from the client.
+/// Logs a failure for the operator, because the client may not report it.
 fn logged<T>(recorded: Result<T, RecordError>) -> Result<T, RecordError> {
     recorded.inspect_err(|error| tracing::error!("{error}"))
 }
