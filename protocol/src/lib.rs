@@ -1,9 +1,9 @@
 //! The messages of the protocol `wildcity.v1`. This package has the types that are sent, and nothing else.
 //!
-//! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server, matched by
-//! `seq`. Binary frames are [observations](observation). [`http`] has the bodies of HTTP requests and answers
-//! for uploads, pushes and versions. `protocol/README.md` describes the protocol; the JSON schemas beside it
-//! are generated from these types, and [`decode`] compares what clients send with them.
+//! Text frames are JSON: [`message::Request`] from the client, [`message::Answer`] from the server, matched by `seq`.
+//! Binary frames are [observations](observation). [`http`] has the bodies of HTTP requests and answers for uploads,
+//! pushes and versions. `protocol/README.md` describes the protocol; the JSON schemas in `protocol/schema` are
+//! generated from these types, and [`decode`] compares messages of clients with them.
 //!
 //! ```
 //! use wildcity_protocol::message::{Pose, Request};

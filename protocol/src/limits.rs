@@ -14,7 +14,7 @@ pub const OBSERVATION_BYTES: usize = 3 << 29;
 /// 3.5 kB, together 0.9 MB.
 pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
-/// Slots of a shared memory: the observation that an agent looks at, the one before it, and the one that is written.
+/// Slots of a shared memory: the observation that an agent processes, the previous one, and the one that is written.
 pub const MEMORY_SLOTS: usize = 3;
 
 /// How long the first message of a connection may take.

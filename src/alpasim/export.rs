@@ -1,7 +1,7 @@
 //! The files of a scene that AlpaSim's runtime reads itself: rig, cameras, tracks and map.
 //!
 //! The runtime reads them from a zip archive named `.usdz`. Poses are in the scene's local frame, so that
-//! `world_to_nre` is the identity. There is no mesh: the runtime's physics is disabled, or that of this package.
+//! `world_to_nre` is the identity. There is no mesh: the runtime's physics is disabled, or the physics of this package.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -33,7 +33,7 @@ const LANE_M: f64 = 3.5;
 /// Distance between two points of the map's road, in metres.
 const ROAD_STEP_M: f64 = 2.0;
 
-/// How far the road goes on after the end of the scene, in metres: a driver plans beyond it.
+/// Length of the road after the end of the scene, in metres, because a driver plans beyond the end.
 const BEYOND_M: f64 = 120.0;
 
 /// Length, width and height of the ego's box, and the box's centre in the rig frame, in metres: a car with the
@@ -59,7 +59,7 @@ pub enum ExportError {
         /// The scene.
         scene: String,
     },
-    /// More recorded actors are there at once than an image may show.
+    /// More recorded actors are present at the same time than an image may show.
     #[error(
         "{scene} has {count} recorded actors at {since_us} us; an image shows at most {most}: leave some out of the \
          tracks, or choose other starts",
@@ -75,7 +75,7 @@ pub enum ExportError {
     },
 }
 
-/// What a scene has beside its twin.
+/// Parts of a scene in addition to its twin.
 #[derive(Clone, Copy, Debug)]
 pub struct SceneContent<'a> {
     /// The cameras that it offers.
@@ -89,7 +89,7 @@ pub struct SceneContent<'a> {
 /// The files of a scene, by name. `hash` is that of the version's manifest.
 ///
 /// # Errors
-/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors are there at once.
+/// The manifest has no such scene, or it is too short, or a track is damaged, or too many actors are present at once.
 pub fn files(
     id: &SceneId,
     manifest: &Manifest,
@@ -169,7 +169,7 @@ fn rig_trajectories(cameras: &[RigCamera], poses: &[(i64, Pose)]) -> Value {
     let frames: serde_json::Map<_, _> = cameras
         .iter()
         .map(|camera| {
-            // The runtime wants an end after the start, for global shutters too.
+            // The runtime requires an end after the start, even for global shutters.
             let open_us = camera.shutter.map_or(1, |shutter| shutter.duration_us);
             let ranges: Vec<[i64; 2]> = times.iter().map(|&end| [end - open_us, end]).collect();
             (unique_id(camera), json!(ranges))
@@ -199,7 +199,7 @@ struct SceneTrack {
 }
 
 /// The part of a recorded actor's track that a scene shows, at the scene's times since `start_us`; `None` if it is
-/// there at fewer than two of them.
+/// present at fewer than two of them.
 fn track(
     section: &TrackSection,
     start_us: i64,
@@ -231,8 +231,8 @@ fn track(
     Ok(is_shown.then_some(SceneTrack { id, label, size_m: section.size, poses }))
 }
 
-/// The first time, in microseconds since the scene's start, at which more actors are there than an image may show, and
-/// their number.
+/// The first time, in microseconds since the scene's start, at which more actors are present than an image may show,
+/// and their number.
 fn crowded(tracks: &[SceneTrack]) -> Option<(i64, usize)> {
     let mut counts: BTreeMap<i64, usize> = BTreeMap::new();
     for (time_us, _) in tracks.iter().flat_map(|track| &track.poses) {
@@ -265,7 +265,7 @@ fn rows(pose: &Pose) -> [[f64; 4]; 4] {
     DMat4::from_rotation_translation(pose.rotation, pose.position_m).transpose().to_cols_array_2d()
 }
 
-/// One OpenDRIVE road along the poses: straight lines with an elevation, the ego's lane and one beside it. It has no
+/// One OpenDRIVE road along the poses: straight lines with an elevation, the ego's lane and an adjacent one. It has no
 /// `geoReference`, so that its coordinates are those of the local frame.
 fn road(poses: &[(i64, Pose)]) -> String {
     let mut points: Vec<DVec3> = Vec::new();

@@ -5,7 +5,7 @@
 //! grpc        one gRPC method over HTTP/2
 //! scene       scenes: pieces of recorded drives, and their local frames
 //! camera      cameras, poses and shutters, to and from the wire
-//! object      dynamic objects: what their ids stand for
+//! object      dynamic objects, as their ids describe them
 //! sensorsim   wildcity as AlpaSim's renderer
 //! physics     wildcity as AlpaSim's physics: boxes on the ground
 //! export      scenes as the files that AlpaSim's runtime reads
@@ -13,11 +13,11 @@
 //! ```
 //!
 //! # Facts of the contract
-//! AlpaSim connects without TLS and without tokens, so that the services listen on loopback addresses
-//! unless told otherwise. All floats of poses are f32, and AlpaSim keeps its own poses in f32 as well: 8 mm at
-//! 100 km. So a scene has a local frame near its start, with the axes of the world. Messages have at most
-//! 64 MiB, as the clients' own limit. There is no .proto file and no code generator here: the messages are written
-//! by hand from the published field numbers, and a test calls every method with the stubs of another package.
+//! AlpaSim connects without TLS and without tokens, so that the services listen on loopback addresses unless told
+//! otherwise. All floats of poses are f32, and AlpaSim keeps its own poses in f32 as well: 8 mm at 100 km. So a scene
+//! has a local frame near its start, with the axes of the world. Messages have at most 64 MiB, as the clients' own
+//! limit. This package has no .proto file and no code generator: the messages are written by hand from the published
+//! field numbers, and a test calls every method with the stubs of another package.
 
 pub mod camera;
 pub mod egodriver;

@@ -44,7 +44,7 @@ pub const PHYSICS_ROTATION_RAD: f64 = 0.174_532_925_199_432_95;
 /// Distance between two listed starts along a drive, in metres.
 pub const SCENE_SPACING_M: f64 = 100.0;
 
-/// Most listed scenes: 1,000 km of drives.
+/// Largest number of listed scenes: 1,000 km of drives.
 pub const LISTED_SCENES: usize = 10_000;
 
 /// Length of the trajectory of a scene, in seconds.
@@ -59,7 +59,7 @@ pub const CONNECTIONS: usize = 256;
 /// How long connections may take to send their last answers when the service stops.
 pub const DRAIN: Duration = Duration::from_secs(2);
 
-/// Time of the start of every scene, in microseconds since 1970: AlpaSim wants integers of this size.
+/// Time of the start of every scene, in microseconds since 1970: AlpaSim requires integers of this size.
 pub const EPOCH_US: u64 = 1_700_000_000_000_000;
 
 /// How long a driver may take until it answers: networks of 20 GB are loaded from disk.

@@ -1,7 +1,7 @@
-//! Dynamic objects: what moves in a scene beside the ego.
+//! Dynamic objects: moving objects of a scene other than the ego.
 //!
-//! A request for an image names an object by its track's id alone, with poses of the middle of its box. So the id says
-//! what is drawn, as the id of a scene does, and the server keeps no table:
+//! A request for an image names an object only by its track's id, with poses of the middle of its box. So the id
+//! describes the object, as the id of a scene describes the scene, and the server keeps no table:
 //!
 //! | id | what is drawn |
 //! |---|---|
@@ -23,7 +23,7 @@ use wildcity_scene::{ActorBox, ActorClass, Gaussians, sh};
 
 use crate::limits;
 
-/// The box of an object of which nothing is known.
+/// The box of an unknown object.
 const CAR: ActorBox = ActorBox { length_m: 4.6, width_m: 1.9, height_m: 1.6 };
 
 /// Red, green and blue of a box without a colour.
@@ -43,10 +43,10 @@ const NAMED: usize = 64;
 /// The logit of an opacity of 0.99.
 const LOGIT_OPACITY: f32 = 4.595;
 
-/// Share of its colour that a face has, so that the edges of a box are seen: front and rear, left and right, top.
+/// Factor of the colour of a face, so that the edges of a box are visible: front and rear, left and right, top.
 const SHADES: [f64; 3] = [0.7, 0.85, 1.0];
 
-/// What an object is drawn from.
+/// The shape of an object.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ObjectShape {
     /// An asset, by its hash or its name.
@@ -58,7 +58,7 @@ pub enum ObjectShape {
         /// Its red, green and blue.
         rgb8: [u8; 3],
     },
-    /// Nothing is known: a grey box of the size of a car.
+    /// Unknown: a grey box of the size of a car.
     Unknown,
 }
 
@@ -69,18 +69,18 @@ pub enum ObjectShape {
      or a NAME without @"
 )]
 pub struct ObjectError {
-    /// The refused id; of one that is too long, its first characters.
+    /// The refused id, or the first characters of an id that is too long.
     pub id: String,
-    /// What is wrong with it.
+    /// The error.
     pub reason: String,
 }
 
 impl ObjectShape {
-    /// What a track's id stands for.
+    /// The object of a track's id.
     ///
     /// # Errors
-    /// It is longer than [`limits::TRACK_ID_BYTES`], or what follows its `@` is no name, and no size that an actor may
-    /// have.
+    /// It is longer than [`limits::TRACK_ID_BYTES`], or the text after its `@` is neither a name nor a size that an
+    /// actor may have.
     pub fn of_track(id: &str) -> Result<Self, ObjectError> {
         let most = limits::TRACK_ID_BYTES;
         if id.len() > most {
@@ -94,8 +94,8 @@ impl ObjectShape {
         shape.parse().map_err(|reason| ObjectError { id: id.to_owned(), reason })
     }
 
-    /// What it is drawn from, as a text: equal for equal boxes, however they were written. That of a box has a `#`,
-    /// which no name and no hash has.
+    /// Key of the shape, which is equal for equal boxes, however they were written. The key of a box has a `#`, which
+    /// names and hashes cannot have.
     pub fn key(&self) -> String {
         let (size, [red, green, blue]) = match self {
             Self::Asset(name) => return name.clone(),
@@ -115,10 +115,10 @@ impl ObjectShape {
         }
     }
 
-    /// The asset of a box; `None` for one of the store.
+    /// The asset of a box; `None` for an asset of the store.
     ///
     /// # Errors
-    /// It has too many Gaussians, which a checked box never has.
+    /// It has too many Gaussians, which never happens for a checked box.
     pub fn box_asset(&self) -> Result<Option<ActorAsset>, AssetError> {
         let (size, rgb8) = match self {
             Self::Asset(_) => return Ok(None),
@@ -135,7 +135,7 @@ impl ObjectShape {
     }
 }
 
-/// What follows the `@` of an id.
+/// Parses the text after the `@` of an id.
 impl FromStr for ObjectShape {
     type Err = String;
 
@@ -200,7 +200,7 @@ fn rgb8(hex: &str) -> Option<[u8; 3]> {
     Some([red, green, blue])
 }
 
-/// Five faces of a box, all but the one on the ground, of flat Gaussians.
+/// The five faces of a box that are not on the ground, as flat Gaussians.
 fn gaussians(size: ActorBox, rgb8: [u8; 3]) -> Gaussians {
     let extents_m = DVec3::new(size.length_m, size.width_m, size.height_m);
     let cells = (extents_m / CELL_M).ceil().min(DVec3::splat(MOST_CELLS)).max(DVec3::ONE);

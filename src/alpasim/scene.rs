@@ -1,7 +1,7 @@
 //! Scenes: AlpaSim's name for a piece of a recorded drive.
 //!
-//! The id `TWIN@VERSION+TRAJECTORY+START_M`, such as `demo@1+log+100`, says all: the server keeps no table.
-//! `@` and `+` are in no name, and AlpaSim makes folders of a `/`.
+//! The id `TWIN@VERSION+TRAJECTORY+START_M`, such as `demo@1+log+100`, is complete, so that the server keeps no table.
+//! Names cannot have `@` and `+`, and AlpaSim creates folders for a `/`.
 //!
 //! The local frame of a scene has the axes of the world. Its origin is the drive's position at START_M, rounded to
 //! whole metres, so that f32 poses lose nothing.
@@ -35,7 +35,7 @@ pub struct SceneId {
 /// Why an id or a pose was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SceneError {
-    /// The text is no id.
+    /// The text is not an id.
     #[error("{id:?} is no scene: expected TWIN@VERSION+TRAJECTORY+START_M, as demo@1+log+0")]
     Id {
         /// The refused text.
@@ -64,7 +64,7 @@ pub enum SceneError {
     Pose {
         /// The pose.
         field: &'static str,
-        /// What is wrong with it.
+        /// The error.
         cause: PoseError,
     },
     /// A pose is missing.
@@ -142,7 +142,7 @@ pub struct LocalFrame {
 }
 
 impl LocalFrame {
-    /// A pose in the world from one in this frame.
+    /// Converts a pose from this frame to the world.
     ///
     /// # Errors
     /// It is missing or invalid; the error names `field`.
@@ -162,7 +162,7 @@ impl LocalFrame {
         Ok(Pose { position_m: local.position_m + self.origin_m, ..local })
     }
 
-    /// A pose in this frame from one in the world.
+    /// Converts a pose from the world to this frame.
     pub fn local_from(&self, world: &Pose) -> common::Pose {
         pose_to_wire(&Pose { position_m: world.position_m - self.origin_m, ..*world })
     }

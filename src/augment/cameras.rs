@@ -22,12 +22,12 @@ pub struct TrainingCamera {
     pub rig_from_camera: Pose,
 }
 
-/// A camera model that transforms.json and COLMAP both know.
+/// A camera model that both transforms.json and COLMAP support.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CameraModel {
     /// fx, fy, cx, cy.
     Pinhole,
-    /// The same and k1, k2, p1, p2.
+    /// A pinhole with k1, k2, p1, p2.
     OpenCv,
     /// fx, fy, cx, cy and k1 to k4 of the angle.
     OpenCvFisheye,
@@ -111,10 +111,10 @@ impl CameraModel {
     }
 }
 
-/// A pinhole of the field of a lens, with an image of the same size: its sides are where the lens' field ends along the
-/// row and the column of the principal point, but at most 50° off the axis. Pixels need not be square.
+/// A pinhole of the field of a lens, with an image of the same size: its sides are where the field of the lens ends on
+/// the row and the column of the principal point, but at most 50° off the axis. Pixels need not be square.
 ///
-/// A pinhole without a windshield stays what it is.
+/// A pinhole without a windshield is returned unchanged.
 pub fn pinhole_of(camera: &Camera) -> Camera {
     if camera.is_pinhole() {
         return *camera;
@@ -124,7 +124,7 @@ pub fn pinhole_of(camera: &Camera) -> Camera {
     let slopes = |side_px: DVec2| {
         let at_px = |step: u32| side_px.lerp(center_px, f64::from(step) / f64::from(STEPS));
         let ray = (0..STEPS).find_map(|step| camera.unproject(at_px(step)));
-        // Behind the camera plane there is no slope.
+        // Behind the camera plane the slope is undefined.
         let ray = ray.filter(|ray| ray.z > 0.0);
         ray.map(|ray| ray.truncate() / ray.z)
     };

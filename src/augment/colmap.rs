@@ -30,7 +30,7 @@ impl ColmapForm {
     }
 }
 
-/// What is written.
+/// Contents of the model.
 #[derive(Clone, Copy, Debug)]
 pub struct ColmapModel<'a> {
     /// The model of all cameras.

@@ -1,4 +1,4 @@
-//! What can go wrong, with what to do about it.
+//! Errors, with their remedies.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -13,10 +13,10 @@ pub enum AugmentError {
         field: &'static str,
         /// Its value.
         value: f64,
-        /// What it may be.
+        /// The accepted values.
         expected: String,
     },
-    /// There is no drive beside which views could be.
+    /// The twin has no drive to offset views from.
     #[error("the twin has no recorded drive: `wildcity twin drive` adds one")]
     NoDrive,
     /// More samples than one round may have.
@@ -38,7 +38,7 @@ pub enum AugmentError {
     Lens {
         /// The camera.
         camera: String,
-        /// What it has.
+        /// Property of the lens that cannot be described.
         lens: &'static str,
     },
     /// Cameras of different models.
@@ -51,7 +51,7 @@ pub enum AugmentError {
         camera: String,
         /// Its model.
         model: &'static str,
-        /// That of the cameras before it.
+        /// Model of the cameras before it.
         other: &'static str,
     },
     /// A folder that was made with something else.
@@ -63,9 +63,9 @@ pub enum AugmentError {
     MadeOtherwise {
         /// The folder.
         dir: PathBuf,
-        /// What differs, by its name in augment.json.
+        /// The field that differs, by its name in augment.json.
         field: String,
-        /// Its value there.
+        /// Its value in augment.json.
         there: String,
         /// The value now.
         here: String,
@@ -79,7 +79,7 @@ pub enum AugmentError {
         /// The folder.
         dir: PathBuf,
     },
-    /// Another run writes there.
+    /// Another run writes to the folder.
     #[error("another `wildcity augment` writes to {}: wait for it, or give another --out", dir.display())]
     InUse {
         /// The folder.
@@ -90,7 +90,7 @@ pub enum AugmentError {
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
     /// An image has another number of values than its camera.

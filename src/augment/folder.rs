@@ -1,9 +1,9 @@
 //! The folder of a round: samples renamed into place, and a run that continues after them.
 //!
-//! Each file is written under a temporary name and renamed. A sample whose files are all there gets a line in
-//! `samples.partial.jsonl`. augment.json is written at the beginning, without the samples that are still to be
-//! drawn, and at the end, with all of them. So a run that was killed at any time leaves a folder that says what it was
-//! made with, and the next one trusts those samples whose files have the hashes that are on record.
+//! Each file is written under a temporary name and renamed. When all files of a sample are written, it gets a line in
+//! `samples.partial.jsonl`. augment.json is written at the start, without the samples that are still to be rendered,
+//! and at the end, with all of them. So the folder of a run that was killed at any time has the settings of this run,
+//! and the next run keeps the samples whose files have the recorded hashes.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, TryLockError};
@@ -53,11 +53,11 @@ struct ReadRecord {
 }
 
 impl Folder {
-    /// Opens the folder, which may be missing or hold an unfinished or finished round, and checks the samples that are
-    /// there. `progress` is told how many of how many are checked.
+    /// Opens the folder, which may be missing or hold an unfinished or finished round, and checks its samples. Calls
+    /// `progress` with the number of checked samples and the number of all.
     ///
     /// # Errors
-    /// It was made with something else, is not a folder of a round, or another run writes there.
+    /// It was made with other settings, is not a folder of a round, or another run writes there.
     pub fn open(
         dir: &Path,
         header: Header,
@@ -97,18 +97,18 @@ impl Folder {
         }
         let damaged = total as usize - samples.len();
         let path = dir.join(JOURNAL);
-        // augment.json has what the journal had before the journal is emptied.
+        // Write the samples of the journal to augment.json before the journal is emptied.
         write_record(dir, &header, false, &samples.values().collect::<Vec<_>>())?;
         let journal = File::create(&path).map_err(AugmentError::file(&path))?;
         Ok(Self { dir: dir.to_owned(), header, samples, journal, damaged, _lock: lock })
     }
 
-    /// Whether the sample of this name is there.
+    /// Whether the folder has a sample of this name.
     pub fn has(&self, name: &str) -> bool {
         self.samples.contains_key(name)
     }
 
-    /// Number of samples that are there.
+    /// Number of samples in the folder.
     pub fn count(&self) -> usize {
         self.samples.len()
     }
@@ -118,7 +118,7 @@ impl Folder {
         self.damaged
     }
 
-    /// Writes the files of a sample, and then puts it on record. Its hashes are filled in.
+    /// Writes the files of a sample, and then records it with the hashes of its files.
     ///
     /// # Errors
     /// A file cannot be written.
@@ -158,12 +158,12 @@ impl Folder {
     }
 }
 
-/// SHA-256 in hex, which every language has at hand.
+/// SHA-256 in hex, which is available in every language.
 fn hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// The right to write to a folder: a locked file, which is removed at the end. The system unlocks it when the process
+/// The lock of a folder for writing: a locked file, which is removed at the end. The system unlocks it if the process
 /// ends in another way.
 #[derive(Debug)]
 struct Lock {
@@ -181,7 +181,7 @@ impl Lock {
             Err(TryLockError::WouldBlock) => return Err(in_use()),
             Err(TryLockError::Error(cause)) => return Err(AugmentError::File { path, cause }),
         }
-        // Another run may have removed the file between the two, and then a third one has a new file.
+        // Another run may have removed the file between creation and lock, and a third run may have created a new one.
         let inode = |metadata: fs::Metadata| metadata.ino();
         let own = file.metadata().map(inode).map_err(AugmentError::file(&path))?;
         match fs::metadata(&path).map(inode) {
@@ -193,12 +193,12 @@ impl Lock {
 
 impl Drop for Lock {
     fn drop(&mut self) {
-        // If it stays, the next run locks it.
+        // If it cannot be removed, the next run locks it.
         let _ = fs::remove_file(&self.path);
     }
 }
 
-/// Whether nothing is there but what a run leaves that was killed before it wrote augment.json.
+/// Whether the folder has only files of a run that was killed before it wrote augment.json.
 fn is_empty(dir: &Path) -> Result<bool, AugmentError> {
     let ours: BTreeSet<String> = [LOCK.to_owned(), temporary_name(RECORD)].into();
     for entry in fs::read_dir(dir).map_err(AugmentError::file(dir))? {
@@ -231,13 +231,13 @@ fn read_journal(path: &Path) -> Result<Vec<Sample>, AugmentError> {
     let mut samples = Vec::new();
     for line in BufReader::new(file.take(RECORD_BYTES)).split(b'\n') {
         let line = line.map_err(AugmentError::file(path))?;
-        // What cannot be read is drawn again.
+        // A sample whose line cannot be read is rendered again.
         samples.extend(serde_json::from_slice::<Sample>(&line).ok());
     }
     Ok(samples)
 }
 
-/// Whether the files of a sample are there with their hashes.
+/// Whether the files of a sample exist and have their hashes.
 fn is_sound(dir: &Path, sample: &Sample) -> Result<bool, AugmentError> {
     for (name, expected) in &sample.files {
         let path = dir.join(name);
@@ -278,8 +278,8 @@ fn temporary_name(name: &str) -> String {
     format!("{name}.tmp")
 }
 
-/// Writes a file under a temporary name, and renames it. Only one run writes to the folder, so the next one overwrites
-/// what a killed one left.
+/// Writes a file under a temporary name, and renames it. Only one run writes to the folder, so the next run overwrites
+/// temporary files of a killed one.
 fn write(path: &Path, bytes: &[u8]) -> Result<(), AugmentError> {
     if let Some(folder) = path.parent() {
         fs::create_dir_all(folder).map_err(AugmentError::file(folder))?;

@@ -1,17 +1,18 @@
-//! Views beside a twin's recorded drives, repaired by a model, as a data set that a trainer reads.
+//! Off-trajectory views: views with a lateral offset from a twin's recorded drives, repaired by a model, as a data set
+//! for training.
 //!
 //! ```text
-//! plan          where views are: rounds, offsets, stations
-//! cameras       pinholes in place of lenses; what each format calls a camera
+//! plan          poses of the views: rounds, offsets, stations
+//! cameras       pinholes in place of lenses; camera models of the formats
 //! maps          masks, depth and images as PNG
-//! record        augment.json: what a data set was made with, and its samples
+//! record        augment.json: the settings of a data set, and its samples
 //! folder        the folder of a round: samples renamed into place, resume, refusals
 //! transforms    transforms.json, as nerfstudio reads it
 //! colmap        sparse/0, as COLMAP reads it
 //! points        Gaussians as COLMAP's points
 //! ```
 //!
-//! Nothing here renders: `wildcity augment` draws the views through a server, as any agent would. The idea of
+//! This package does not render: `wildcity augment` renders the views through a server, like any agent. The idea of
 //! rounds, in which the views move away from the drive and the newest ones are trained on, is that of Difix3D+ (Wu et
 //! al. 2025).
 

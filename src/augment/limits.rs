@@ -1,9 +1,9 @@
 //! Limits of a data set, with the arithmetic behind each.
 
-/// How far a round moves the views away from the drive, in metres: what Difix3D+'s trainer moves per round.
+/// How far a round moves the views away from the drive, in metres: the value of Difix3D+'s trainer.
 pub const ROUND_M: f64 = 0.5;
 
-/// Largest round: 20 m at [`ROUND_M`] a round, which is farther than any twin is known.
+/// Largest round: 20 m at [`ROUND_M`] per round, which is farther than the valid range of any twin.
 pub const MOST_ROUNDS: u32 = 40;
 
 /// Largest offset, in metres.
@@ -28,10 +28,10 @@ pub const MOST_DEPTH_M: f32 = 65.0;
 /// pinhole of 120° has four times as many pixels per radian at its edge as in its middle.
 pub const MOST_SLOPE: f64 = 1.191_753_592_594_21;
 
-/// COLMAP's points, unless more are asked for: what a trainer begins with for a street.
+/// Default number of COLMAP's points: the number with which a trainer starts on a street.
 pub const POINTS: u32 = 100_000;
 
-/// Most points: 51 MB of text.
+/// Largest number of points: 51 MB of text.
 pub const MOST_POINTS: u32 = 1_000_000;
 
 /// Gaussians within this distance of a view may become points, in metres.

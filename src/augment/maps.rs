@@ -25,7 +25,7 @@ pub fn counted(camera: &Camera, opacity: &[f32]) -> Result<Vec<bool>, AugmentErr
     Ok(counts)
 }
 
-/// Depth in whole millimetres, 0 where there is none: where the pixel does not count, and beyond
+/// Depth in whole millimetres, 0 without depth: where the pixel does not count, and beyond
 /// [`crate::limits::MOST_DEPTH_M`]. `depth_m` is `[height, width]`.
 ///
 /// # Errors

@@ -11,7 +11,7 @@ use crate::limits::{EVERY_M, MOST_OFFSET_M, MOST_ROUNDS, ROUND_M};
 /// Names have centimetres.
 const CM: f64 = 100.0;
 
-/// The views of one round: every so many metres along each drive, on both sides of it.
+/// The views of one round: at regular distances along each drive, on both sides of it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     round: u32,
@@ -19,21 +19,21 @@ pub struct Plan {
     every_m: f64,
 }
 
-/// A place of the rig beside a drive.
+/// A pose of the rig at a lateral offset from a drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Place {
     /// Name of the drive.
     pub trajectory: String,
     /// Along the drive, in metres from its start.
     pub station_m: f64,
-    /// To the left of the drive, in metres; negative to the right.
+    /// Lateral offset from the drive, in metres: positive to the left.
     pub offset_m: f64,
     /// Pose of the rig in the world: that of the drive at the station, moved along the rig's y axis (left).
     pub world_from_rig: Pose,
 }
 
 impl Plan {
-    /// A plan with the wanted offsets and the distance of two stations, in metres; both are rounded to centimetres.
+    /// A plan with the requested offsets and the distance of two stations, in metres; both are rounded to centimetres.
     ///
     /// ```
     /// use wildcity_augment::Plan;
@@ -75,7 +75,7 @@ impl Plan {
         self.round
     }
 
-    /// The wanted offsets, ascending, in metres.
+    /// The requested offsets, ascending, in metres.
     pub fn wanted_m(&self) -> &[f64] {
         &self.offsets_m
     }
@@ -85,8 +85,8 @@ impl Plan {
         self.every_m
     }
 
-    /// The offsets of the round, in metres, left (positive) and right of the drive: for each wanted one
-    /// `min(0.5 m x round, wanted)`, without repetitions.
+    /// The offsets of the round, in metres, left (positive) and right of the drive: for each requested one `min(0.5 m x
+    /// round, wanted)`, without repetitions.
     pub fn offsets_m(&self) -> Vec<f64> {
         let reached_m = ROUND_M * f64::from(self.round);
         let mut offsets_m: Vec<f64> =
@@ -95,7 +95,7 @@ impl Plan {
         offsets_m.into_iter().flat_map(|offset_m| [offset_m, -offset_m]).collect()
     }
 
-    /// The places beside the drives: drive by drive, station by station, and at each the offsets.
+    /// All places, in order of the drives, the stations and the offsets.
     ///
     /// # Errors
     /// There is no drive.
@@ -125,7 +125,7 @@ impl Plan {
 }
 
 impl Place {
-    /// The name of a camera's image here: `CAMERA/DRIVE_STATION_SIDE.png`, such as
+    /// The name of a camera's image at the place: `CAMERA/DRIVE_STATION_SIDE.png`, such as
     /// `front/log_00012.00_left1.50.png`. The order of names is that of the stations up to 100 km.
     pub fn image_name(&self, camera: &str) -> String {
         let side = if self.offset_m < 0.0 { "right" } else { "left" };

@@ -31,7 +31,7 @@ pub struct Surroundings {
 }
 
 impl Surroundings {
-    /// What is within [`POINT_REACH_M`] of a place.
+    /// The surroundings within [`POINT_REACH_M`] of places.
     pub fn of(places: &[Place]) -> Self {
         let mut places_m: Vec<DVec3> = Vec::new();
         for place in places {
@@ -71,7 +71,7 @@ pub struct PointSample {
     most: usize,
     surroundings: Surroundings,
     seen: u64,
-    /// Those with the smallest keys; the largest of them on top.
+    /// The Gaussians with the smallest keys; the largest of these keys is on top.
     kept: BinaryHeap<Keyed>,
 }
 
@@ -108,8 +108,8 @@ impl PointSample {
         Self { seed, most, surroundings, seen: 0, kept: BinaryHeap::new() }
     }
 
-    /// Shows it Gaussians that are near to each other. Those with an opacity below 1/2 are left out, since they are no
-    /// surface, and those beyond the surroundings.
+    /// Adds Gaussians that are near to each other, except those with an opacity below 1/2, which are not a surface, and
+    /// those outside of the surroundings.
     pub fn add(&mut self, gaussians: &Gaussians) {
         let near = self.surroundings.near(gaussians);
         for index in 0..gaussians.len() {

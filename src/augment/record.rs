@@ -1,4 +1,4 @@
-//! augment.json: what a data set was made with, and its samples.
+//! augment.json: the settings of a data set, and its samples.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ use crate::limits::WEIGHT;
 /// Format of augment.json.
 pub(crate) const FORMAT: &str = "wildcity.augment/1";
 
-/// What each folder and number is, by its name.
+/// Meaning of each folder and number, by its name.
 pub(crate) const CONVENTIONS: [(&str, &str); 7] = [
     ("images", "PNG, 8-bit sRGB; repaired if `made_with.repair` is there, else as rendered"),
     ("rendered", "PNG, the images before the repair; there only if `made_with.repair` is"),
@@ -33,7 +33,7 @@ pub(crate) const CONVENTIONS: [(&str, &str); 7] = [
     ("files", "SHA-256 of each file of the sample, by its path"),
 ];
 
-/// What a data set is made with. A folder is continued only with the same.
+/// Settings of a data set. A folder is continued only with the same settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MadeWith {
     /// Name of the twin.
@@ -61,7 +61,7 @@ pub struct RepairedWith {
     pub provider: String,
     /// Under this trust images are left as rendered.
     pub at_least: f64,
-    /// `recorded` or `rendered`: what the model compares with, if it needs that.
+    /// `recorded` or `rendered`: images that the model compares with, if it needs any.
     pub references: Option<String>,
 }
 
@@ -80,7 +80,7 @@ pub struct Options {
     pub side_px: Option<u32>,
     /// Whether the lenses of the rig are kept.
     pub lenses: bool,
-    /// Most points of the COLMAP model, and the seed of their choice.
+    /// Largest number of points of the COLMAP model, and the seed of their choice.
     pub points: u32,
     /// See `points`.
     pub seed: u64,
@@ -91,14 +91,14 @@ pub struct Options {
 /// augment.json without its samples.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
-    /// What the samples are made with.
+    /// Settings of the samples.
     pub made_with: MadeWith,
     /// Number of the twin's version. An equal version may have another number after a rollback.
     pub version: u64,
     /// Offsets of this round, in metres, positive to the left of the drive.
     pub offsets_m: Vec<f64>,
     /// From the axes of the twin's capture to those of the twin, as eight numbers of `wildcity twin align`; `None` if
-    /// the version does not say it.
+    /// it is unknown.
     pub world_from_capture: Option<String>,
 }
 
@@ -123,19 +123,19 @@ pub struct Sample {
     pub weight: f64,
     /// Share of the pixels that count.
     pub counted: f64,
-    /// What became of the image; `None` without a model.
+    /// Result of the repair; `None` without a model.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub repair: Option<SampleRepair>,
     /// SHA-256 of its files, by their path.
     pub files: BTreeMap<String, String>,
 }
 
-/// What a model did to an image.
+/// Result of a model for an image.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SampleRepair {
     /// `repaired`, or `kept` where the trust is too low.
     pub status: String,
-    /// Names of the recorded images that the model saw.
+    /// Names of the recorded images that the model got.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub references: Vec<String>,
 }
@@ -143,7 +143,7 @@ pub struct SampleRepair {
 /// The encoded files of a sample, each a PNG.
 #[derive(Clone, Debug, Default)]
 pub struct SampleFiles {
-    /// What a trainer reads.
+    /// The training image.
     pub image: Vec<u8>,
     /// Before the repair; `None` without a model.
     pub rendered: Option<Vec<u8>>,
@@ -187,7 +187,7 @@ fn leaf(path: &str, there: &Value, here: &Value) -> Option<[String; 3]> {
                 leaf(&path, value, &b[key])
             })
         }
-        // A model in place of none: its name says enough.
+        // If only one of the two has a model, its name is enough.
         _ if there != here => Some([path.to_owned(), short(there), short(here)]),
         _ => None,
     }

@@ -1,7 +1,7 @@
 //! Maps from GeoJSON.
 //!
 //! Coordinates are metres in the twin's axes, or longitude and latitude (degrees, WGS 84) if an origin is given: then
-//! they become east, north and up from there. Each feature has the property `layer`:
+//! they are converted to east, north and up from this origin. Each feature has the property `layer`:
 //!
 //! | layer | geometry | properties |
 //! |---|---|---|
@@ -36,7 +36,7 @@ struct Feature<'a> {
     origin: Option<&'a Origin>,
 }
 
-/// Where the axes east, north and up begin.
+/// Origin of the axes east, north and up.
 struct Origin {
     at_m: DVec3,
     enu_from_ecef: DMat3,

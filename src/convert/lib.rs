@@ -1,12 +1,12 @@
-//! Maps and scenarios from the formats of others.
+//! Maps and scenarios from other formats.
 //!
-//! | module | what it reads |
+//! | module | input |
 //! |---|---|
 //! | `opendrive` | lanes of OpenDRIVE, by the crate xodr |
 //! | `geojson` | lanes and areas of GeoJSON, with nuPlan's layers |
 //! | `openscenario` | a subset of OpenSCENARIO XML 1.0 to 1.3 |
 //!
-//! What a reader does not understand it refuses, with its name and its line.
+//! A reader refuses elements that it does not support, with their name and line.
 
 pub mod geojson;
 pub mod opendrive;
@@ -21,7 +21,7 @@ pub const TEXT_BYTES: usize = 256 << 20;
 pub struct ConvertError {
     /// Where: a line, or a feature.
     pub place: String,
-    /// What is wrong, and what to write instead.
+    /// The error, and the remedy.
     pub message: String,
 }
 

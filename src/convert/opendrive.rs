@@ -13,10 +13,10 @@ use crate::{ConvertError, text_of};
 /// Farthest coordinate, in metres.
 pub const FARTHEST_M: f32 = 16_000.0;
 
-/// Lanes narrower than this are left out, in metres: a lane that begins or ends as a wedge has no width there.
+/// Lanes narrower than this are left out, in metres: a lane that starts or ends as a wedge has no width at this end.
 const NARROW_M: f32 = 0.05;
 
-/// A map, and what the reader passed over or assumed.
+/// A map, and the elements that the reader ignored or assumed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
     /// The map.
@@ -28,7 +28,7 @@ pub struct Imported {
 /// Reads an OpenDRIVE file.
 ///
 /// # Errors
-/// It is no OpenDRIVE, has no lanes, or reaches beyond [`FARTHEST_M`].
+/// It is not OpenDRIVE, has no lanes, or reaches beyond [`FARTHEST_M`].
 pub fn read(bytes: &[u8]) -> Result<Imported, ConvertError> {
     let text = text_of(bytes)?;
     let (network, provenance) = xodr::load_str_with_provenance(text)
@@ -118,7 +118,7 @@ fn id_of(network: &RoadNetwork, lane: xodr::LaneId) -> Option<String> {
     Some(format!("{}/{}/{}", road.od_id(), of.section, of.od_id))
 }
 
-/// The kind of a lane; `None` for what is no surface to move on.
+/// The kind of a lane; `None` for lanes that are not a surface to move on.
 fn kind_of(kind: LaneType) -> Option<LaneKind> {
     use LaneType as From;
     if kind.is_drivable() {

@@ -7,10 +7,10 @@ use serde_json::{Map, Value};
 use crate::file::{EpisodeFile, Frame};
 use crate::lines::{ActorsLine, ScenarioLine};
 
-/// What differs, in the order of cause and effect.
+/// Kind of difference, in the order of cause and effect.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum What {
-    /// Twin, start, dynamics, seed, scenario or rig: the episodes are not of one kind.
+    /// Twin, start, dynamics, seed, scenario or rig: the episodes have different setups.
     Setup,
     /// The agent's command.
     Command,
@@ -29,7 +29,7 @@ pub enum What {
 pub struct Difference {
     /// The step.
     pub step: u64,
-    /// What differs.
+    /// Kind of difference.
     pub what: What,
     /// How, in words.
     pub how: String,
@@ -55,8 +55,8 @@ impl std::fmt::Display for Difference {
     }
 }
 
-/// The first step at which the command, the ego, an actor or an image of two episodes differ, asked in this order;
-/// before them the setup. `None` if they are alike from begin to end.
+/// The first step at which the command, the ego, an actor or an image of two episodes differ, tested in this order,
+/// after the setup. `None` if the episodes are equal from start to end.
 pub fn diff(a: &EpisodeFile, b: &EpisodeFile) -> Option<Difference> {
     if let Some(how) = setup(a, b) {
         return Some(Difference { step: 0, what: What::Setup, how });
@@ -128,7 +128,7 @@ fn json(value: &impl serde::Serialize) -> Value {
     serde_json::to_value(value).unwrap_or_default()
 }
 
-/// The first place at which two values differ, and both values there: `at: actors[0].idm.speed 8.0 against 9.0`.
+/// The first place at which two values differ, and both values: `at: actors[0].idm.speed 8.0 against 9.0`.
 fn value_difference(at: &str, a: &Value, b: &Value) -> Option<String> {
     let (path, a, b) = first_difference(String::new(), a, b)?;
     let text = |value: &Value| match value {
@@ -221,7 +221,7 @@ fn image(episode: &EpisodeFile, a: &Frame, b: &Frame) -> Option<(What, String)> 
     }
     let cameras = &episode.header.rig.cameras;
     let first = a.images.iter().zip(&b.images).position(|(a, b)| a != b);
-    // Of a warm-up there are several images of each camera.
+    // A warm-up has several images of each camera.
     let camera = first.and_then(|image| cameras.get(image % cameras.len().max(1)));
     let how = match camera {
         Some(camera) => format!("camera {:?}", camera.name),

@@ -59,8 +59,8 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
     })
 }
 
-/// When the ego first left the trained area, in microseconds. A record without events says only that it did: then it
-/// counts from the start.
+/// When the ego first left the trained area, in microseconds. A record without events has no time of this, so that the
+/// start is returned.
 pub fn off_model_us(episode: &EpisodeFile) -> Option<i64> {
     let event = episode.events.iter().find(|line| matches!(line.event, Event::OffModel { .. }));
     let at_end = episode.end.as_ref().is_some_and(|end| end.outcome == "off_model");
@@ -117,7 +117,7 @@ where
     (0..values.len()).map(slope).collect()
 }
 
-/// The plans of the agent, each decided at the frame before the one that its step ends with.
+/// The plans of the agent, each decided at the frame before the last frame of its step.
 fn plans(frames: &[&Frame]) -> Vec<Plan> {
     let Some(begin_us) = frames.first().map(|first| first.time_us) else { return Vec::new() };
     let of_pair = |pair: &[&Frame]| {
@@ -140,7 +140,7 @@ fn plans(frames: &[&Frame]) -> Vec<Plan> {
 }
 
 fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<Track> {
-    // Where a session went back, and in a warm-up, the last line of a step holds.
+    // If a session returned to an earlier state, and in a warm-up, a step has several lines: use the last one.
     let of_step: BTreeMap<u64, &ActorsLine> = lines.iter().map(|line| (line.step, line)).collect();
     let mut tracks: Vec<Track> = scenario
         .actors

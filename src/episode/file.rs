@@ -15,7 +15,7 @@ use wildcity_sim::ego::TimedPose;
 use crate::limits;
 use crate::lines::{ActorsLine, EpisodeResult, EventLine, ScenarioLine};
 
-/// What an episode was driven with: the fields of its first line that need no renderer.
+/// Setup of an episode: the fields of its first line that need no renderer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct Header {
     /// Version of the format.
@@ -85,7 +85,7 @@ pub struct Frame {
     pub images: Vec<String>,
 }
 
-/// How an episode went, as the session says.
+/// Summary of an episode by the session.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct EndLine {
     /// Why it ended: `completed`, `off_model`, `agent_error` ..
@@ -106,14 +106,14 @@ pub struct EndLine {
 pub struct Cut {
     /// The line, from 1.
     pub line: usize,
-    /// What is wrong with it.
+    /// The error.
     pub reason: String,
 }
 
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeFile {
-    /// What it was driven with.
+    /// Its setup.
     pub header: Header,
     /// The scenario, if there was one.
     pub scenario: Option<ScenarioLine>,
@@ -121,7 +121,7 @@ pub struct EpisodeFile {
     pub frames: Vec<Frame>,
     /// The actors, step by step.
     pub actors: Vec<ActorsLine>,
-    /// What happened, in order; without what a session undid when it went back to an earlier step.
+    /// Events in order, without events that a session undid when it returned to an earlier step.
     pub events: Vec<EventLine>,
     /// The result that the session wrote.
     pub result: Option<EpisodeResult>,
@@ -139,18 +139,18 @@ pub enum ReadError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
-    /// The first line is no header.
+    /// The first line is not a header.
     #[error("{}: the first line is no header of an episode: {reason}", path.display())]
     Header {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
-    /// It is the MCAP file beside a record.
+    /// The file is the MCAP export of a record.
     #[error("{} is an MCAP export; only the record is read: {}", path.display(), path.with_extension("jsonl").display())]
     Mcap {
         /// The file.
@@ -158,7 +158,7 @@ pub enum ReadError {
     },
 }
 
-/// What every MCAP file begins with; its line break ends the first line.
+/// First bytes of every MCAP file; their line break ends the first line.
 const MCAP_MAGIC: &[u8] = b"\x89MCAP0\r\n";
 
 /// A line's kind. It is read before the line, since a tagged enum copies every value of it first: a third of the time.
@@ -176,7 +176,7 @@ enum Line {
     Frame(Frame),
     Result(EpisodeResult),
     End(EndLine),
-    /// Versions, notes, and what later builds add.
+    /// Versions, notes, and lines that later builds add.
     Other,
 }
 
@@ -191,11 +191,11 @@ impl EpisodeFile {
     /// The format that this build reads.
     pub const FORMAT: u32 = 0;
 
-    /// Reads an episode's file. A damaged or incomplete line ends the reading: all before it is returned, and
-    /// [`EpisodeFile::cut`] says where and why.
+    /// Reads an episode's file. A damaged or incomplete line ends the reading: all lines before it are returned, and
+    /// [`EpisodeFile::cut`] has the place and the reason.
     ///
     /// # Errors
-    /// The file cannot be read, or its first line is no header.
+    /// The file cannot be read, or its first line is not a header.
     pub fn read(path: &Path) -> Result<Self, ReadError> {
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
@@ -228,7 +228,7 @@ impl EpisodeFile {
     /// Reads the first line of an episode's file.
     ///
     /// # Errors
-    /// The file cannot be read, or its first line is no header.
+    /// The file cannot be read, or its first line is not a header.
     pub fn header(path: &Path) -> Result<Header, ReadError> {
         let failed = |cause| ReadError::Io { path: path.to_owned(), cause };
         let mut reader = BufReader::new(File::open(path).map_err(failed)?);
@@ -254,7 +254,7 @@ impl EpisodeFile {
                 self.events.push(event);
             }
             Line::Frame(frame) => {
-                // Where a session went back, what happened later did not happen.
+                // If a session returned to an earlier step, drop the events after it.
                 if frame.request != "observe"
                     && self.events.last().is_some_and(|last| last.time_us > frame.time_us)
                 {
@@ -274,7 +274,7 @@ impl EpisodeFile {
         self.scenario.as_ref().map_or(0, |scenario| scenario.actors.len())
     }
 
-    /// The rig of an episode's file, with intrinsics and places of the cameras; `None` if the header has names alone.
+    /// The rig of an episode's file, with intrinsics and places of the cameras; `None` if the header has only names.
     ///
     /// # Errors
     /// The file cannot be read.
@@ -291,8 +291,8 @@ impl EpisodeFile {
         Ok(read.map(|read| read.rig))
     }
 
-    /// The frames that the ego drove: the start and each step, in order. Where a session went back to an earlier
-    /// step, the later ones replace it.
+    /// The frames that the ego drove: the start and each step, in order. If a session returned to an earlier step, the
+    /// frames after this replace the earlier ones.
     pub fn driven(&self) -> Vec<&Frame> {
         let moves = |frame: &Frame| frame.request != "observe" && !frame.poses.is_empty();
         let steps = self.frames.iter().map(|frame| moves(frame).then_some(frame.step));
@@ -305,8 +305,8 @@ impl EpisodeFile {
     }
 }
 
-/// Indices of the frames that the ego drove. `steps` are those of all frames, in order; none of a frame that did not
-/// move the ego. Where a session went back to an earlier step, the later frames replace the earlier ones.
+/// Indices of the frames that the ego drove. `steps` are those of all frames, in order; `None` for a frame that did not
+/// move the ego. If a session returned to an earlier step, the frames after this replace the earlier ones.
 pub fn driven_indices(steps: impl IntoIterator<Item = Option<u64>>) -> Vec<usize> {
     let mut driven: Vec<(u64, usize)> = Vec::new();
     for (index, step) in steps.into_iter().enumerate() {
@@ -353,7 +353,7 @@ fn read_header(
     }
 }
 
-/// Reads a line into `text`. Returns whether there was one; or what is wrong with it.
+/// Reads a line into `text`. Returns whether there was one, or the error in it.
 fn read_line(
     reader: &mut BufReader<File>,
     limit: usize,

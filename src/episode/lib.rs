@@ -1,16 +1,16 @@
 //! Recorded episodes, without renderer and twin: reading, comparing and scoring them.
 //!
 //! The session writes an episode's file while it drives. This package has the lines that a scenario adds to it, and
-//! reads the file afterwards: with whatever fields later builds add, and up to the place where a file was cut.
+//! reads the file afterwards. It accepts fields that later builds add, and reads a truncated file up to its end.
 //!
-//! | module | what it holds |
+//! | module | contents |
 //! |---|---|
 //! | `lines` | the lines of a scenario: `scenario`, `actors`, `event`, `result` |
 //! | `file` | reading an episode's file |
-//! | `drive` | an episode as the scores see it |
+//! | `drive` | an episode as input of the scores |
 //! | `outcome` | the result of an episode |
 //! | `scenario` | the line of a scenario |
-//! | `diff` | where two episodes part |
+//! | `diff` | the first difference of two episodes |
 //! | `export` | an episode as MCAP |
 //! | `listing` | the episodes of a directory |
 //! | [`limits`] | limits |

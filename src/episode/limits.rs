@@ -9,12 +9,12 @@ pub const LINE_BYTES: usize = 16 << 20;
 /// Longest first line, in bytes, as the session writes it: the overlays of a rig.
 pub const HEAD_BYTES: usize = 96 << 20;
 
-/// Most steps of an episode: a day at 10 Hz.
+/// Largest number of steps of an episode: a day at 10 Hz.
 pub const STEPS: usize = 1 << 20;
 
-/// A temporary file of an export that nothing was written to for so long is left of a killed process: an export writes
-/// every second of the episode, and with images a second takes minutes on a slow machine.
+/// A temporary file of an export that was not written to for this time belongs to a killed process. An export writes
+/// once per second of the episode, and with images such a second takes minutes on a slow machine.
 pub const LEFTOVER_AGE: Duration = Duration::from_secs(3600);
 
-/// Most episodes of a list.
+/// Largest number of episodes of a list.
 pub const LISTED: usize = 10_000;

@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! {"kind":"scenario", ...}  after the header: the resolved scenario, the ego's size, the route
-//! {"kind":"actors", ...}    one before each frame that a step rendered: where the actors are
-//! {"kind":"event", ...}     contacts, and why the episode ended
+//! {"kind":"actors", ...}    one before each frame that a step rendered: the poses of the actors
+//! {"kind":"event", ...}     contacts, and the reason for the end
 //! {"kind":"result", ...}    before the end: verdict and scores
 //! ```
 //!
@@ -25,9 +25,9 @@ use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox};
 pub struct ScenarioLine {
     /// Its name.
     pub name: String,
-    /// BLAKE3 of the resolved scenario's JSON, in hex: the identity of the episode beside its seed.
+    /// BLAKE3 of the resolved scenario's JSON, in hex: with its seed, the identity of the episode.
     pub hash: String,
-    /// The resolved scenario: every value of the sweep put in, jitter drawn.
+    /// The resolved scenario: with the values of the sweep, and the jitter sampled.
     pub scenario: serde_json::Value,
     /// The ego's size.
     pub ego: EgoLine,
@@ -63,7 +63,7 @@ pub struct EgoLine {
     pub center_x: f64,
 }
 
-/// What does not change about an actor.
+/// Constant properties of an actor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorLine {
     /// Its name.
@@ -122,7 +122,7 @@ pub struct ActorsLine {
     pub step: u64,
     /// Time, in microseconds.
     pub time_us: i64,
-    /// Those that are there, by rising index.
+    /// The actors that are present, by rising index.
     pub actors: Vec<ActorStateLine>,
 }
 
@@ -140,12 +140,12 @@ pub struct EventLine {
     pub step: u64,
     /// When it happened, in microseconds.
     pub time_us: i64,
-    /// What happened.
+    /// The event.
     #[serde(flatten)]
     pub event: Event,
 }
 
-/// What happened.
+/// Kind of an event.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
@@ -228,7 +228,7 @@ pub struct EpisodeResult {
     pub verdict: String,
     /// The faults, by time.
     pub faults: Vec<FaultLine>,
-    /// What was not judged, and why.
+    /// Criteria that were not judged, and the reasons.
     pub not_judged: Vec<String>,
     /// The scores, each with its name and version.
     pub scores: BTreeMap<String, ScoreLine>,
@@ -266,10 +266,10 @@ pub struct FaultLine {
 pub struct ScoreLine {
     /// The value.
     pub value: Option<f64>,
-    /// Why there is none.
+    /// Reason for the missing value.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
-    /// What it was computed from; null what it lacks.
+    /// Inputs of the value; null for a missing input.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub parts: BTreeMap<String, Option<f64>>,
 }
@@ -339,7 +339,7 @@ impl EventLine {
     /// Checks that the event is about one of the scenario's `actors`.
     ///
     /// # Errors
-    /// It is not; says what is wrong.
+    /// It is not; describes the error.
     pub fn check(&self, actors: usize) -> Result<(), String> {
         match self.event.actor() {
             Some(actor) => check_index(actor, actors),
@@ -392,7 +392,7 @@ impl ActorLine {
 }
 
 impl ActorsLine {
-    /// The line of the actors that are there.
+    /// The line of the actors that are present.
     pub fn new(step: u64, time_us: i64, states: &[ActorState]) -> Self {
         let there = states.iter().filter(|state| state.present);
         Self { step, time_us, actors: there.map(ActorStateLine::new).collect() }
@@ -401,7 +401,7 @@ impl ActorsLine {
     /// Checks that the line is about some of the scenario's `actors`, each once, by rising index.
     ///
     /// # Errors
-    /// It is not, or an actor has no pose; says what is wrong.
+    /// It is not, or an actor has no valid pose; describes the error.
     pub fn check(&self, actors: usize) -> Result<(), String> {
         let mut before: Option<u16> = None;
         for state in &self.actors {
@@ -431,7 +431,7 @@ impl ActorStateLine {
         )
     }
 
-    /// The state; `None` if the pose is none.
+    /// The state; `None` if the pose is invalid.
     pub fn state(&self) -> Option<ActorState> {
         let Self(index, xyz_m, q_wxyz, velocity_mps, yaw_rate_radps) = *self;
         Some(ActorState {

@@ -17,7 +17,7 @@ pub struct Listed {
     pub path: PathBuf,
     /// Its size, in bytes.
     pub bytes: u64,
-    /// Size of the MCAP file beside it, in bytes; none without one.
+    /// Size of its MCAP file, in bytes; `None` without one.
     pub mcap_bytes: Option<u64>,
     /// When it was last written.
     pub modified: Option<SystemTime>,
@@ -63,7 +63,7 @@ pub fn record_bytes(record: &Path) -> u64 {
     fs::metadata(record).map_or(0, |metadata| metadata.len())
 }
 
-/// The MCAP file beside a record; none if it has more than `most` bytes.
+/// The MCAP file of a record; `None` if it has more than `most` bytes.
 ///
 /// # Errors
 /// There is no such file, or it cannot be read.

@@ -1,4 +1,4 @@
-//! The line of a scenario: what a record needs of it to be judged later.
+//! The line of a scenario, which a record needs to be judged later.
 
 use glam::{DVec2, DVec3};
 
@@ -54,7 +54,7 @@ fn ground_lines(surface: &LaneSurface) -> Vec<Vec<GroundPoint>> {
     surface.lines().map(|line| line.iter().map(point).collect()).collect()
 }
 
-/// The road that a line of a scenario tells of; none without a map.
+/// The road of a line of a scenario; `None` without a map.
 pub fn ground_of(line: &ScenarioLine) -> Option<LaneSurface> {
     let point = |point: &GroundPoint| SurfacePoint {
         position_m: DVec3::from_array(point.at),

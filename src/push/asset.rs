@@ -21,7 +21,7 @@ use crate::request::{RequestedFile, check_files};
 use crate::source::{SourceFile, provenance};
 use crate::status::{Push, State};
 
-/// What a push of an asset asks for.
+/// Request for a push of an asset.
 #[derive(Clone, Debug)]
 pub struct AssetRequest {
     /// The files, which become one scene.
@@ -30,7 +30,7 @@ pub struct AssetRequest {
     pub settings: AssetSettings,
 }
 
-/// What an asset is made with, beside its Gaussians.
+/// Settings of an asset in addition to its Gaussians.
 #[derive(Clone, Debug)]
 pub struct AssetSettings {
     /// Its name.
@@ -43,7 +43,7 @@ pub struct AssetSettings {
     pub record: RecordFormat,
 }
 
-/// Gaussians in the directions and the unit of the actor's axes, and where they come from.
+/// Gaussians in the directions and the unit of the actor's axes, and their sources.
 #[derive(Clone, Debug)]
 pub struct AssetSource {
     /// The Gaussians. Their origin may be anywhere.
@@ -74,7 +74,7 @@ impl AssetRequest {
         Ok(())
     }
 
-    /// Bytes of memory that making the asset of files of so many bytes may take.
+    /// Bytes of memory that making the asset may use, for files of `file_bytes` bytes.
     fn memory_bytes(&self, file_bytes: u64) -> u64 {
         let mesh_gaussians = u64::from(self.settings.mesh_gaussians);
         limits::push_memory_bytes(file_bytes)
@@ -118,11 +118,11 @@ fn refused(reason: String) -> PushError {
     PushError::Content { reason, cells: Vec::new() }
 }
 
-/// Waits for the push's turn, makes the asset, and stores it. Dropping the future before the asset is written abandons
-/// the push: nothing of it is visible. The caller ends the push with [`Push::close`].
+/// Waits for the push's permit, makes the asset, and stores it. Dropping the future before the asset is written
+/// abandons the push: nothing of it is visible. The caller ends the push with [`Push::close`].
 ///
 /// # Errors
-/// The content is refused, an asset of another content has the name, or the server could not do it; see
+/// The content is refused, an asset with different content has the name, or the server could not do it; see
 /// [`PushError::is_refusal`].
 pub async fn publish_asset(
     catalog: &Catalog,
@@ -131,27 +131,27 @@ pub async fn publish_asset(
     request: AssetRequest,
     files: Vec<SourceFile>,
 ) -> Result<AddedActor, PushError> {
-    // A name of a twin does not start with a dot. Assets of one name wait for each other, so that the name of one that
-    // is being written is not taken by another.
+    // A name of a twin does not start with a dot. Pushes of assets with one name run one after the other, so that two
+    // assets cannot be stored under the same name.
     let name = format!(".actors/{}", request.settings.name);
     let file_bytes = files.iter().map(|file| file.bytes).sum();
-    let turn = queue.turn_with(&name, request.memory_bytes(file_bytes)).await?;
+    let permit = queue.permit_with(&name, request.memory_bytes(file_bytes)).await?;
 
     push.enter(State::Ingesting)?;
     let record = request.settings.record;
     let bounds = ReadBounds {
-        memory_bytes: turn.memory_bytes(),
+        memory_bytes: permit.memory_bytes(),
         mesh_gaussians: request.settings.mesh_gaussians,
         most_gaussians: ActorAsset::MOST_GAUSSIANS as u64,
         too_many_fix: "an actor is one vehicle or person; reduce its Gaussians",
     };
-    // Threads hold the turn: they end a moment after their push does.
+    // Blocking threads hold a clone of the permit, because they may outlive their push for a moment.
     let stopping = StopWhenDropped(push.stop_flag().clone());
     let made = {
-        let turn = turn.clone();
+        let permit = permit.clone();
         let push = push.clone();
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             let scene = read(&push, &request.files, &files, bounds)?;
             let (hashes, options) = (scene.hashes, scene.options);
             let source = AssetSource { gaussians: scene.gaussians, hashes, options };
@@ -163,11 +163,11 @@ pub async fn publish_asset(
     let asset = made.map_err(|error| push.cause(error))?;
     drop(stopping);
 
-    // From here on the push cannot be cancelled.
+    // From here on, the push cannot be cancelled.
     push.enter(State::Committing)?;
     let catalog = catalog.clone();
     run_blocking(move || {
-        let _turn = turn;
+        let _permit = permit;
         Ok(catalog.add_actor(&asset, record, SameName::Refused)?)
     })
     .await

@@ -25,7 +25,7 @@ pub fn check_base(catalog: &Catalog, request: &PushRequest) -> Result<Option<u64
                 changed.filter(|cell| selected.contains(cell)).collect()
             }
             CellSelection::All => changed.collect(),
-            // These cells are known only once the files are read; then the store refuses them.
+            // These cells are known only after the files are read; the store then detects conflicts.
             CellSelection::Touched => Vec::new(),
         };
         if !cells.is_empty() {

@@ -11,7 +11,7 @@ use crate::request::{CellSelection, PushRequest, profile_with};
 use crate::source::provenance;
 use crate::status::Push;
 
-/// The content of a version, apart from what the request says.
+/// The content of a version that is not in the request.
 pub(crate) struct NewContent<'a> {
     pub(crate) gaussians: &'a Gaussians,
     /// BLAKE3 of each file, in hex.
@@ -20,9 +20,9 @@ pub(crate) struct NewContent<'a> {
     pub(crate) options: &'a [String],
 }
 
-/// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push
-/// of all cells replaces the twin, but keeps rig, trajectories, sky, place on the earth and alignment of the base.
-/// Neither replaces what others changed since the base, which is the latest version if the request names none.
+/// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push of all
+/// cells replaces the twin, but keeps rig, trajectories, sky, place on the earth and alignment of the base. Neither
+/// replaces changes that others made since the base, which is the latest version if the request names none.
 pub(crate) fn commit(
     catalog: &Catalog,
     push: &Push,

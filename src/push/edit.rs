@@ -1,5 +1,5 @@
-//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig. What a person places with the
-//! mouse.
+//! Edits: a new version with the same Gaussians on level ground, with a drive and a rig, which a person has placed with
+//! the mouse.
 
 use std::sync::Arc;
 
@@ -20,7 +20,7 @@ use crate::publish::{Viewpoints, pin_latest, preload};
 use crate::queue::PushQueue;
 use crate::status::PushedVersion;
 
-/// What an edit asks for. Points are in the axes and the unit of the base.
+/// Request for an edit. Points are in the axes and the unit of the base.
 #[derive(Clone, Debug)]
 pub struct EditRequest {
     /// Name of the twin.
@@ -52,7 +52,7 @@ impl EditRequest {
     /// The edit of the store.
     ///
     /// # Errors
-    /// Names the field that cannot be used, and what must hold instead.
+    /// Names the field that cannot be used, and the requirement.
     pub fn edit(&self) -> Result<Edit, PushError> {
         let Self { ground, scale, drive, rig, .. } = self;
         let is_empty = ground.is_none() && scale.is_none() && drive.is_none() && rig.is_none();
@@ -96,7 +96,8 @@ fn of_path(error: PathError) -> PushError {
     PushError::InvalidField { field, reason: error.to_string() }
 }
 
-/// Makes the version in the twin's turn among its pushes, and loads what sessions see before it is the latest.
+/// Makes the version when no other push of the twin runs, and loads the sections that sessions see before the version
+/// becomes the latest.
 ///
 /// # Errors
 /// The request cannot be used; [`wildcity_twin::store::StoreError::Overlap`]; or as a commit.
@@ -115,12 +116,12 @@ pub async fn publish_edit(
     };
     let needed =
         if edit.alignment == Alignment::IDENTITY { 0 } else { base.manifest.stored_bytes() };
-    let turn = queue.turn(&twin, needed).await?;
+    let permit = queue.permit(&twin, needed).await?;
     let (version, held) = {
         let engine = engine.clone();
         let twin = twin.clone();
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             let held = pin_latest(&engine, &twin)?;
             let version = engine.catalog().edit(&base, edit, &mut |_, _| {})?;
             Ok((version, held))
@@ -133,7 +134,7 @@ pub async fn publish_edit(
     Ok(PushedVersion { number: version.number, hash: version.hash })
 }
 
-/// What is known of a version before it is edited.
+/// Properties of a version before it is edited.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Survey {
     /// Number of the version.
@@ -155,10 +156,10 @@ pub async fn survey(
     version: Option<u64>,
 ) -> Result<Survey, PushError> {
     // One at a time for each twin, as its pushes.
-    let turn = queue.turn(&twin, 0).await?;
+    let permit = queue.permit(&twin, 0).await?;
     let catalog = engine.catalog().clone();
     run_blocking(move || {
-        let _turn = turn;
+        let _permit = permit;
         let version = catalog.version(&twin, version)?;
         let stride =
             version.manifest.gaussians().div_ceil(limits::SURVEYED_GAUSSIANS).max(1) as usize;

@@ -14,7 +14,7 @@ pub enum PushError {
     OutOfRange {
         /// The field, as it is called on the wire.
         field: String,
-        /// Its value, and what is accepted.
+        /// Its value, and the accepted values.
         must: String,
     },
     /// A field of the request cannot be understood.
@@ -22,7 +22,7 @@ pub enum PushError {
     InvalidField {
         /// The field, as it is called on the wire.
         field: String,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
     /// A field of the request is not a name.
@@ -87,10 +87,10 @@ pub enum PushError {
     Unreadable {
         /// Name of the file.
         name: String,
-        /// What the operating system says.
+        /// The operating system's error.
         reason: String,
     },
-    /// The process gave it up before it began.
+    /// The process abandoned it before it began.
     #[error("the push did not begin: {reason}")]
     Abandoned {
         /// Why.

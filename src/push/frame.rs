@@ -1,7 +1,7 @@
 //! The frame of a push: from the axes and unit of the capture to the twin's.
 //!
-//! A twin that was aligned (`wildcity twin align`, an edit) lies in other axes than the capture that it was trained
-//! from. Its manifest has the way from one to the other, and a training pipeline pushes what it trained.
+//! A twin that was aligned (`wildcity twin align`, an edit) has different axes from the capture that it was trained
+//! from. Its manifest has the transform between the two, so that a training pipeline can push its result unchanged.
 
 use wildcity_scene::align::Alignment;
 use wildcity_twin::store::{StoreError, Version};
@@ -14,8 +14,8 @@ pub enum Frame {
     /// The axes and metres of the base version.
     #[default]
     Twin,
-    /// The axes and the unit with which the capture was imported, before the twin was aligned. Those of the twin if it
-    /// never was.
+    /// The axes and the unit with which the capture was imported, before the twin was aligned. The axes and the unit of
+    /// the twin if it never was.
     Capture,
 }
 

@@ -1,23 +1,23 @@
 //! Pushes: trained scenes become a new version of a twin, all of their cells at once or none; and assets of actors.
 //!
 //! ```text
-//! request   what a push asks for, and the checks that need neither files nor twin
+//! request   the request for a push, and the checks that need neither files nor twin
 //! base      the version that a push is made from, and conflicts with later versions
-//! queue     the pushes of a server: waiting, running, ended not long ago
+//! queue     the pushes of a server: waiting, running, recently ended
 //! status    the progress of a push
 //! source    reads scene files and converts them to the twin's axes; `wildcity import` uses it, too
-//! read      joins the files of one push, and takes them to the twin's frame
+//! read      joins the files of one push, and transforms them to the twin's frame
 //! frame     the axes of a push: the twin's, or those of its capture before it was aligned
-//! report    what the files hold, and which cells would change
+//! report    contents of the files, and cells that would change
 //! preview   compares small images before and after
 //! commit    writes the version
-//! asset     assets of actors from files; `wildcity actor import` makes them alike
+//! asset     assets of actors from files, as `wildcity actor import` makes them
 //! edit      the same Gaussians on level ground, with a drive and a rig
 //! publish   the pipeline: read, check, preview, commit, preload
 //! ```
 //!
-//! Nothing of a push is visible before its version is committed, or its asset is stored. This package knows neither HTTP nor
-//! JSON: the server converts requests and answers.
+//! Nothing of a push is visible before its version is committed, or its asset is stored. This package contains neither
+//! HTTP nor JSON: the server converts requests and answers.
 
 mod asset;
 mod base;

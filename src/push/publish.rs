@@ -7,9 +7,8 @@
 //! queue of the sessions. Until the new version is loaded, `latest` remains the previous version for
 //! sessions that open the twin ([`Engine::pin_latest`]).
 //!
-//! **A push needs no state that survives the server**, because its content is compared with the twin's. A
-//! client that got no answer sends its push again, and the same content as the latest version's is that
-//! version.
+//! **A push needs no state that survives the server**, because its content is compared with the twin's. A client that
+//! got no answer sends its push again, and a push with the content of the latest version makes no new version.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -29,7 +28,7 @@ use crate::commit::{NewContent, commit};
 use crate::error::PushError;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
-use crate::queue::{PushQueue, Turn};
+use crate::queue::{PushPermit, PushQueue};
 use crate::read::{PushedScene, ReadBounds, read};
 use crate::report::{CellChanges, PushReport};
 use crate::request::{CellSelection, PushRequest};
@@ -47,7 +46,7 @@ struct CheckedScene {
     report: PushReport,
 }
 
-/// Waits for the push's turn, carries it out, and returns the version that it made. Dropping the future
+/// Waits for the push's permit, carries it out, and returns the version that it made. Dropping the future
 /// abandons the push: before the commit nothing of it is visible. The caller ends the push with
 /// [`Push::end`].
 ///
@@ -62,29 +61,30 @@ pub async fn publish(
     viewpoints: Viewpoints<'_>,
 ) -> Result<PushedVersion, PushError> {
     let file_bytes = files.iter().map(|file| file.bytes).sum();
-    let turn = queue.turn(&request.twin, file_bytes).await?;
+    let permit = queue.permit(&request.twin, file_bytes).await?;
     let request = Arc::new(request);
 
     let limit = queue.check_timeout();
     let deadline = Instant::now() + limit;
-    // Later than the push itself: a push that takes too long ends as `TimedOut`, not by a late frame.
+    // The frames have a later deadline than the push, so that a push that takes too long fails with `TimedOut` and not
+    // with the error of a frame.
     let frames_by = deadline + engine.step_timeout();
-    let checked = read_and_check(engine, push, &request, files, &turn, frames_by);
+    let checked = read_and_check(engine, push, &request, files, &permit, frames_by);
     let Ok(checked) = timeout_at(deadline, checked).await else {
         push.stop_flag().stop();
         return Err(PushError::TimedOut { limit });
     };
     let (scene, base) = checked.map_err(|error| push.cause(error))?;
 
-    // From here on the push cannot be cancelled.
+    // From here on, the push cannot be cancelled.
     push.enter(State::Committing)?;
     let committed = {
         let engine = engine.clone();
         let push = push.clone();
         let request = request.clone();
-        let turn = turn.clone();
+        let permit = permit.clone();
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             commit_held(&engine, &push, &request, &scene, base.as_deref())
         })
         .await?
@@ -98,24 +98,26 @@ pub async fn publish(
     Ok(PushedVersion { number: version.number, hash: version.hash })
 }
 
-/// Everything before the commit. Frames of the preview have until `frames_by`. Threads hold the turn: they end a moment
-/// after their push does.
+/// Everything before the commit. `frames_by` is the deadline of the preview's frames.
+///
+/// Blocking threads hold a clone of the permit, because they may still run for a moment after the push was cancelled:
+/// the next push of the twin must not begin before they end.
 async fn read_and_check(
     engine: &Arc<Engine>,
     push: &Arc<Push>,
     request: &Arc<PushRequest>,
     files: Vec<SourceFile>,
-    turn: &Turn,
+    permit: &PushPermit,
     frames_by: Instant,
 ) -> Result<(CheckedScene, Option<Arc<Version>>), PushError> {
     push.enter(State::Ingesting)?;
     let scene = {
         let push = push.clone();
         let request = request.clone();
-        let turn = turn.clone();
-        let bounds = ReadBounds::of_twin(turn.memory_bytes());
+        let permit = permit.clone();
+        let bounds = ReadBounds::of_twin(permit.memory_bytes());
         run_blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             read(&push, &request.files, &files, bounds)
         })
         .await?
@@ -207,8 +209,8 @@ fn commit_held(
     scene: &CheckedScene,
     base: Option<&Version>,
 ) -> Result<Committed, PushError> {
-    // Until the new version is ready, sessions that open the latest version get the one that is the latest
-    // now. It may be later than the base, because another version may have been committed during the preview.
+    // Until the new version is ready, sessions that open the latest version get the present latest version. It may be
+    // later than the base, because another version may have been committed during the preview.
     let held = pin_latest(engine, &request.twin)?;
     let content =
         NewContent { gaussians: &scene.gaussians, hashes: &scene.hashes, options: &scene.options };
@@ -226,8 +228,8 @@ pub(crate) fn pin_latest(engine: &Arc<Engine>, twin: &str) -> Result<Option<Late
     Ok(versions.last().map(|latest| engine.pin_latest(twin, latest.number)))
 }
 
-/// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they
-/// switch. The version is already committed: what cannot be loaded now is loaded when it is opened.
+/// Loads those parts of the version that sessions on the twin see now, so that they need not wait when they switch. The
+/// version is already committed: sections that cannot be loaded now are loaded when it is opened.
 pub(crate) async fn preload(
     engine: &Arc<Engine>,
     twin: &str,

@@ -1,4 +1,4 @@
-//! The pushes of a server: those that wait, those that run, and those that ended not long ago.
+//! The pushes of a server: waiting, running, and recently ended ones.
 //!
 //! The pushes of one twin run one after the other, in the order of their requests. Pushes of different twins wait for
 //! each other only while memory is short.
@@ -26,7 +26,7 @@ pub struct PushQueue {
     limits: QueueLimits,
 }
 
-/// What the pushes of a server may use.
+/// Limits of the pushes of a server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct QueueLimits {
     /// How many may wait or run.
@@ -37,13 +37,13 @@ pub struct QueueLimits {
     pub check_timeout: Duration,
 }
 
-/// The right of a push to run. The next one gets it when all clones are dropped: threads hold a clone, because they
-/// go on for a moment after their push was cancelled.
+/// The right of a push to run: its share of the memory and the lock of its twin, which are released when all clones are
+/// dropped. Blocking threads hold a clone, because they may still run for a moment after their push was cancelled.
 #[derive(Clone, Debug)]
-pub(crate) struct Turn(Arc<TurnParts>);
+pub(crate) struct PushPermit(Arc<PermitParts>);
 
 #[derive(Debug)]
-struct TurnParts {
+struct PermitParts {
     /// Bytes that the push may unpack.
     memory_bytes: u64,
     _memory: OwnedSemaphorePermit,
@@ -90,7 +90,7 @@ impl PushQueue {
         self.entries.lock().open_count()
     }
 
-    /// A value that is another one when a push has begun or ended since.
+    /// A value that changes whenever a push begins or ends.
     pub fn changes(&self) -> (u64, usize) {
         let entries = self.entries.lock();
         (entries.begun, entries.open_count())
@@ -101,7 +101,7 @@ impl PushQueue {
     /// have been removed.
     ///
     /// # Errors
-    /// The id belongs to a push that asked for something else, too many pushes are open, or `files`
+    /// The id belongs to a push with a different request, too many pushes are open, or `files`
     /// found a file missing.
     pub fn begin<E: From<PushError>>(
         &self,
@@ -159,31 +159,40 @@ impl PushQueue {
         found.ok_or_else(|| PushError::UnknownPush { id: id.to_owned(), twin: twin.to_owned() })
     }
 
-    /// Waits for the turn of a push of files of so many bytes.
-    pub(crate) async fn turn(&self, twin: &str, file_bytes: u64) -> Result<Turn, PushError> {
-        self.turn_with(twin, limits::push_memory_bytes(file_bytes)).await
+    /// Waits for the permit of a push whose files have `file_bytes` bytes.
+    pub(crate) async fn permit(
+        &self,
+        twin: &str,
+        file_bytes: u64,
+    ) -> Result<PushPermit, PushError> {
+        self.permit_with(twin, limits::push_memory_bytes(file_bytes)).await
     }
 
-    /// Waits for the turn of a push that may take so many bytes of memory.
-    pub(crate) async fn turn_with(&self, twin: &str, memory_bytes: u64) -> Result<Turn, PushError> {
+    /// Waits for the permit of a push that may use `memory_bytes` bytes of memory.
+    pub(crate) async fn permit_with(
+        &self,
+        twin: &str,
+        memory_bytes: u64,
+    ) -> Result<PushPermit, PushError> {
         let lock = {
             let mut twins = self.twins.lock();
-            // Locks that no push holds or waits for are forgotten.
+            // Remove locks that no push holds or waits for.
             twins.retain(|_, lock| Arc::strong_count(lock) > 1);
             twins.entry(twin.to_owned()).or_default().clone()
         };
-        // The twin first: a push that waits for its twin keeps no memory from other twins.
+        // Lock the twin first, so that a push that waits for its twin reserves no memory, which pushes of other twins
+        // may need.
         let twin = lock.lock_owned().await;
         let needed = memory_bytes.min(self.limits.memory_bytes);
         let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;
         // The semaphore is never closed while the process runs.
         let memory = memory.map_err(|_| PushError::ShuttingDown)?;
-        let parts = TurnParts { memory_bytes: needed, _memory: memory, _twin: twin };
-        Ok(Turn(Arc::new(parts)))
+        let parts = PermitParts { memory_bytes: needed, _memory: memory, _twin: twin };
+        Ok(PushPermit(Arc::new(parts)))
     }
 }
 
-impl Turn {
+impl PushPermit {
     /// Bytes that the push may unpack.
     pub(crate) fn memory_bytes(&self) -> u64 {
         self.0.memory_bytes
@@ -201,7 +210,7 @@ impl Entries {
         self.pushes.values().filter(|push| push.is_open()).count() + actors.count()
     }
 
-    /// Forgets the oldest pushes that ended while there are too many.
+    /// Removes the oldest ended pushes while there are too many.
     fn forget_oldest(&mut self) {
         while self.pushes.len() > limits::REMEMBERED_PUSHES {
             let ended = self.pushes.iter().filter(|(_, push)| !push.is_open());
@@ -276,7 +285,7 @@ mod tests {
         let missing = || Err(PushError::Unreadable { name: "a".into(), reason: "gone".into() });
         assert!(queue.begin(&request("a"), "x", missing).is_err());
         assert_eq!(queue.open_count(), 0);
-        // A known push needs its files no more.
+        // A known push no longer needs its files.
         new(begin(&queue, "a", "x"));
         assert!(matches!(queue.begin(&request("a"), "x", missing), Ok(Begun::Known(_))));
     }
@@ -309,10 +318,10 @@ mod tests {
         assert!(queue.begin_actor().is_ok());
     }
 
-    /// Whether a turn comes within a moment.
-    async fn comes(queue: &PushQueue, twin: &str, file_bytes: u64) -> Option<Turn> {
-        let turn = queue.turn(twin, file_bytes);
-        tokio::time::timeout(Duration::from_millis(50), turn).await.ok().map(Result::unwrap)
+    /// The permit, if it is granted within 50 ms.
+    async fn comes(queue: &PushQueue, twin: &str, file_bytes: u64) -> Option<PushPermit> {
+        let permit = queue.permit(twin, file_bytes);
+        tokio::time::timeout(Duration::from_millis(50), permit).await.ok().map(Result::unwrap)
     }
 
     #[tokio::test]

@@ -26,7 +26,7 @@ pub(crate) struct PushedScene {
 }
 
 impl PushedScene {
-    /// Turns, moves and scales the Gaussians to the frame of their base. The report says in which frame they were.
+    /// Transforms the Gaussians to the frame of their base. The report contains their original frame.
     ///
     /// # Errors
     /// [`PushError::Content`]: a Gaussian is outside its bounds there.
@@ -49,7 +49,7 @@ impl PushedScene {
     }
 }
 
-/// What the files of one push may become.
+/// Limits of the scene of one push.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ReadBounds {
     /// Bytes that each scene may unpack to.
@@ -58,7 +58,7 @@ pub(crate) struct ReadBounds {
     pub(crate) mesh_gaussians: u32,
     /// Gaussians of all files together.
     pub(crate) most_gaussians: u64,
-    /// What to do if there are more.
+    /// Remedy that the error gives if there are more.
     pub(crate) too_many_fix: &'static str,
 }
 
@@ -74,9 +74,9 @@ impl ReadBounds {
     }
 }
 
-/// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A file that
-/// another one names, such as a buffer of a glTF, is a part of that scene and no scene of its own. The report of
-/// the push is set on success, and on failure if Gaussians are the reason.
+/// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A file that another
+/// one names, such as a buffer of a glTF, is a part of that scene and not a separate scene. The report of the push is
+/// set on success, and on failure if Gaussians are the reason.
 pub(crate) fn read(
     push: &Push,
     requested: &[RequestedFile],
@@ -84,7 +84,7 @@ pub(crate) fn read(
     bounds: ReadBounds,
 ) -> Result<PushedScene, PushError> {
     let mut reader = Reader::new(push, files, bounds);
-    // Scenes that may name others come first: what they name is known before it could be read as a scene.
+    // Read scenes that may name other files first, so that the named files are not read as scenes.
     let names_others: Vec<bool> =
         files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
     for is_first in [true, false] {
@@ -231,7 +231,7 @@ impl<'a> Reader<'a> {
             check_count(name, total, &self.bounds)
                 .inspect_err(|_| self.push.set_report(scene.report.clone()))?;
             if scene.gaussians.is_empty() {
-                // The usual push has one file, which needs no copy.
+                // Most pushes have one file, which needs no copy.
                 scene.gaussians = gaussians;
             } else {
                 scene.gaussians.append(&gaussians);

@@ -1,4 +1,4 @@
-//! What the files of a push hold, and what it would change, before anything is committed.
+//! Contents of the files of a push, and the changes that it would make, before anything is committed.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,7 +11,7 @@ use crate::limits;
 use crate::preview::psnr::PsnrPreview;
 use crate::request::CellSelection;
 
-/// What was found in the files of a push.
+/// Contents of the files of a push.
 #[derive(Clone, Debug, Default)]
 pub struct PushReport {
     /// Each file that was read.
@@ -20,7 +20,7 @@ pub struct PushReport {
     pub gaussians: u64,
     /// The frame in which the files were.
     pub frame: Frame,
-    /// Whether the base was aligned, so that the frame of its capture is another one.
+    /// Whether the base was aligned, so that the frame of its capture differs from its own.
     pub is_aligned: bool,
     /// Gaussians that lie in none of the replaced cells.
     pub left_out: u64,
@@ -30,7 +30,7 @@ pub struct PushReport {
     pub ranges: Option<Ranges>,
     /// Cells that are replaced, in order of (y, x).
     pub cells: Vec<CellChange>,
-    /// PSNR between the twin before and after, at each pose of the preview.
+    /// PSNR between the base version and the new one, at each pose of the preview.
     pub preview: Vec<PsnrPreview>,
 }
 

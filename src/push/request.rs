@@ -1,4 +1,4 @@
-//! What a push asks for, and the checks that need neither its files nor the twin.
+//! The request for a push, and the checks that need neither its files nor the twin.
 
 use std::collections::BTreeSet;
 
@@ -12,7 +12,7 @@ use crate::frame::Frame;
 use crate::limits;
 use crate::source::SourceAxes;
 
-/// What a push asks for.
+/// Request for a push.
 #[derive(Clone, Debug)]
 pub struct PushRequest {
     /// Chosen by the client; see [`crate::default_id`] for the id of a push without one.
@@ -57,7 +57,7 @@ pub struct RequestedFile {
 /// Which cells a push replaces.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum CellSelection {
-    /// Those that its Gaussians lie in.
+    /// The cells that its Gaussians are in.
     Touched,
     /// These cells (x, y). Gaussians elsewhere are left out.
     These(BTreeSet<[i32; 2]>),

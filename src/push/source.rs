@@ -52,7 +52,7 @@ impl SourceAxes {
         Ok(Self { axes: axes.parse::<Axes>()?.scaled(scale)?, options })
     }
 
-    /// Converts what was read to the twin's axes.
+    /// Converts a scene that was read to the twin's axes.
     fn apply(&self, read: ReadScene) -> SourceScene {
         let ReadScene { mut gaussians, hash, parts } = read;
         self.axes.apply(&mut gaussians);

@@ -50,7 +50,7 @@ impl State {
 pub struct Progress {
     /// Work done.
     pub done: u64,
-    /// All work of the state; 0 if it is not known.
+    /// All work of the state; 0 if unknown.
     pub total: u64,
 }
 
@@ -72,7 +72,7 @@ pub struct Status {
     pub progress: Progress,
     /// The version, once it is ready.
     pub version: Option<PushedVersion>,
-    /// What was found in the files; `None` until they are read.
+    /// Contents of the files; `None` until they are read.
     pub report: Option<Arc<PushReport>>,
     /// Why it was refused or failed.
     pub error: Option<Arc<PushError>>,
@@ -145,7 +145,8 @@ impl Push {
         self.cancelled.notified().await;
     }
 
-    /// What ends the push: its cancellation if there was one, since that also ends the reading with an error of its own.
+    /// Reason for which the push ends: its cancellation if it was cancelled, because this also ends the reading with an
+    /// error.
     pub(crate) fn cause(&self, error: PushError) -> PushError {
         let status = self.status.lock();
         match status.error.as_deref() {
@@ -179,7 +180,7 @@ impl Push {
         status.state
     }
 
-    /// Ends a push whose result is told elsewhere, unless it was cancelled before. Returns the state.
+    /// Ends a push whose result is reported elsewhere, unless it was cancelled before. Returns the state.
     pub fn close(&self, result: Result<(), &PushError>) -> State {
         let mut status = self.status.lock();
         if status.state.is_open() {

@@ -1,9 +1,9 @@
-//! The audit log: which token made which version of a twin or which asset of an actor, one JSON object a line.
+//! The audit log: which token made which version of a twin or which asset of an actor, one JSON object per line.
 //!
-//! A line is on disk before what it announces begins, and again when that ended: what cannot be logged is refused. At
-//! [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, an older FILE.1 to FILE.2 and so on, and a new file begins; if
-//! that fails, the log says why and goes on in the same file. A line has a bounded length: names are checked before, and
-//! reasons are cut.
+//! A line is on disk before a change begins, and another one after it has ended. A change that cannot be logged is
+//! refused. At [`limits::AUDIT_BYTES`] the file is renamed to FILE.1, an older FILE.1 to FILE.2 and so on, and a new
+//! file begins; if that fails, the log gives the reason and continues in the same file. A line has a bounded length:
+//! names are checked before, and reasons are cut.
 
 use std::fmt::Display;
 use std::fs::{self, File, OpenOptions};
@@ -37,13 +37,13 @@ struct Log {
 pub(crate) struct Change {
     /// `push`, `cancel`, `edit`, `rollback` or `actor`.
     pub(crate) what: &'static str,
-    /// What is changed.
+    /// Object that is changed.
     pub(crate) target: Target,
     /// Id of the push.
     pub(crate) id: Option<String>,
 }
 
-/// What a change changes.
+/// Kind of object that a change concerns.
 #[derive(Clone, Debug)]
 pub(crate) enum Target {
     /// The twin of this name.
@@ -52,7 +52,7 @@ pub(crate) enum Target {
     Actor(String),
 }
 
-/// What a change made.
+/// Result of a change.
 #[derive(Clone, Debug)]
 pub(crate) enum Made {
     /// A version of this number.
@@ -92,7 +92,7 @@ impl Audit {
         path.map(|path| Log::open(path, limits::AUDIT_BYTES).map(Mutex::new)).transpose().map(Self)
     }
 
-    /// Writes that a change begins, on a thread that may wait for the disk.
+    /// Logs the start of a change, on a thread that may wait for the disk.
     ///
     /// # Errors
     /// [`Fault::Audit`]: the change must not begin.
@@ -112,7 +112,7 @@ impl Audit {
         .await
     }
 
-    /// Writes what a change made, or why it made nothing, on a thread that may wait for the disk.
+    /// Logs the result of a change, or why it failed, on a thread that may wait for the disk.
     pub(crate) async fn end(
         self: &Arc<Self>,
         grant: &Arc<Grant>,
@@ -134,7 +134,7 @@ impl Audit {
         }
     }
 
-    /// Writes that a change begins, and waits for the disk.
+    /// Logs the start of a change, and waits for the disk.
     ///
     /// # Errors
     /// [`Fault::Audit`]: the change must not begin.
@@ -142,8 +142,8 @@ impl Audit {
         self.write(grant, change, None)
     }
 
-    /// Writes what a change made, or why it made nothing, and waits for the disk. What is done is done: a line that
-    /// cannot be written is an error in the server's log.
+    /// Logs the result of a change, or why it failed, and waits for the disk. The change has already happened, so a
+    /// line that cannot be written is only an error in the server's log.
     pub(crate) fn end_now(
         &self,
         grant: &Grant,
@@ -228,7 +228,7 @@ impl Log {
         let written = self.file.write_all(line).and_then(|()| self.file.sync_data());
         match written {
             Ok(()) => self.bytes += line.len() as u64,
-            // A part of the line may be there; what follows begins on a line of its own.
+            // A part of the line may have been written, so start the next one on a new line.
             Err(_) => drop(self.file.write_all(b"\n")),
         }
         written
@@ -245,7 +245,7 @@ impl Log {
             }
         };
         let begin = || {
-            // The oldest first: a rename replaces the file before it.
+            // Rename the oldest file first, because a rename replaces the target.
             for number in (0..limits::AUDIT_OLD_FILES).rev() {
                 match fs::rename(old(number), old(number + 1)) {
                     Err(error) if number > 0 && error.kind() == io::ErrorKind::NotFound => {}
@@ -319,7 +319,7 @@ mod tests {
         assert_eq!(fs::read_to_string(&path).unwrap(), "{\"second, too long for it\": 2}\n");
         let old = dir.path().join("audit.jsonl.1");
         assert_eq!(fs::read_to_string(&old).unwrap(), "{\"cut\n{\"first\": 1}\n");
-        // Where an old file cannot be replaced, the log goes on in the same one.
+        // If an old file cannot be replaced, the log continues in the same file.
         fs::write(dir.path().join("audit.jsonl.7"), "old").unwrap();
         fs::create_dir_all(dir.path().join("audit.jsonl.8/taken")).unwrap();
         log.append(b"{\"third, too long for it\": 3}\n").unwrap();

@@ -24,7 +24,7 @@ pub(crate) fn expiry(der: &[u8]) -> Option<SystemTime> {
     time(tag, std::str::from_utf8(text).ok()?)
 }
 
-/// The tag and the content of the first element, and what follows it.
+/// The tag and the content of the first element, and the bytes after it.
 fn element(der: &[u8]) -> Option<(u8, &[u8], &[u8])> {
     let (&tag, rest) = der.split_first()?;
     let (&first, rest) = rest.split_first()?;
@@ -91,7 +91,7 @@ mod tests {
             let der = certificate.der();
             let expected = UNIX_EPOCH + Duration::from_secs(seconds);
             assert_eq!(expiry(der), Some(expected), "{year}-{month}-{day}");
-            // No part of one panics.
+            // Truncated certificates cause no panic.
             for length in 0..der.len() {
                 let _ = expiry(&der[..length]);
             }

@@ -46,9 +46,9 @@ pub struct Config {
     pub origins: Origins,
     /// Certificate and key; without them the server speaks plain HTTP.
     pub tls: Option<TlsFiles>,
-    /// File of the audit log; without it there is none.
+    /// File of the audit log; `None` for no audit log.
     pub audit: Option<PathBuf>,
-    /// Whether an episode that ends becomes an MCAP file beside its record.
+    /// Whether an episode that ends is also written as an MCAP file, next to its record.
     pub mcap: bool,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
@@ -106,12 +106,12 @@ pub struct Limits {
     pub sessions: usize,
     /// Pushes that wait or run at once.
     pub pushes: usize,
-    /// Bytes of memory that running pushes may take together; a third of `resident_bytes` if there is no value.
+    /// Bytes of memory that running pushes may use together; a third of `resident_bytes` if there is no value.
     pub push_memory_bytes: Option<u64>,
     /// Time-out for reading and checking one push.
     pub push: Duration,
-    /// Bytes of memory that all twins in use may take; three quarters of the machine's memory if there
-    /// is no value.
+    /// Bytes of memory that all twins in use may use together; three quarters of the machine's memory if there is no
+    /// value.
     pub resident_bytes: Option<u64>,
     /// Time between two returns of free memory to the operating system, while sections are evicted or pushes run.
     pub memory_release: Duration,

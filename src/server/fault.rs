@@ -20,9 +20,9 @@ pub(crate) enum Fault {
     /// JSON, but not a request.
     #[error("not a request: {reason}")]
     InvalidRequest {
-        /// The field at fault, as `rig.cameras[2].width`, if one is.
+        /// The field at fault, for example `rig.cameras[2].width`, if any.
         field: Option<String>,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
     /// A binary message.
@@ -40,7 +40,7 @@ pub(crate) enum Fault {
     #[error("not WebSocket: {0}")]
     BrokenFrame(String),
     /// A text message, or the reason of a Close frame, is not UTF-8.
-    #[error("not UTF-8: a text message has to be")]
+    #[error("a text message is not valid UTF-8")]
     NotUtf8,
     /// The request's number is neither the next one nor a repeated one.
     #[error("{field} is {seq}; {expected}")]
@@ -74,7 +74,7 @@ pub(crate) enum Fault {
         /// The name asked for.
         name: String,
     },
-    /// There is no session of that name to open another one from.
+    /// There is no session of this name from which another one could be opened.
     #[error("there is no session {name:?} of this token; it ended, or was never opened")]
     NoSuchSession {
         /// The field of the request that names it.
@@ -98,7 +98,7 @@ pub(crate) enum Fault {
         /// Its name.
         name: String,
     },
-    /// The sessions to resume together did not have one connection.
+    /// The sessions to resume together did not belong to one connection.
     #[error(
         "{field}: the session {name:?} was not on the connection of the first: its last request was {seq}"
     )]
@@ -141,7 +141,7 @@ pub(crate) enum Fault {
     Pose {
         /// The pose, as `poses[3]`.
         field: String,
-        /// What is wrong with it.
+        /// The error.
         cause: PoseError,
     },
     /// NaN or infinity in a pose, which JSON cannot express.
@@ -155,7 +155,7 @@ pub(crate) enum Fault {
     Camera {
         /// The camera, as `rig.cameras[2]`.
         field: String,
-        /// What is wrong with it.
+        /// The error.
         cause: CameraError,
     },
     /// The exposure or the overlay of a camera cannot be used.
@@ -163,7 +163,7 @@ pub(crate) enum Fault {
     Appearance {
         /// The field, as `rig.cameras[2].overlay`.
         field: String,
-        /// What is wrong with it.
+        /// The error.
         cause: AppearanceError,
     },
     /// The cameras do not form a valid rig.
@@ -171,13 +171,13 @@ pub(crate) enum Fault {
     Rig {
         /// The field.
         field: String,
-        /// What is wrong with it.
+        /// The error.
         cause: RigError,
     },
     /// A count has reached its maximum.
     #[error("there are {limit} {what} already; try again later")]
     Busy {
-        /// What is counted.
+        /// Name of the counted objects.
         what: &'static str,
         /// The maximum.
         limit: usize,
@@ -188,15 +188,15 @@ pub(crate) enum Fault {
     /// Another connection took over the session or the upload.
     #[error("the session was resumed by another connection")]
     Replaced,
-    /// The request has no token, or one that the server does not know.
-    #[error("a token is needed that this server knows: send Authorization: Bearer TOKEN")]
+    /// The request has no token, or an unknown one.
+    #[error("the request has no valid token: send Authorization: Bearer TOKEN")]
     Unauthorized,
-    /// The ticket is not good.
+    /// The ticket is invalid.
     #[error(
         "the ticket was used already, is older than 30 s, or was never issued: POST /v1/tickets"
     )]
     UnknownTicket,
-    /// There is no session to watch, or another token's.
+    /// There is no such session to watch, or it belongs to another token.
     #[error("there is no session {name:?} of this token to watch; GET /v1/sessions lists them")]
     NothingToWatch {
         /// The name asked for.
@@ -229,21 +229,21 @@ pub(crate) enum Fault {
     Forbidden {
         /// The field or header that decides it.
         field: &'static str,
-        /// What it lacks.
+        /// The missing right.
         reason: String,
     },
-    /// The request is for a name that the server does not go by.
+    /// The request's host name is not one of the server's names.
     #[error(
-        "the server is not called {host:?}; it answers to {served}. If that is its name, start it with --origin \
+        "the host name {host:?} is not accepted, only {served}; to add it, start the server with --origin \
          https://NAME"
     )]
     ForbiddenHost {
         /// The header `Host`.
         host: String,
-        /// The names that it answers to.
+        /// The names that are accepted.
         served: &'static str,
     },
-    /// A header that may be there once is there more than once.
+    /// A header that is allowed once occurs more than once.
     #[error("the header {header} is there more than once")]
     HeaderTwice {
         /// The header.
@@ -265,7 +265,7 @@ pub(crate) enum Fault {
     Handshake {
         /// The header.
         header: &'static str,
-        /// What must hold.
+        /// The requirement.
         must: &'static str,
     },
     /// The handshake does not offer the protocol's name.
@@ -279,7 +279,7 @@ pub(crate) enum Fault {
     NoSharedMemory {
         /// The field at fault.
         field: &'static str,
-        /// Why not, and what to do.
+        /// The reason, and the remedy.
         reason: String,
     },
     /// There is no route of this path.
@@ -303,7 +303,7 @@ pub(crate) enum Fault {
     UnknownUpload {
         /// The id asked for.
         id: String,
-        /// The field of a body that has it, if one does.
+        /// The field of the body that has it, if any.
         field: Option<String>,
     },
     /// The bytes do not continue the upload.
@@ -314,7 +314,7 @@ pub(crate) enum Fault {
         /// The offset at which the upload continues.
         held: u64,
     },
-    /// An upload is not what was announced.
+    /// An upload differs from its announcement.
     #[error("{what} is {found}, but {promised} was promised: send it again")]
     UploadDigest {
         /// The digest or size that differs.
@@ -327,7 +327,7 @@ pub(crate) enum Fault {
     /// The disk or the space for uploads is full.
     #[error("no room for the upload: {reason}")]
     StorageFull {
-        /// What is full.
+        /// The resource that is full.
         reason: String,
     },
     /// This server has no directory for uploads.
@@ -347,13 +347,13 @@ pub(crate) enum Fault {
     /// A file of the spool cannot be read now; a repetition may succeed.
     #[error("cannot read the spool: {cause}")]
     SpoolRead {
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// A file of the spool cannot be written.
     #[error("cannot write to the spool: {cause}")]
     SpoolWrite {
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// The audit log cannot be written.
@@ -364,7 +364,7 @@ pub(crate) enum Fault {
     Audit {
         /// The log.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// The server stops.
@@ -409,7 +409,7 @@ fn list(names: &[String]) -> String {
     }
 }
 
-/// Whether an error says that a disk, or a user's quota of it, is full.
+/// Whether an error means that a disk, or a user's quota of it, is full.
 pub(crate) fn is_full(cause: &io::Error) -> bool {
     matches!(cause.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }

@@ -1,7 +1,7 @@
-//! The messages of a client, read also while its last request is carried out.
+//! The messages of a client, which are read even while its last request is carried out.
 //!
-//! A request may take a minute. A client that sends a ping meanwhile, to see whether the server lives, gets its
-//! pong at once, and one that closes the connection gets its Close frame. A request that comes too early waits here.
+//! A request may take a minute. Meanwhile, a client that sends a ping, to check the server, gets its pong at once, and
+//! a client that closes the connection gets its Close frame. A request that arrives too early waits in the inbox.
 
 use std::collections::VecDeque;
 use std::pin::pin;
@@ -9,10 +9,10 @@ use std::pin::pin;
 use crate::limits;
 use crate::socket::{Disconnect, Incoming, Socket};
 
-/// A socket, and what was received too early.
+/// A socket, and the messages that were received too early.
 pub(crate) struct Inbox {
     pub(crate) socket: Socket,
-    /// What was received while a request was carried out, in order.
+    /// Messages that were received while a request was carried out, in order.
     early: VecDeque<Result<Incoming, Disconnect>>,
     early_bytes: usize,
     /// Whether nothing more will be received.
@@ -33,8 +33,8 @@ impl Inbox {
         early
     }
 
-    /// Carries out a request, and keeps what is received meanwhile. A client that sends too much ahead is not
-    /// read until the request is done: then its pings wait as well.
+    /// Carries out a request, and keeps the messages that are received meanwhile. If a client sends too many messages
+    /// ahead, no more are read until the request is done, so that its pings wait as well.
     pub(crate) async fn during<T>(&mut self, request: impl Future<Output = T>) -> T {
         let mut request = pin!(request);
         loop {

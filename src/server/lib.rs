@@ -9,9 +9,9 @@
 //! certificate    when a certificate expires
 //! reload         reading the certificate and the tokens again at SIGHUP
 //! readiness      whether sessions can be opened
-//! state          what all connections share
+//! state          state that all connections share
 //! listen         accepts connections, a bounded number
-//! newcomers      the slots of connections, before and after authentication
+//! admission      the slots of connections, before and after authentication
 //! idle_deadline  closes HTTP connections that make no progress
 //! routes         HTTP routes, and the upgrade to WebSocket
 //! auth           tokens, their roles, twins and limits
@@ -22,7 +22,7 @@
 //! spool          uploads on disk
 //! metrics        counters for Prometheus
 //! socket         WebSocket messages, with a time-out on every wait
-//! inbox          what a client sends while its last request is carried out
+//! inbox          messages that a client sends while its last request is carried out
 //! connection     one agent, in lock step: read a request, answer it
 //! memory         observations in memory that a client on the same machine maps
 //! watchers       clients that look at a session without taking part in it
@@ -33,6 +33,7 @@
 //!
 //! The pipeline of pushes is the package `wildcity-push`; the routes only carry requests to it.
 
+mod admission;
 mod audit;
 mod auth;
 mod blocking;
@@ -47,7 +48,6 @@ pub mod limits;
 mod listen;
 mod memory;
 mod metrics;
-mod newcomers;
 mod origins;
 mod readiness;
 mod reload;

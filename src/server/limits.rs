@@ -26,9 +26,9 @@ pub const IDLE_TIMEOUT: Duration = Duration::from_secs(600);
 /// How long a session outlives its connection, waiting for `resume`.
 pub const RESUME_GRACE: Duration = Duration::from_secs(60);
 
-/// Time between two returns of free memory to the operating system, while sections are evicted or pushes run. One walks
-/// the whole heap: with 1.1 GiB of sections that come and go it took 140 to 165 ms on two cores at a load of 9, which is
-/// less than 2 % of this time; 8 ms where little was free.
+/// Time between two returns of free memory to the operating system, while sections are evicted or pushes run. Each
+/// walks the whole heap: with 1.1 GiB of sections that come and go it took 140 to 165 ms on two cores at a load of 9,
+/// which is less than 2 % of this time; 8 ms where little was free.
 pub const MEMORY_RELEASE: Duration = Duration::from_secs(10);
 
 /// How long running steps may take to finish after SIGTERM.
@@ -39,14 +39,14 @@ pub const DRAIN_TIMEOUT: Duration = Duration::from_secs(10);
 pub const SPARE_CONNECTIONS: usize = 64;
 
 /// Connections that have not sent a request that a token allows. Each takes a file descriptor and 20 kB.
-pub const NEWCOMERS: usize = 512;
+pub const UNAUTHENTICATED_CONNECTIONS: usize = 512;
 
-/// Connections of one address among those, beyond which its oldest one is closed for the next.
-pub const NEWCOMERS_OF_ADDRESS: usize = 256;
+/// Unauthenticated connections of one address. Beyond this number the oldest one is closed when a new one arrives.
+pub const UNAUTHENTICATED_OF_ADDRESS: usize = 256;
 
-/// How long a new connection is not closed for another one. A client sends its request with its connection, and 512
-/// requests are read in a few milliseconds.
-pub const NEWCOMER_GRACE: Duration = Duration::from_millis(250);
+/// Grace period of a new connection, in which it is not closed for another one. A client sends its request with its
+/// connection, and 512 requests are read in a few milliseconds.
+pub const UNAUTHENTICATED_GRACE: Duration = Duration::from_millis(250);
 
 /// Bytes of pongs and of the close frame that a client has not read; each has at most 129 bytes.
 pub const PONGS_BYTES: usize = 4 << 10;
@@ -79,14 +79,14 @@ pub const INLINE_MEMORY_BYTES: u64 = 256 << 10;
 /// Uploads that a server keeps, finished or not: the blocks of a city, each in a file.
 pub const UPLOADS: usize = 1024;
 
-/// Longest name of an upload: what file systems allow.
+/// Longest name of an upload: the limit of file systems.
 pub const UPLOAD_NAME_BYTES: usize = 255;
 
 /// Longest name of a token.
 pub const TOKEN_NAME_BYTES: usize = 255;
 
-/// Largest file that says what was announced: a digest, and the names of an upload and of a token. With all their bytes
-/// escaped these have 2 x 6 x 255 = 3,060 bytes.
+/// Largest file of an announcement: a digest, and the names of an upload and of a token. With all their bytes escaped
+/// these have 2 x 6 x 255 = 3,060 bytes.
 pub const ANNOUNCEMENT_BYTES: u64 = 16 << 10;
 
 /// Largest upload: 250 million Gaussians of 236 bytes are 59 GB.
@@ -98,8 +98,8 @@ pub const SPOOL_BYTES: u64 = 2 * UPLOAD_BYTES;
 /// Part of the spool that each token may use, if several may: half of it, one of the largest uploads.
 pub const TOKEN_SHARE: u64 = 2;
 
-/// Bytes beyond those that have arrived that an active upload has room for: the bytes of a fast connection until
-/// room is next looked for, many times over.
+/// Space that is reserved for an active upload in addition to the bytes that have arrived: many times what a fast
+/// connection sends between two quota checks.
 pub const RESERVED_BYTES: u64 = 16 << 20;
 
 /// How long after its last byte, or its announcement, an upload keeps that room.
@@ -120,13 +120,13 @@ pub const UPLOAD_WRITE_BYTES: usize = 1 << 20;
 /// Largest file of tokens: 200 B each.
 pub const TOKENS_FILE_BYTES: u64 = 1 << 20;
 
-/// How long a ticket is good: a page uses it at once.
+/// How long a ticket is valid: a page uses it at once.
 pub const TICKET_AGE: Duration = Duration::from_secs(30);
 
-/// Tickets that were not used yet: one for each connection, and some for pages that were closed meanwhile.
+/// Largest number of unused tickets: one for each connection, and some for pages that were closed meanwhile.
 pub const TICKETS: usize = 2 * CONNECTIONS;
 
-/// Tickets of one token that were not used yet; a page needs one or two at a time.
+/// Largest number of unused tickets of one token; a page needs one or two at a time.
 pub const TOKEN_TICKETS: usize = 32;
 
 /// How long the result of a look at the list of twins answers `GET /readyz`, which needs no token.

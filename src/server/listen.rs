@@ -12,9 +12,9 @@ use socket2::{SockRef, TcpKeepalive};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::task::JoinHandle;
 
+use crate::admission::{ConnectionSlot, ConnectionSlots};
 use crate::idle_deadline::IdleDeadline;
 use crate::limits;
-use crate::newcomers::{ConnectionSlot, Newcomers};
 use crate::routes;
 use crate::state::ServerState;
 use crate::stream::Stream;
@@ -33,7 +33,7 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
             accepted = accepted => match accepted {
                 Ok(accepted) => accepted,
                 Err(error) => {
-                    // Most likely there are no file descriptors left; some will be closed.
+                    // Most likely no file descriptors are left; connections that end will free some.
                     tracing::warn!("cannot accept a connection: {error}");
                     tokio::time::sleep(Duration::from_millis(100)).await;
                     continue;
@@ -50,20 +50,21 @@ pub(crate) async fn listen(state: Arc<ServerState>, listener: TcpListener, tls: 
 /// Serves connections, whatever carries their bytes.
 pub(crate) struct Acceptor {
     state: Arc<ServerState>,
-    newcomers: Arc<Newcomers>,
+    connections: Arc<ConnectionSlots>,
     app: Router,
 }
 
 impl Acceptor {
     pub(crate) fn new(state: Arc<ServerState>) -> Self {
-        let newcomers = Newcomers::new(state.limits.connections + limits::SPARE_CONNECTIONS);
+        let connections =
+            ConnectionSlots::new(state.limits.connections + limits::SPARE_CONNECTIONS);
         let app = routes::router(state.clone());
-        Self { state, newcomers, app }
+        Self { state, connections, app }
     }
 
     /// A slot for a connection from an address.
     pub(crate) async fn admit(&self, address: IpAddr) -> ConnectionSlot {
-        self.newcomers.admit(address).await
+        self.connections.admit(address).await
     }
 
     /// Serves a connection until it ends or becomes a WebSocket.

@@ -5,15 +5,16 @@
 //! does not depend on the size of `/dev/shm` either, which is 64 MB in a container by default, less than three
 //! observations of six raw images.
 //!
-//! The client opens it by its path in `/proc` of this process. The kernel permits that only to programs of the same
-//! user (and to root) that see this process by the same number. A program elsewhere may have another file at that path: the
-//! target of the path, a symbolic link, has a random name by which the client recognises the file before it opens
+//! The client opens it by its path in `/proc` of this process. The kernel permits this only to programs of the same
+//! user (and to root) in which this process has the same id. For another program, the path may be of a different file:
+//! the target of the path, a symbolic link, has a random name by which the client recognises the file before it opens
 //! it. Then it sends back a random text from the file, which proves to the server that it can read the observations.
 //!
 //! The file has three slots, each as large as the largest answer, and its size is sealed: a client that maps it is
-//! never killed by SIGBUS. Pages that were not written take no memory. Those that were count against the budget for
-//! answers; a message without room in it goes through the socket, and the next ones try again. The server writes with
-//! positioned writes and maps nothing: there is one copy, from the observation that is kept for a repeated request.
+//! never killed by SIGBUS. Pages that were not written take no memory. Written pages count against the budget for
+//! answers. A message that exceeds the budget is sent through the socket, and the next message tries the memory again.
+//! The server writes with positioned writes and maps nothing: there is one copy, from the observation that is kept for
+//! a repeated request.
 
 use std::fs::File;
 use std::io;
@@ -91,7 +92,7 @@ impl SharedMemory {
     /// Begins to use the memory, if the client sends the text that is in it.
     ///
     /// # Errors
-    /// It sends another one.
+    /// The client sends a different text.
     pub(crate) fn open(&mut self, proof: &str) -> Result<(), Fault> {
         if proof != self.proof {
             let reason = "this is not the text at the beginning of the memory; connect without shared memory";

@@ -1,4 +1,4 @@
-//! Counters and gauges for Prometheus. Each server has its own: nothing here is global.
+//! Counters and gauges for Prometheus. Each server has its own; none is global.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
@@ -39,7 +39,7 @@ pub(crate) struct Metrics {
     pushes_open: Gauge,
 }
 
-/// The values of the gauges at one moment.
+/// The values of the gauges at one time.
 pub(crate) struct GaugeValues {
     /// Sessions, connected or waiting to be resumed.
     pub(crate) sessions: usize,
@@ -58,7 +58,7 @@ pub(crate) struct GaugeValues {
 impl Metrics {
     pub(crate) fn new(engine: Arc<Engine>) -> Self {
         let mut registry = Registry::with_prefix("wildcity");
-        // 16 buckets from 1 ms to 33 s, each twice the one before: most steps take 0.1 s.
+        // 16 buckets from 1 ms to 33 s, each twice the previous one: most steps take 0.1 s.
         let seconds = || Histogram::new(exponential_buckets(1e-3, 2.0, 16));
         let metrics = Self {
             registry: Registry::default(),

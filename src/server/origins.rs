@@ -1,8 +1,8 @@
-//! Which web pages may send requests, and by which names the server may be called.
+//! Checks which web pages may send requests, and which host names are accepted.
 //!
-//! A page of any site can send requests to 127.0.0.1, and browsers say in `Origin` which page it was. A page can also
-//! let the name of its own site stand for 127.0.0.1 (DNS rebinding): its requests then have no foreign `Origin`, but
-//! that name as `Host`. Programs send no `Origin`.
+//! A page of any site can send requests to 127.0.0.1, and browsers name the site of the page in `Origin`. A site can
+//! also make its own host name resolve to 127.0.0.1 (DNS rebinding): requests of its pages then have no foreign
+//! `Origin`, but this name as `Host`. Programs send no `Origin`.
 
 use std::net::IpAddr;
 
@@ -33,7 +33,7 @@ impl Origins {
             let uri: Result<Uri, _> = origin.parse();
             let Ok(uri) = uri else { return false };
             let scheme = uri.scheme_str().filter(|scheme| ["http", "https"].contains(scheme));
-            // Nothing after the authority, and no user in it.
+            // Only an authority, and no user in it.
             let plain =
                 scheme.zip(uri.authority()).map(|(scheme, host)| format!("{scheme}://{host}"));
             plain.is_some_and(|plain| plain == origin && !plain.contains('@'))
@@ -50,8 +50,8 @@ impl Origins {
         self.0.iter().any(|listed| listed.as_bytes() == origin)
     }
 
-    /// Refuses requests of pages that are neither local, nor listed, nor (on a server with tokens, of which a foreign
-    /// page knows none) from this server itself.
+    /// Refuses requests of pages that are neither local, nor listed, nor from this server itself. The last exception
+    /// applies only to servers with tokens, because a foreign page has no token.
     ///
     /// # Errors
     /// [`Fault::ForbiddenOrigin`].
@@ -72,9 +72,9 @@ impl Origins {
         Err(Fault::ForbiddenOrigin { origin })
     }
 
-    /// Refuses requests for other hosts. Without tokens, and with a list of origins, a host is this machine or one of the
-    /// list; with tokens it may also be an address, which no site can rebind. Without a list, a server with tokens does
-    /// not know its own names, and serves all.
+    /// Refuses requests for other hosts. Without tokens, and with a list of origins, the host must be this machine or
+    /// in the list; with tokens it may also be an address, which no site can rebind. A server with tokens and without a
+    /// list accepts all hosts, because its names are not configured.
     ///
     /// # Errors
     /// [`Fault::ForbiddenHost`].
@@ -92,7 +92,7 @@ impl Origins {
         }
         let served = match has_tokens {
             true => "the hosts of --origin, addresses and localhost",
-            false => "without tokens, localhost and the hosts of --origin",
+            false => "localhost and the hosts of --origin (the server has no tokens)",
         };
         Err(Fault::ForbiddenHost { host: host.to_owned(), served })
     }

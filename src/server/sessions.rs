@@ -16,7 +16,7 @@ use crate::auth::{Grant, Role};
 use crate::fault::Fault;
 use crate::watchers::{Newest, Watch};
 
-/// How long one attempt to take over a session waits before it asks the old connection again.
+/// How long one attempt to take over a session waits before it notifies the old connection again.
 const TAKEOVER_ATTEMPT: Duration = Duration::from_millis(100);
 
 /// All sessions of a server, by name.
@@ -50,7 +50,7 @@ struct Entry {
     view: Option<SessionView>,
     /// Where watchers see the session's observations.
     newest: Newest,
-    /// Asks the connection that holds the slot to release it.
+    /// Notifies the connection that holds the slot to release it.
     release: Arc<Notify>,
     /// Set while no connection holds the slot.
     parked: Option<Parked>,
@@ -83,7 +83,7 @@ pub(crate) struct ListedSession {
     pub(crate) connected: bool,
 }
 
-/// A session, and what must survive the loss of its connection.
+/// A session, and the data that must survive the loss of its connection.
 #[derive(Default)]
 pub(crate) struct SessionSlot {
     /// `None` while the session is opened, and once it is closed.
@@ -135,7 +135,7 @@ impl Answer {
 /// The answer to steps of several sessions.
 #[derive(Debug)]
 pub(crate) struct ManyAnswer {
-    /// What is sent before the observations.
+    /// Bytes that are sent before the observations.
     pub(crate) header: Vec<u8>,
     /// The observations, in order.
     pub(crate) frames: Vec<Arc<Observation>>,
@@ -147,7 +147,7 @@ pub(crate) struct SlotGuard {
     name: String,
     /// The outcome of the episode if the guard is dropped and no client resumes the session.
     pub(crate) outcome: Outcome,
-    /// Notified when another connection wants to resume the session.
+    /// Notified when another connection is resuming the session.
     pub(crate) release: Arc<Notify>,
     newest: Newest,
     slot: OwnedMutexGuard<SessionSlot>,
@@ -200,7 +200,7 @@ impl SessionRegistry {
         Ok(self.guard(name, release, newest, guard))
     }
 
-    /// Watches a session: of the client's own token, or any as an administrator.
+    /// Watches a session of the client's own token, or any session as an administrator.
     ///
     /// # Errors
     /// There is no such session that the client may see.
@@ -259,8 +259,8 @@ impl SessionRegistry {
         self.closed.lock().get(name).filter(|session| session.owner == owner).cloned()
     }
 
-    /// Takes over the slot of a session, which `field` of a request names, even if its old connection still holds it: after a network
-    /// failure, the client notices long before the server that the old connection is dead.
+    /// Takes over the slot of a session, which `field` of a request names, even if its old connection still holds it:
+    /// after a network failure, the client detects long before the server that the old connection is dead.
     ///
     /// # Errors
     /// There is no such session of this owner, or its last step runs for longer than `max_wait`.
@@ -407,7 +407,7 @@ impl SlotGuard {
         }
     }
 
-    /// Shows an observation to the watchers of the session, if there are any.
+    /// Sends an observation to the watchers of the session, if there are any.
     pub(crate) fn show(&self, observation: &Arc<Observation>) {
         self.newest.show(observation);
     }
@@ -458,8 +458,8 @@ impl Drop for SlotGuard {
 mod tests {
     use super::*;
 
-    /// The answer to `close` is not kept under a name that another session has taken in the meantime: a client that resumes
-    /// that name wants the session that is open.
+    /// The answer to `close` is not kept under a name that another session has taken in the meantime: a client that
+    /// resumes this name must get the open session.
     #[test]
     fn a_closed_session_gives_way_to_an_open_one() {
         let registry = SessionRegistry::new(8, Duration::from_secs(60));

@@ -132,8 +132,8 @@ impl Running {
         self.state.limits.connections - self.state.websocket_permits.available_permits()
     }
 
-    /// Stops accepting connections, lets running steps finish, notifies every client, and ends every
-    /// session. What is being exported is finished.
+    /// Stops accepting connections, lets running steps finish, notifies every client, and ends every session. Exports
+    /// that have started are finished.
     pub async fn stop(self) {
         // An error means that no task waits for the signal any more.
         let _ = self.stop.send(true);

@@ -161,8 +161,8 @@ impl Socket {
 
     /// Closes the connection, with a Close frame of this status unless the client has closed it already.
     ///
-    /// What the client still sends is read for a while: closing a socket with unread bytes resets the connection,
-    /// and the client would never see the last answer. Its own Close frame is among these bytes.
+    /// Bytes that the client still sends are read for a while: closing a socket with unread bytes resets the
+    /// connection, and the client would never see the last answer. Its own Close frame is among these bytes.
     pub(crate) async fn close(mut self, status: Option<CloseStatus>) {
         let closing = async {
             if let Some(CloseStatus { code, reason }) = status {

@@ -46,7 +46,7 @@ pub enum ServerError {
     Listen {
         /// The address.
         address: SocketAddr,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// The directory for episodes cannot be made.
@@ -54,7 +54,7 @@ pub enum ServerError {
     Episodes {
         /// The directory.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// The audit log cannot be opened.
@@ -62,7 +62,7 @@ pub enum ServerError {
     Audit {
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// The certificate or the key cannot be used.

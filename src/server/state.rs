@@ -1,4 +1,4 @@
-//! What all connections of a server share.
+//! State that all connections of a server share.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::spool::Spool;
 use crate::tickets::Tickets;
 use crate::token_counts::TokenCounts;
 
-/// What all connections of a server share.
+/// State that all connections of a server share.
 pub(crate) struct ServerState {
     pub(crate) engine: Arc<Engine>,
     pub(crate) sessions: Arc<SessionRegistry>,
@@ -44,7 +44,7 @@ pub(crate) struct ServerState {
     pub(crate) origins: Origins,
     /// Directory where episodes are recorded.
     pub(crate) episodes: PathBuf,
-    /// The spool, or why there is none.
+    /// The spool, or the reason for its absence.
     pub(crate) spool: Result<Arc<Spool>, String>,
     pub(crate) pushes: PushQueue,
     pub(crate) metrics: Metrics,

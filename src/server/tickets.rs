@@ -1,4 +1,5 @@
-//! One-time tickets, which stand for a token in the address of a WebSocket: browsers cannot send a token with one.
+//! One-time tickets, which stand for a token in the address of a WebSocket: browsers cannot send a token in a
+//! handshake.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -13,7 +14,7 @@ use crate::limits;
 /// The tickets that were not used yet.
 #[derive(Default)]
 pub(crate) struct Tickets {
-    /// By the BLAKE3 of the ticket: how long a look-up takes then says nothing about a ticket.
+    /// By the BLAKE3 of the ticket, so that the time of a look-up reveals nothing about tickets.
     entries: Mutex<BTreeMap<[u8; 32], Entry>>,
 }
 
@@ -23,11 +24,11 @@ struct Entry {
 }
 
 impl Tickets {
-    /// A new ticket with the rights of a token. It replaces the token's oldest one if there are
+    /// A new ticket with the rights of a token. It replaces the token's oldest ticket if there are
     /// [`limits::TOKEN_TICKETS`].
     ///
     /// # Errors
-    /// There are too many of all tokens that were not used.
+    /// All tokens together have too many unused tickets.
     pub(crate) fn issue(&self, grant: Arc<Grant>) -> Result<String, Fault> {
         self.issue_at(grant, Instant::now())
     }
@@ -98,7 +99,7 @@ mod tests {
         assert!(matches!(tickets.redeem_at(&second, later), Err(Fault::UnknownTicket)));
     }
 
-    /// The grants of so many tokens.
+    /// The grants of `count` tokens.
     fn grants(count: usize) -> Vec<Arc<Grant>> {
         let token = |index: usize| {
             format!(r#"{{"name": "{index}", "role": "drive", "token": "token-token-{index:06}"}}"#)

@@ -16,7 +16,7 @@ use crate::certificate::expiry;
 /// The files of a certificate and its key, in PEM.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TlsFiles {
-    /// The server's certificate first, then those of the authorities between it and the root.
+    /// The server's certificate first, then the intermediate certificates.
     pub cert: PathBuf,
     /// The key, in PKCS#8, PKCS#1 or SEC1.
     pub key: PathBuf,
@@ -41,7 +41,7 @@ impl TlsFiles {
 pub struct TlsError {
     /// The file.
     pub path: PathBuf,
-    /// What is wrong with it.
+    /// The error.
     pub reason: String,
 }
 
@@ -65,7 +65,7 @@ impl Tls {
         self.acceptor.lock().clone()
     }
 
-    /// Reads the files again. Connections that exist keep their certificate. If the new files cannot be used, the old
+    /// Reads the files again. Existing connections keep their certificate. If the new files cannot be used, the old
     /// ones stay.
     pub(crate) fn read_again(&self) {
         match read(&self.files) {

@@ -8,7 +8,7 @@ use parking_lot::Mutex;
 use crate::auth::Grant;
 use crate::fault::Fault;
 
-/// Numbers of things of one kind, by token.
+/// Number of operations of one kind, by token.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct TokenCounts(Arc<Mutex<BTreeMap<String, usize>>>);
 
@@ -23,7 +23,7 @@ impl TokenCounts {
     /// Counts one more push, edit or search for the ground of a token.
     ///
     /// # Errors
-    /// [`Fault::Busy`]: the token has as many as it may.
+    /// [`Fault::Busy`]: the token's limit is reached.
     pub(crate) fn push(&self, grant: &Grant) -> Result<Counted, Fault> {
         self.begin(grant, grant.limits.pushes, "pushes of this token")
     }
@@ -31,7 +31,7 @@ impl TokenCounts {
     /// Counts one more WebSocket connection of a token.
     ///
     /// # Errors
-    /// [`Fault::Busy`]: the token has as many as it may.
+    /// [`Fault::Busy`]: the token's limit is reached.
     pub(crate) fn connection(&self, grant: &Grant) -> Result<Counted, Fault> {
         self.begin(grant, grant.limits.connections, "connections of this token")
     }

@@ -1,7 +1,7 @@
 //! Clients that look at a session without taking part in it.
 //!
-//! A session hands out its newest observation through a cell that holds one. With no watcher nothing is stored, and
-//! a slow watcher misses observations: the session never waits.
+//! A session publishes its newest observation in a cell that holds one. Without watchers nothing is stored, and a slow
+//! watcher misses observations, so that the session never waits.
 
 use std::sync::{Arc, Weak};
 
@@ -32,7 +32,7 @@ impl Newest {
         Self(Arc::new(watch::channel(None).0))
     }
 
-    /// Shows an observation to the watchers, if there are any.
+    /// Sends an observation to the watchers, if there are any.
     pub(crate) fn show(&self, observation: &Arc<Observation>) {
         if self.0.receiver_count() > 0 {
             self.0.send_replace(Some(observation.clone()));

@@ -1,8 +1,8 @@
 //! One episode: the ego's pose, the simulated time, and the past poses. Pure: no clock, no I/O.
 //!
-//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues
-//! exactly as the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records the
-//! new one before it replaces the old, so that a step which fails on the way has not happened.
+//! An [`Episode`] is a plain value: a copy of it, or one that was written as JSON and read again, continues exactly as
+//! the original does. A step returns a new [`Episode`] and leaves the old one as it is. The session renders and records
+//! the new one before it replaces the old, so that a step which fails on the way changes nothing.
 
 use std::collections::VecDeque;
 
@@ -48,10 +48,10 @@ pub struct Episode {
     /// By camera, whether its images are being repaired; empty if none is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     repairing: Vec<bool>,
-    /// By camera, the recorded image that its repair model compares with; empty if there is none.
+    /// For each camera, the recorded image that its repair model compares with; empty if there is none.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     references: Vec<Option<String>>,
-    /// What its sensors keep, if the session asked for effects.
+    /// State of its sensors, if the session has sensor effects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     sensors: Option<Box<EpisodeSensors>>,
 }
@@ -105,8 +105,8 @@ pub struct EgoHistory {
     pub xyz_m: [[f32; 3]; HISTORY_POSES],
     /// Rotation matrices `[16, 3, 3]`, row by row.
     pub rotation: [[[f32; 3]; 3]; HISTORY_POSES],
-    /// How many poses, counted from the end, were driven, warm-up included. The earlier ones repeat the
-    /// first of these.
+    /// How many poses, counted from the end, were driven, warm-up included. The earlier ones repeat the first driven
+    /// pose.
     pub count: usize,
 }
 
@@ -116,7 +116,7 @@ impl Episode {
         Self::with_warm_up(seed, ego, &[], dt_us)
     }
 
-    /// The same with a warm-up before the start: past poses at rising times below 0.
+    /// An episode with a warm-up before the start: past poses at rising times below 0.
     pub(crate) fn with_warm_up(seed: u64, ego: Ego, warm_up: &[Keyframe], dt_us: i64) -> Self {
         let start = Keyframe { time_us: 0, world_from_rig: ego.world_from_rig() };
         let track: VecDeque<Keyframe> = warm_up.iter().copied().chain([start]).collect();
@@ -138,7 +138,7 @@ impl Episode {
         }
     }
 
-    /// The same, at its start, with sensors that have effects.
+    /// Adds sensor effects to an episode at its start.
     #[must_use]
     pub(crate) fn with_sensors(mut self, sensors: Option<EpisodeSensors>) -> Self {
         self.sensors = sensors.map(Box::new);
@@ -162,8 +162,8 @@ impl Episode {
         Ok(self.followed(command, 1, ground, terminate)?.0)
     }
 
-    /// The episode after one or more steps along a plan: a command that holds for all of them. And the ego after each
-    /// step.
+    /// Returns the episode after one or more steps along a plan, which is one command for all steps, and the ego after
+    /// each step.
     ///
     /// # Errors
     /// As [`Episode::stepped`].
@@ -198,9 +198,9 @@ impl Episode {
             next.ego = ego.clone();
         }
         next.terminated = terminate;
-        // Keep one pose at or before the history's first, to interpolate from, for every step of the plan: the
-        // frames that were taken since its start are rendered at its end. The first plan may still render frames
-        // of the warm-up, so it keeps all of that.
+        // For every step of the plan, keep one pose at or before the first one of the history, to interpolate from:
+        // frames of all times since the start of the plan are rendered at its end. The first plan may still render
+        // frames of the warm-up, so it keeps all of that.
         let time_us = next.time_us();
         let plan_us = time_us - self.time_us();
         let reach_us =
@@ -211,8 +211,8 @@ impl Episode {
         Ok((next, egos))
     }
 
-    /// The ego after each of some steps, along the decision that holds then: with a delay of the planner, not yet that
-    /// of now.
+    /// The ego after each of some steps, along the decision that is in effect at that step. With a planner latency this
+    /// is an earlier decision than the present one.
     fn follow_decisions(
         &mut self,
         command: &Command,
@@ -266,7 +266,7 @@ impl Episode {
         selected.iter().map(|&camera| all[camera]).collect()
     }
 
-    /// Checks a state that was read from a file. Returns what is wrong with it otherwise.
+    /// Checks a state that was read from a file. Returns what is wrong with it, if anything.
     pub(crate) fn check(&self) -> Result<(), &'static str> {
         let rising = self.track.iter().is_sorted_by(|a, b| a.time_us < b.time_us);
         match self.track.back() {
@@ -283,13 +283,13 @@ impl Episode {
         }
     }
 
-    /// The poses before its start, if it is still there.
+    /// The poses before its start, if the track still has them.
     pub(crate) fn warm_up(&self) -> Vec<Keyframe> {
         let before = self.track.iter().filter(|key| self.step == 0 && key.time_us < 0);
         before.copied().collect()
     }
 
-    /// Whether it has its start alone: no step was made, there is no warm-up before the start, and no sensor has
+    /// Whether it contains only its start: no step was made, there is no warm-up before the start, and no sensor has
     /// effects.
     pub(crate) fn is_start_alone(&self) -> bool {
         self.step == 0 && self.begin_us == 0 && self.sensors.is_none()
@@ -344,7 +344,7 @@ impl Episode {
     ) -> EpisodeSummary {
         let completed = self.terminated
             || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
-        // Rules of a scenario are not evaluated by a replay: what a record says of them is believed.
+        // A replay does not evaluate the rules of the scenario. It takes the outcome from the record.
         let failed = self.failed || outcome == Outcome::DrivingFailure;
         let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model, failed) {
@@ -382,12 +382,12 @@ impl Episode {
         }
     }
 
-    /// What the repair keeps from one observation to the next.
+    /// State of the repair that continues from one observation to the next.
     pub(crate) fn repair_state(&self) -> RepairState {
         RepairState { is_on: self.repairing.clone(), references: self.references.clone() }
     }
 
-    /// Takes over what the repair keeps after an observation; `None` changes nothing.
+    /// Stores the state of the repair after an observation; `None` changes nothing.
     pub(crate) fn set_repair_state(&mut self, state: Option<RepairState>) {
         let Some(RepairState { is_on, references }) = state else { return };
         self.repairing = if is_on.contains(&true) { is_on } else { Vec::new() };

@@ -1,4 +1,4 @@
-//! What can go wrong with a session.
+//! Errors of sessions.
 
 use wildcity_render::RenderError;
 use wildcity_repair::RepairError;
@@ -19,7 +19,7 @@ pub enum SessionError {
     /// The twin does not exist or cannot be read.
     #[error(transparent)]
     Twin(#[from] StoreError),
-    /// What a frame needs does not fit into memory, or could not be loaded.
+    /// The data of a frame does not fit into memory, or could not be loaded.
     #[error(transparent)]
     Residency(ResidencyError),
     /// The scenario does not exist, is malformed, or does not fit the twin.
@@ -59,7 +59,7 @@ pub enum SessionError {
         /// Why.
         reason: String,
     },
-    /// The repair model failed, and the session asked for an error then.
+    /// The repair model failed, and the session had asked for an error in this case.
     #[error("the image of camera {camera:?} was not repaired: {cause}; nothing changed")]
     Repair {
         /// Name of the camera.
@@ -67,7 +67,7 @@ pub enum SessionError {
         /// Why.
         cause: Box<RepairError>,
     },
-    /// A recorded drive of the twin is no route.
+    /// A recorded drive of the twin cannot be used as a route.
     #[error(transparent)]
     Route(#[from] RouteError),
     /// The session has no snapshot of this name.
@@ -91,7 +91,7 @@ pub enum SessionError {
     /// A recorded episode cannot be continued.
     #[error("the recorded episode cannot be continued: {reason}")]
     Branch {
-        /// What prevents it.
+        /// The reason.
         reason: String,
     },
     /// A camera was requested twice.
@@ -156,7 +156,7 @@ pub enum SessionError {
     /// The render queue is full, or the budget for answers is used up.
     #[error("the server is busy: {what}; try again later")]
     Busy {
-        /// What is used up.
+        /// The resource that is used up.
         what: &'static str,
     },
     /// The deadline passed while the frame was queued or rendered.
@@ -170,7 +170,7 @@ pub enum SessionError {
     Encode {
         /// Name of the camera.
         camera: String,
-        /// What the encoder says.
+        /// The encoder's message.
         reason: String,
     },
     /// The episode's file could not be written, so that the request had no effect: every answer is on
@@ -183,7 +183,7 @@ pub enum SessionError {
     /// A thread could not be started.
     #[error("cannot start a thread: {reason}")]
     Thread {
-        /// What the operating system says.
+        /// The operating system's message.
         reason: String,
     },
 }

@@ -4,7 +4,7 @@
 //! recorded, and only then changes the session: if any of this fails, the session is unchanged, and the
 //! client can repeat the request.
 //!
-//! | module | what it holds |
+//! | module | contents |
 //! |---|---|
 //! | `session` | a session: opening it, answering its requests |
 //! | `options`, `start` | what a client requests when it opens a session; where episodes start |
@@ -14,9 +14,9 @@
 //! | `observe` | which images are rendered, and how they become one message |
 //! | `record` | episodes' files, and their replay |
 //! | `prefetch` | loads what the next frames of the ego will need |
-//! | `repair` | which images a model repairs, and what is told of each |
-//! | `scenario` | scenarios by name, and the files beside them |
-//! | `sensors` | effects of the sensors, and the delay of the planner |
+//! | `repair` | which images a model repairs, and what is reported of each |
+//! | `scenario` | scenarios by name, and the files next to them |
+//! | `sensors` | sensor effects, and the planner latency |
 //! | `stills` | images from any views, without an episode |
 //! | [`limits`] | limits and defaults |
 

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-/// Most events of one observation.
+/// Largest number of events of one observation.
 pub const EVENTS: usize = 64;
 
 /// Room in the header of an observation for its events and the route: 64 events of at most 600 bytes, 20 points of 80,
@@ -12,8 +12,8 @@ pub const SCENARIO_HEADER_BYTES: usize = 96 << 10;
 /// Room for an actor: a name of 64 bytes, 14 numbers of at most 24 digits, and the names of the fields.
 pub const ACTOR_HEADER_BYTES: usize = 640;
 
-/// Most episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work. What comes on top is not exported, and
-/// the listing says so.
+/// Largest number of episodes that wait to be exported as MCAP: at 20 ms each, 20 s of work. Further episodes are not
+/// exported, and the listing says so.
 pub const WAITING_EXPORTS: usize = 1024;
 
 /// Largest record that is exported as MCAP by itself, in bytes: it is held in memory, several times its size. A day at
@@ -26,8 +26,8 @@ pub const FAILED_EXPORTS: usize = 1024;
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
-/// An episode ends as `off_model` if the mean trust of one of its observations was below this. It is
-/// reached 11.5 m beside the recorded drive, two lanes beyond the neighbouring one.
+/// An episode ends as `off_model` if the mean trust of one of its observations was below this. It is reached at a
+/// lateral offset of 11.5 m from the recorded drive, two lanes beyond the neighbouring one.
 pub const OFF_MODEL_TRUST: f64 = 0.1;
 
 /// JPEG quality unless the session requests another.
@@ -38,7 +38,7 @@ pub const JPEG_QUALITY: u8 = 90;
 /// depth and opacity are 88 MB.
 pub const OBSERVATION_BYTES: usize = 3 << 29;
 
-/// Most bytes per pixel without normals and instances: raw colour, and depth and opacity as f32.
+/// Largest number of bytes per pixel without normals and instances: raw colour, and depth and opacity as f32.
 pub const PIXEL_BYTES: u64 = 3 + 4 + 4;
 
 /// Bytes per pixel of normals.
@@ -51,10 +51,11 @@ pub const INSTANCE_BYTES: u64 = 2;
 /// of at most 3.5 kB, together 0.9 MB.
 pub const OBSERVATION_HEADER_BYTES: u64 = 1 << 20;
 
-/// Sessions at once, both connected ones and ones that wait for their client to resume.
+/// Open sessions, both connected ones and ones that wait for their client to resume.
 pub const SESSIONS: usize = 256;
 
-/// Most steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of 64 bytes until the plan's end.
+/// Largest number of steps of a plan, `until_us` of a step: a minute at 16 Hz. Each keeps a pose of 64 bytes until the
+/// plan's end.
 pub const PLAN_STEPS: usize = 1_000;
 
 /// How long a render queue that is dropped waits for the frames that are being rendered. 128 Mi pixels at 15 ns each
@@ -87,7 +88,7 @@ pub const HISTORY_POSES: usize = 16;
 /// Time between two poses of the ego history, in microseconds.
 pub const HISTORY_STEP_US: i64 = 100_000;
 
-/// Most frames of each camera in one observation: 1.5 s at 10 Hz, as far as the ego history reaches.
+/// Largest number of frames of each camera in one observation: 1.5 s at 10 Hz, the length of the ego history.
 pub const BUNDLE_FRAMES: usize = HISTORY_POSES;
 
 /// Longest time between two frames of a camera, or between two decisions, in microseconds. A longer step
@@ -101,16 +102,16 @@ pub const START_LATERAL_M: f64 = 20.0;
 /// 1 kHz these are 10,000 poses of 64 bytes.
 pub const SENSOR_REACH_US: i64 = 10_000_000;
 
-/// After so many lost frames in a row the camera delivers the oldest of them: at one in two, every 500th frame.
+/// After this number of lost frames in a row the camera delivers the oldest of them: at one in two, every 500th frame.
 pub const SENSOR_DROPS: i64 = 8;
 
-/// Shortest and longest time between two values of an exposure or a bias that wanders, in microseconds: up to an hour.
-pub const WANDER_PERIOD_US: std::ops::RangeInclusive<i64> = 1_000..=3_600_000_000;
+/// Shortest and longest time between two values of a drifting exposure or bias, in microseconds: up to an hour.
+pub const DRIFT_PERIOD_US: std::ops::RangeInclusive<i64> = 1_000..=3_600_000_000;
 
 /// Time between two biases of an inertial measurement unit unless the session names another, in microseconds.
 pub const BIAS_PERIOD_US: i64 = 60_000_000;
 
-/// Most spots of dirt on a lens. Each is computed for each image.
+/// Largest number of spots of dirt on a lens. Each is computed for each image.
 pub const DIRT_SPOTS: u64 = 256;
 
 /// Longest warm-up, in microseconds: sixteen frames at 1 Hz, and more than twice what any known agent
@@ -123,8 +124,8 @@ pub const DT_MIN_US: i64 = 1_000;
 /// Longest simulated time of a step, in microseconds.
 pub const DT_MAX_US: i64 = 10_000_000;
 
-/// What frames may take between the stages of the renderer is one in so many of the bytes of memory for twins. A frame
-/// that would take more is drawn in parts, which costs little: 128 MiB of 1 GiB are a million Gaussians at once.
+/// The renderer's intermediate buffers may use 1/`FRAME_SHARE` of the memory for twins. A frame that needs more is
+/// rendered in parts, which costs little: 128 MiB of 1 GiB are a million Gaussians at once.
 pub const FRAME_SHARE: u64 = 8;
 
 /// Bytes per pixel of a JPEG file for which memory is set aside: twice those of a street of quality 90.
@@ -134,8 +135,8 @@ pub const JPEG_PIXEL_BYTES: u64 = 1;
 /// one in the queue after its deadline: hence twice the sessions.
 pub const QUEUED_FRAMES: usize = 2 * SESSIONS;
 
-/// A frame of more pixels takes so long on processors, a second and more, that small frames are rendered beside it.
-/// Sixteen 1440x928 images are 21 million.
+/// A frame of more pixels takes a second and more on processors, so small frames are rendered at the same time. Sixteen
+/// 1440x928 images are 21 million.
 pub const LARGE_PIXELS: u64 = 24 << 20;
 
 /// Bytes of all answers that are being made, sent, or kept for a repeated `seq`, and of the sessions'
@@ -143,10 +144,11 @@ pub const LARGE_PIXELS: u64 = 24 << 20;
 /// depth and opacity (88 MB each), or for JPEGs to every session.
 pub const ANSWERS_BYTES: u64 = 9 << 30;
 
-/// The memory of one answer up to this size is kept for the next one, in bytes: six raw 1440x928 images take 24 MB.
+/// Largest memory of an answer, in bytes, that is kept for the next answer: six raw 1440x928 images take 24 MB.
 pub const SPARE_ANSWER_BYTES: usize = 32 << 20;
 
-/// What a render thread keeps for the next frame, in bytes: RGB and opacity of six 1440x928 images take 56 MB.
+/// Largest memory that a render thread keeps for the next frame, in bytes: RGB and opacity of six 1440x928 images take
+/// 56 MB.
 pub const SCRATCH_BYTES: usize = 64 << 20;
 
 /// Longest line of an episode's file after the first: 256 image hashes of an `observe` take 17 kB.
@@ -198,7 +200,7 @@ pub const STANDSTILL_STEP_M: f64 = 0.01;
 /// urban speed.
 pub const STANDSTILL_AHEAD_M: f64 = 50.0;
 
-/// Most steps that prefetching looks ahead, even if the agent steps much faster than real time.
+/// Largest number of steps that prefetching looks ahead, even if the agent steps much faster than real time.
 pub const STEPS_AHEAD: usize = 256;
 
 /// How long a push may preload its version for the running sessions. After that the version counts as ready
@@ -209,7 +211,7 @@ pub const PRELOAD_TIMEOUT: Duration = Duration::from_secs(60);
 /// loading.
 pub const PRELOAD_POLL: Duration = Duration::from_millis(50);
 
-// Answers are what is set aside for images.
+// The memory for answers is the memory that is set aside for images.
 const _: () = assert!(ANSWERS_BYTES == wildcity_twin::limits::IMAGE_BYTES);
 
 // The largest answer fits the budget while no other session has one.

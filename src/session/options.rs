@@ -1,4 +1,4 @@
-//! What a client requests when it opens a session.
+//! Options of a session that a client requests at `open`.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -29,7 +29,7 @@ pub struct SessionOptions {
     pub rig: Option<RigChoice>,
     /// Fields of the twin's render profile to override.
     pub profile: ProfileOverrides,
-    /// What each observation holds.
+    /// Contents of each observation.
     pub outputs: Outputs,
     /// How the ego moves.
     pub dynamics: Dynamics,
@@ -41,7 +41,7 @@ pub struct SessionOptions {
     /// Length of the warm-up in microseconds. The warm-up is the part of the recorded drive before the
     /// start; the first observations hold its poses and frames.
     pub warm_up_us: i64,
-    /// How long one answer may take.
+    /// Largest time for one answer.
     pub deadline: Option<Duration>,
     /// The scenario that is driven; without one there are no actors.
     pub scenario: Option<ScenarioOptions>,
@@ -51,18 +51,18 @@ pub struct SessionOptions {
     pub sensors: Option<Sensors>,
 }
 
-/// A scenario, and what of its ego section holds.
+/// A scenario, and which values of its ego section apply.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScenarioOptions {
     /// Which scenario.
     pub source: ScenarioSource,
     /// Values of its sweep; the first ones where absent.
     pub values: BTreeMap<String, serde_json::Value>,
-    /// Whether its dynamics hold: the request names none.
+    /// Whether the scenario's dynamics apply, because the request gives none.
     pub dynamics: bool,
-    /// Whether its warm-up holds: the request names none.
+    /// Whether the scenario's warm-up applies, because the request gives none.
     pub warm_up: bool,
-    /// Whether observations tell where the actors are.
+    /// Whether observations contain the poses of the actors.
     pub actors: bool,
 }
 
@@ -89,43 +89,43 @@ impl SessionOptions {
     }
 }
 
-/// Which images are repaired, and by which model. For a field that is `None`, the default of
-/// [`Selection`](wildcity_repair::Selection) holds.
+/// Which images are repaired, and by which model. A field that is `None` has the default of
+/// [`Selection`](wildcity_repair::Selection).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RepairOptions {
     /// Name of the model.
     pub model: String,
-    /// A camera is repaired from trust below this on.
+    /// A camera is repaired once its trust is below this.
     pub below: Option<f64>,
-    /// A camera is no longer repaired from trust above this on.
+    /// A camera is no longer repaired once its trust is above this.
     pub above: Option<f64>,
-    /// Under this trust nothing is repaired.
+    /// Images whose trust is below this are not repaired.
     pub at_least: Option<f64>,
-    /// Most images of one pose of the rig.
+    /// Largest number of repaired images of one pose of the rig.
     pub per_step: Option<u64>,
-    /// What happens when the model fails.
+    /// Behaviour when the model fails.
     pub on_failure: OnFailure,
 }
 
-/// What happens to an image that could not be repaired.
+/// Behaviour when an image could not be repaired.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OnFailure {
-    /// It is delivered as rendered and says so.
+    /// The image is delivered as rendered, and marked so.
     #[default]
     Unrepaired,
     /// The request is refused with [`SessionError::Repair`](crate::SessionError::Repair); nothing changed.
     Error,
 }
 
-/// How a step is made, beside its command.
+/// Options of a step in addition to its command.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepOptions {
-    /// For how long the command is followed, in microseconds: a whole number of steps; one step if absent.
+    /// Duration for which the command is followed, in microseconds: a whole number of steps; one step if absent.
     pub until_us: Option<i64>,
     /// Whether the episode ends with it.
     pub terminate: bool,
-    /// What the agent notes, for the record.
+    /// Notes of the agent, for the record.
     pub notes: Option<serde_json::Value>,
 }
 
@@ -141,16 +141,16 @@ pub enum Start {
         /// Distance along it in metres, from 0 to its length.
         station_m: f64,
     },
-    /// Somewhere along a recorded trajectory, drawn with the episode's seed.
+    /// A random pose along a recorded trajectory, sampled with the episode's seed.
     Random(RandomStart),
 }
 
-/// A start that is drawn anew for each episode. Every draw is uniform.
+/// A start that is sampled anew for each episode, from uniform distributions.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RandomStart {
     /// Name of the trajectory; the first one if absent.
     pub trajectory: Option<String>,
-    /// Where the stations begin, in metres; at 0, or where a warm-up ends, if absent.
+    /// Lowest station, in metres; if absent, 0 or the end of the warm-up.
     pub from_m: Option<f64>,
     /// Where the stations end, in metres; at the trajectory's end if absent.
     pub to_m: Option<f64>,
@@ -160,7 +160,7 @@ pub struct RandomStart {
     pub heading_rad: f64,
 }
 
-/// What `reset` changes for its episode.
+/// Changes by `reset` for its episode.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResetOptions {
     /// Seed of the episode.
@@ -182,7 +182,7 @@ pub enum RigChoice {
     Full(Rig),
 }
 
-/// What each observation holds.
+/// Contents of each observation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outputs {
     /// Names of the cameras in the order of the images; all cameras of the rig if absent.
@@ -216,7 +216,7 @@ impl Outputs {
     }
 }
 
-/// Per-pixel maps of an image beside its colour; all but `instances` are f32.
+/// Per-pixel maps of an image in addition to its colour; all but `instances` are f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct PixelMaps {
     /// Expected depth in metres, `[height, width]`.

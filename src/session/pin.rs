@@ -15,7 +15,7 @@ use crate::limits;
 /// Waits until all sections that a frame needs are in memory, and pins them.
 ///
 /// # Errors
-/// They are not there by the deadline, cannot be loaded, or do not fit.
+/// They are not loaded by the deadline, cannot be loaded, or do not fit.
 pub(crate) async fn pin(
     resident: Arc<Resident>,
     profile: RenderProfile,

@@ -36,7 +36,7 @@ impl Snapshots {
     /// Stores a snapshot, in place of an earlier one of that name.
     ///
     /// # Errors
-    /// There are [`limits::SNAPSHOTS`] others already.
+    /// There are [`limits::SNAPSHOTS`] other snapshots already.
     pub(crate) fn store(&self, name: String, snapshot: Snapshot) -> Result<(), SessionError> {
         let mut snapshots = self.0.lock();
         if !snapshots.contains_key(&name) && snapshots.len() >= limits::SNAPSHOTS {

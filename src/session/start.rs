@@ -83,7 +83,7 @@ impl EpisodeStart {
         Self::with_warm_up(drive, start_us, warm_up_us)
     }
 
-    /// Draws a start. With a warm-up, the drive before it is moved and turned with it.
+    /// Samples a start. With a warm-up, the drive before the start is moved and rotated with it.
     fn at_random(
         drives: &[Trajectory],
         random: &RandomStart,
@@ -103,7 +103,7 @@ impl EpisodeStart {
         check_jitter("start.random.lateral_m", *lateral_m, limits::START_LATERAL_M)?;
         check_jitter("start.random.heading_rad", *heading_rad, std::f64::consts::PI)?;
 
-        // The stations between which the start is drawn.
+        // The stations between which the start is sampled.
         let route = Route::new(drive)?;
         let length_m = route.length_m();
         let begin_us = drive.keyframes.first().map_or(0, |first| first.time_us);
@@ -122,7 +122,7 @@ impl EpisodeStart {
             return Err(SessionError::OutOfRange { field: "start.random.to_m", must });
         }
 
-        // One stream for each draw, so that a change of one range does not change the other draws.
+        // Use one random stream for each value, so that a change of one range does not change the other values.
         let draw = |name: &str, low: f64, high: f64| match low < high {
             true => Random::new(seed, name, 0).range(low, high),
             false => low,
@@ -139,7 +139,7 @@ impl EpisodeStart {
         Ok(drawn.moved_by(offset))
     }
 
-    /// The same start with the rig, and the drive before it, moved by an offset in the rig's frame.
+    /// Moves the rig, and the drive before the start, by an offset in the rig's frame.
     fn moved_by(self, offset: Pose) -> Self {
         let world_from_rig = self.world_from_rig * offset;
         let moved = world_from_rig * self.world_from_rig.inverse();
@@ -161,7 +161,7 @@ impl EpisodeStart {
         }
     }
 
-    /// A start at a time of the drive, after the `warm_up_us` of the drive before it.
+    /// A start at a time of the drive, after `warm_up_us` of the drive.
     fn with_warm_up(
         drive: &Trajectory,
         start_us: i64,
@@ -184,13 +184,13 @@ impl EpisodeStart {
         Ok(Self { warm_up: std::iter::once(first).chain(between).collect(), world_from_rig })
     }
 
-    /// The start of a recorded episode; `state` is the one at the beginning of its file.
+    /// The start of a recorded episode; `state` is the state at the beginning of its file.
     pub(crate) fn recorded(world_from_rig: Pose, state: Option<&Episode>) -> Self {
         let warm_up = state.map(Episode::warm_up).unwrap_or_default();
         Self { warm_up, world_from_rig }
     }
 
-    /// The same start for other dynamics, on this ground if they need one.
+    /// Converts the start for other dynamics, on this ground if they need one.
     pub(crate) fn placed(&self, ground: &Ground<'_>, dynamics: Dynamics) -> Self {
         let world_from_rig = dynamics.start_pose(self.world_from_rig, ground);
         Self { warm_up: self.warm_up.clone(), world_from_rig }
@@ -201,7 +201,7 @@ impl EpisodeStart {
         self.world_from_rig
     }
 
-    /// An episode that begins here.
+    /// An episode that begins at this start.
     pub(crate) fn episode(&self, seed: u64, dynamics: Dynamics, dt_us: i64) -> Episode {
         let ego = Ego::new(dynamics, self.world_from_rig);
         Episode::with_warm_up(seed, ego, &self.warm_up, dt_us)

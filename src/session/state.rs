@@ -1,4 +1,4 @@
-//! The parts of a session: what stays the same from opening to closing, and what steps change.
+//! The parts of a session: settings that stay the same from opening to closing, and state that steps change.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,7 +21,7 @@ use crate::repair::session_repair::SessionRepair;
 use crate::scenario::{EpisodeTraffic, SessionScenario};
 use crate::start::EpisodeStart;
 
-/// What `open` determines. Sessions that are branches of another one share its settings.
+/// Settings that `open` determines. Sessions that are branches of another one share its settings.
 #[derive(Debug)]
 pub(crate) struct SessionSettings {
     /// Fields that override the profile of each version of the twin.
@@ -31,7 +31,7 @@ pub(crate) struct SessionSettings {
     /// The share of the budget for answers that the cameras' overlays take.
     pub(crate) _overlays: BudgetShare,
     pub(crate) dynamics: Dynamics,
-    /// Where episodes start unless `reset` names another start; drawn anew for each if `random_start` is set.
+    /// Where episodes start unless `reset` names another start; sampled anew for each episode if `random_start` is set.
     pub(crate) start: EpisodeStart,
     pub(crate) random_start: Option<RandomStart>,
     pub(crate) warm_up_us: i64,
@@ -41,8 +41,8 @@ pub(crate) struct SessionSettings {
     pub(crate) drive: Option<Arc<RecordedDrive>>,
     /// The scenario of every episode.
     pub(crate) scenario: Option<SessionScenario>,
-    /// Whether observations tell where the actors are.
-    pub(crate) tells_actors: bool,
+    /// Whether observations contain the poses of the actors.
+    pub(crate) reports_actors: bool,
     /// The repair of the images, if the session asked for it.
     pub(crate) repair: Option<Arc<SessionRepair>>,
 }
@@ -54,16 +54,16 @@ pub(crate) struct PinnedVersion {
     /// The version's profile with the session's overrides.
     pub(crate) profile: RenderProfile,
     pub(crate) profile_hash: blake3::Hash,
-    /// Where the twin was recorded; only if images come with their trust or may be repaired.
+    /// Poses where the twin was recorded; only if images come with their trust or may be repaired.
     pub(crate) coverage: Option<Arc<TrainingCoverage>>,
-    /// Its solid Gaussians beside the scenario's route; only if a contact with them ends an episode.
+    /// Its solid Gaussians near the scenario's route; only if a contact with them ends an episode.
     pub(crate) solids: Option<Arc<Solids>>,
-    /// Images beside the views; only if the session's repair model needs some.
+    /// References of the views; only if the session's repair model needs some.
     pub(crate) references: Option<Arc<ReferenceViews>>,
 }
 
-/// What a step changes: all that the coming observations depend on, beside the settings and the version. A
-/// copy continues exactly as the original does.
+/// State that a step changes. With the settings and the version, it determines the coming observations. A copy
+/// continues exactly as the original does.
 #[derive(Clone, Debug)]
 pub(crate) struct EpisodeState {
     pub(crate) episode: Episode,
@@ -83,12 +83,12 @@ impl PinnedVersion {
         Self { resident, profile, profile_hash, coverage, solids: None, references: None }
     }
 
-    /// The same, with solid Gaussians.
+    /// Sets the solid Gaussians.
     pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>) -> Self {
         Self { solids, ..self }
     }
 
-    /// The same, with images beside the views.
+    /// Sets the references.
     pub(crate) fn with_references(self, references: Option<Arc<ReferenceViews>>) -> Self {
         Self { references, ..self }
     }

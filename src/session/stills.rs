@@ -37,10 +37,10 @@ pub struct Still {
     pub encoding: Encoding,
 }
 
-/// What moves in the twin, in images of one moment.
+/// A moving object in the twin, in images of one time.
 #[derive(Clone, Debug)]
 pub struct StillActor {
-    /// What it is drawn from.
+    /// Asset that it is drawn from.
     pub asset: Arc<ResidentActor>,
     /// Its pose where the exposures end: its origin is on the ground under its middle, x points forward.
     pub world_from_actor: Pose,
@@ -54,7 +54,7 @@ pub struct Stills {
     engine: Arc<Engine>,
     reservation: Reservation,
     profile: RenderProfile,
-    /// Its frames share one turn, as those of a session do.
+    /// Number by which its frames are scheduled, like that of a session.
     number: u64,
 }
 
@@ -89,24 +89,24 @@ impl Stills {
         Ok(frame_fits && needed <= self.reservation.scene_bytes())
     }
 
-    /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than [`MAX_VIEWS`] are
-    /// rendered in several frames, each in its turn among the frames of all sessions. All of them show `actors`, at
-    /// most [`PlacedChunk::MAX_ACTORS`].
+    /// Renders images, and returns a JPEG or PNG file, or raw pixels, for each. More than [`MAX_VIEWS`] are rendered in
+    /// several frames, each scheduled among the frames of all sessions. All of them show `actors`, at most
+    /// [`PlacedChunk::MAX_ACTORS`].
     ///
     /// # Errors
-    /// Names what was not ready within `patience`, or what the backend refuses.
+    /// Names what was not ready within `max_wait`, or what the backend refuses.
     pub async fn render(
         &self,
         stills: Vec<Still>,
         actors: &[StillActor],
-        patience: Duration,
+        max_wait: Duration,
     ) -> Result<Vec<Vec<u8>>, SessionError> {
         let most = PlacedChunk::MAX_ACTORS;
         if actors.len() > most {
             let must = format!("{}; at most {most} are accepted", actors.len());
             return Err(SessionError::OutOfRange { field: "actors", must });
         }
-        let deadline = Instant::now() + patience;
+        let deadline = Instant::now() + max_wait;
         let mut images = Vec::with_capacity(stills.len());
         for part in stills.chunks(MAX_VIEWS) {
             images.append(&mut self.render_frame(part.to_vec(), actors, deadline).await?);
@@ -178,7 +178,8 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
     image.map(|image| image.file)
 }
 
-/// What a frame of stills takes beside its scene. Of more than [`MAX_VIEWS`] views several frames are made.
+/// Buffers and images that a frame of stills needs in addition to its scene. More than [`MAX_VIEWS`] views are rendered
+/// in several frames.
 fn frame_bytes(engine: &Engine, views: &[View]) -> FrameBytes {
     views.chunks(MAX_VIEWS).fold(FrameBytes::default(), |most, views| {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();

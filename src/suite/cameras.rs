@@ -1,4 +1,4 @@
-//! Checks what a suite says about cameras and steps, before anything is driven.
+//! Checks the cameras and steps of a suite before anything is driven.
 
 use wildcity_scene::Rig;
 use wildcity_session::limits as session;

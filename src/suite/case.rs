@@ -35,7 +35,7 @@ pub struct Case {
     pub resolved: Arc<Scenario>,
     /// The line that heads its record.
     pub line: Arc<ScenarioLine>,
-    /// What is opened.
+    /// Options of its session.
     pub options: SessionOptions,
     /// The recorded drive that the episode starts on, if it does.
     pub drive: Option<Arc<Trajectory>>,
@@ -47,12 +47,12 @@ pub struct Case {
     pub version_hash: String,
 }
 
-/// What of the scenarios is left out.
+/// Parts of the scenarios to ignore.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct CaseOptions {
-    /// Versions that scenarios name: the latest ones are taken.
+    /// Versions that scenarios name: the latest versions are used.
     pub latest: bool,
-    /// All actors: what is left is the twin, on which the agent `log` must pass.
+    /// All actors: only the twin remains, on which the agent `log` must pass.
     pub bare: bool,
 }
 
@@ -114,7 +114,7 @@ fn chosen(
     Ok(file)
 }
 
-/// The combinations of a scenario; the seeds of the suite if it has none of its own.
+/// The combinations of a scenario; with the seeds of the suite if the scenario has none.
 fn seeded(suite: &SuiteFile, scenario: &SuiteScenario) -> Vec<Seeded> {
     let own = scenario.document.cases();
     let has_own_seeds = own.iter().any(|case| case.seed != 0);
@@ -188,7 +188,7 @@ impl Case {
             version: Some(version.number),
             seed,
             dt_us: Some(dt_us),
-            // The resolved scenario has its seed, so that the session draws the same jitter.
+            // The resolved scenario has its seed, so that the session samples the same jitter.
             scenario: Some(ScenarioOptions {
                 source: ScenarioSource::Inline(line.scenario.clone()),
                 values: BTreeMap::new(),

@@ -27,7 +27,7 @@ const PLAN_POSES: i64 = 20;
 const PLAN_STEP_US: i64 = 100_000;
 /// Braking of an agent that stands, in m/s².
 const BRAKING_MPS2: f64 = 4.0;
-/// Least speed of a free road for `idm`, in m/s: a recording that crawls is no limit.
+/// Lowest free-flow speed for `idm`, in m/s, for recordings that are slower.
 const LEAST_FREE_MPS: f64 = 5.0;
 
 impl BuiltIn {
@@ -107,7 +107,7 @@ struct IdmPlan<'a> {
     stations_m: Vec<f64>,
 }
 
-/// What the ego follows.
+/// Reference of the ego.
 #[derive(Clone, Copy)]
 struct Lead {
     /// The station of the ego's origin at which its front would touch, in metres.
@@ -158,7 +158,7 @@ impl<'a> IdmPlan<'a> {
             true => (length_m / whole_s).max(LEAST_FREE_MPS),
             false => Idm::WILDCITY.free_speed_mps,
         };
-        // It brakes as hard as the formula says: a driver that is to pass must be able to stop.
+        // The braking is not clipped, because a driver that must pass needs to be able to stop.
         let idm = Idm { free_speed_mps, clipped: false, ..Idm::WILDCITY };
         let lead = lead(case, session, begin.station_m);
         let forward = episode.world_from_rig().rotation * DVec3::X;

@@ -7,11 +7,11 @@ use crate::result::SuiteResult;
 /// The exit code of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ExitCode {
-    /// As wanted.
+    /// All criteria are met.
     Passed = 0,
-    /// An episode failed by driving, the pass rate is too low, or the run is worse than the one before.
+    /// An episode failed by driving, the pass rate is too low, or the run is worse than the previous one.
     Driving = 1,
-    /// The command line, the suite, a scenario or the run before is wrong.
+    /// The command line, the suite, a scenario or the previous run is invalid.
     Usage = 2,
     /// An episode was not driven, or more than a tenth were off the model.
     Technical = 3,
@@ -29,10 +29,10 @@ pub struct Ending {
 }
 
 impl Ending {
-    /// The ending of a run, perhaps compared with the one before: technical failures before driving ones, since a result
-    /// with holes says little of driving.
+    /// Decides how a run ended. Technical failures take precedence over driving failures, because an incomplete result
+    /// says little about the driver.
     ///
-    /// Without a wanted pass rate and without a run before, every episode must pass.
+    /// Without a required pass rate and without a previous run, every episode must pass.
     pub fn of(result: &SuiteResult, against: Option<&Result<Comparison, CompareError>>) -> Self {
         let counts = &result.counts;
         let off_model = counts.off_model as f64;

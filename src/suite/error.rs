@@ -1,4 +1,4 @@
-//! Why a suite could not be run at all. What fails within an episode is part of the results.
+//! Why a suite could not be run at all. Failures within an episode are part of the results.
 
 use std::io;
 use std::path::PathBuf;
@@ -23,7 +23,7 @@ pub enum SuiteError {
         what: &'static str,
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// A file is larger than this build reads.
@@ -52,7 +52,7 @@ pub enum SuiteError {
         /// Where and why.
         cause: ScenarioError,
     },
-    /// A file is no result of a run.
+    /// A file is not a result of a run.
     #[error(
         "{} is no result of a run: {reason}; give the result.json of `wildcity episode run`, or its --out directory",
         path.display()
@@ -60,7 +60,7 @@ pub enum SuiteError {
     NoResult {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
     /// The command of the agent cannot be started.
@@ -68,10 +68,10 @@ pub enum SuiteError {
     NoAgent {
         /// The agent.
         agent: String,
-        /// What the shell says.
+        /// The shell's message.
         reason: String,
     },
-    /// The version of a twin that a scenario was made for is not there.
+    /// The version of a twin that a scenario was made for does not exist.
     #[error(
         "scenario {scenario:?} was made for version {wanted} of twin {twin:?}, which is not in the store: import that \
          version, or run with --latest"

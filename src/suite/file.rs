@@ -10,7 +10,7 @@ use wildcity_sim::scenario::{Document, FileError, ScenarioFile, check_format};
 use crate::error::SuiteError;
 use crate::limits;
 
-/// A suite: which scenarios are driven, by what, and what is rendered.
+/// A suite: the scenarios, the agent that drives them, and the rendered images.
 ///
 /// ```json
 /// {"format": "wildcity.suite/1", "name": "streets", "scenarios": ["straight.json", "pedestrian.json"],
@@ -43,7 +43,8 @@ pub struct SuiteFile {
     /// Simulated time of a step, in microseconds; if absent, 100000.
     #[serde(default)]
     pub dt_us: Option<i64>,
-    /// The least pass rate, held against the lower end of its interval; if absent, every episode must pass.
+    /// Lower limit of the pass rate, which the lower end of its interval must reach; if absent, every episode must
+    /// pass.
     #[serde(default)]
     pub at_least: Option<f64>,
     /// Its own file.
@@ -64,7 +65,7 @@ impl SuiteFile {
     /// The format that this build reads.
     pub const FORMAT: &str = "wildcity.suite/1";
 
-    /// Reads a suite with all of its scenarios. A scenario's file is a suite of that scenario alone.
+    /// Reads a suite with all of its scenarios. A scenario's file is a suite of only that scenario.
     ///
     /// # Errors
     /// Names the file and the place of the first mistake.
@@ -136,7 +137,8 @@ impl SuiteFile {
     }
 }
 
-/// Refuses a scenario that needs files beside it. Sessions look for them beside the suite.
+/// Refuses a scenario that names files in its own directory, because sessions look for them in the directory of the
+/// suite.
 fn check_alone(document: &Document) -> Result<(), FileError> {
     let file = document.with(&document.first_values())?;
     let fields = [("map.file", file.map.is_some()), ("tracks.file", file.tracks.is_some())];

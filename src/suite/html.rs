@@ -1,4 +1,4 @@
-//! What the pages share: each is one file that loads nothing else.
+//! Common parts of the pages. Each page is one file that loads nothing else.
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 

@@ -1,4 +1,4 @@
-//! `junit.xml`: what CI systems show.
+//! `junit.xml`, for CI systems.
 
 use std::fmt::Write as _;
 
@@ -8,7 +8,8 @@ use crate::result::SuiteResult;
 
 /// The result as JUnit XML: `failure` is driving, `error` technical, `skipped` off the model or not judged.
 ///
-/// A failure is one whatever the exit code is: the properties of the suite say what that is, and why.
+/// A failed episode is a `failure` even if the run passes. The properties of the suite have the exit code and its
+/// reason.
 pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
     let skipped = counts.off_model + counts.not_judged;
@@ -81,7 +82,7 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
     }
 }
 
-/// What the status does not say: what was not judged, and whether the episode says anything new.
+/// Notes in addition to the status: criteria that were not judged, and whether the episode is a duplicate.
 fn notes(episode: &EpisodeEntry) -> String {
     let is_told = episode.status == Status::NotJudged;
     let not_judged = episode.not_judged.iter().filter(|_| !is_told);
@@ -109,7 +110,7 @@ fn escaped(text: &str) -> String {
             '"' => escaped.push_str("&quot;"),
             '\t' | '\n' => escaped.push(character),
             control if control.is_control() => escaped.push('\u{fffd}'),
-            // The two code points that XML leaves out beside controls.
+            // The two code points that XML does not allow in addition to controls.
             '\u{fffe}' | '\u{ffff}' => escaped.push('\u{fffd}'),
             other => escaped.push(other),
         }

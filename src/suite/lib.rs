@@ -1,16 +1,16 @@
 //! Suites of scenarios, run without a person: "did my driver get worse?" as one command.
 //!
-//! A suite names scenarios; a run drives each of them with each of its seeds, with an agent that dials in or with a
-//! built-in one, and judges every episode from its record. The results do not depend on how many episodes are driven
+//! A suite names scenarios; a run drives each of them with each of its seeds, with an external agent or with a built-in
+//! one, and judges every episode from its record. The results do not depend on how many episodes are driven
 //! at once.
 //!
 //! | module | what it does |
 //! |---|---|
 //! | `file` | the format `wildcity.suite/1` |
-//! | `case` | one scenario with one seed: what is opened, what is recorded about it |
+//! | `case` | one scenario with one seed: the options of its session, and its properties in the results |
 //! | `driver` | the built-in agents: `log`, `stand`, `idm` |
-//! | `cameras` | what a suite says about cameras, checked against a twin |
-//! | `dial_in`, `stderr` | agents that are commands, and what they say |
+//! | `cameras` | the cameras of a suite, checked against a twin |
+//! | `agent_process`, `stderr` | external agents: their processes, and the text that these print |
 //! | `run` | drives all cases, some at once, technical failures once more |
 //! | `finish` | judges the record of a driven episode |
 //! | `verify` | renders all episodes again |
@@ -22,10 +22,10 @@
 //! | `picture` | the picture of a fault |
 //! | [`limits`] | limits |
 
+mod agent_process;
 mod cameras;
 mod case;
 mod compare;
-mod dial_in;
 mod driver;
 mod ending;
 mod entry;

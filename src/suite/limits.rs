@@ -8,7 +8,7 @@ pub const FILE_BYTES: u64 = 16 << 20;
 /// Largest result of a run, in bytes: an episode has 21 scores with their parts, 7 kB, and there are at most 100,000.
 pub const RESULT_BYTES: u64 = 1 << 30;
 
-/// Most episodes of a suite.
+/// Largest number of episodes of a suite.
 pub const EPISODES: usize = 100_000;
 
 /// Steps of an episode whose scenario gives no time: 10 minutes at 10 Hz.
@@ -17,7 +17,7 @@ pub const STEPS: u64 = 6_000;
 /// Episodes at once.
 pub const JOBS: usize = 64;
 
-/// How long an agent that is a command may take for an episode, unless the command line says otherwise.
+/// How long an external agent may take for an episode, unless the command line says otherwise.
 pub const AGENT_TIMEOUT: Duration = Duration::from_secs(600);
 
 /// Time between two looks at whether the command of an agent has ended.
@@ -35,12 +35,13 @@ pub const OFF_MODEL_SHARE: f64 = 0.1;
 /// Worst episodes that the report shows with pictures.
 pub const WORST: usize = 12;
 
-/// What is kept of the standard error of an agent: its last lines, at most so many, and at most so many bytes of them.
+/// Largest number of lines of an agent's standard error that are kept, from the end.
 pub const STDERR_LINES: usize = 12;
-/// See [`STDERR_LINES`].
+/// Largest number of bytes of these lines.
 pub const STDERR_BYTES: usize = 4 << 10;
 
-/// How long the rest of an agent's standard error is waited for after it has ended: a process that it started may hold it.
+/// How long to wait for the rest of an agent's standard error after the agent has ended, because a process that it
+/// started may keep the stream open.
 pub const STDERR_WAIT: Duration = Duration::from_millis(500);
 
 /// Exit statuses of a shell that finds no such command, or cannot run it.
@@ -49,5 +50,5 @@ pub const NO_COMMAND_STATUSES: [i32; 2] = [127, 126];
 /// Exit status of an agent that ran out of time: that of the command `timeout`.
 pub const TIMEOUT_STATUS: i32 = 124;
 
-/// Exit status of an agent that lost what it needs: EX_UNAVAILABLE.
+/// Exit status of an agent that lost a resource: EX_UNAVAILABLE.
 pub const LOST_STATUS: i32 = 69;

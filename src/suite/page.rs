@@ -76,7 +76,7 @@ fn scenarios(result: &SuiteResult) -> Markup {
     }
 }
 
-/// What was not judged in some episode of a scenario.
+/// Criteria that were not judged in some episode of a scenario.
 fn not_judged<'a>(result: &'a SuiteResult, scenario: &str) -> Vec<&'a str> {
     let of_scenario = result.episodes.iter().filter(|episode| episode.scenario == scenario);
     let reasons = of_scenario.flat_map(|episode| episode.not_judged.iter().map(String::as_str));
@@ -165,7 +165,7 @@ fn table(result: &SuiteResult) -> Markup {
     }
 }
 
-/// What the status of an episode comes from.
+/// Reason of the status of an episode.
 fn why(episode: &EpisodeEntry) -> Markup {
     let is_not_judged = episode.status == Status::NotJudged;
     let reasons = episode.not_judged.iter().filter(|_| is_not_judged);

@@ -24,8 +24,8 @@ pub struct Picture {
     pub jpeg: Vec<u8>,
 }
 
-/// The pictures of the worst episodes of a run: of the step of their first fault, by their first camera. An episode that
-/// cannot be rendered again has none; the report says so.
+/// The pictures of the worst episodes of a run: of the step of their first fault, by their first camera. An episode
+/// that cannot be rendered again has no picture, which the report mentions.
 pub fn pictures(
     result: &SuiteResult,
     episodes: &Path,
@@ -48,7 +48,7 @@ pub fn pictures(
 
 impl SuiteResult {
     /// The failed episodes: those with a contact or off the road before those that only lack progress, and of these
-    /// those with the earliest fault first. Without duplicates, which would show the same again.
+    /// those with the earliest fault first. Without duplicates, which would show the same pictures.
     pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
         let distinct = self.episodes.iter().filter(|episode| episode.duplicate_of.is_none());
         let mut worst: Vec<&EpisodeEntry> =
@@ -78,7 +78,7 @@ fn picture(
     // The first frame at or after the fault.
     let at = recording.frames.iter().position(|frame| shown(frame) && frame.time_us >= fault_us);
     let Some(at) = at.or_else(|| recording.frames.iter().rposition(shown)) else { return Ok(None) };
-    // The steps before it are driven, so that the ego is where it was, but not rendered.
+    // The earlier steps are executed, so that the ego has its pose, but not rendered.
     recording.frames.truncate(at + 1);
     recording.end = None;
     for frame in recording.frames.iter_mut().take(at) {

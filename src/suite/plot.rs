@@ -10,7 +10,7 @@ use wildcity_score::DriveRecord;
 
 use crate::entry::EpisodeEntry;
 
-/// The colour of each thing that is drawn.
+/// Colours of the plots.
 const DRIVEN: &str = "#0072b2";
 const RECORDED: &str = "#bbb";
 const ACTORS: &str = "#d55e00";
@@ -29,7 +29,7 @@ pub(crate) fn plots(episode: &EpisodeEntry, episodes: &Path) -> Option<String> {
     Some(from_above(&drive, fault_us) + &speed(&drive, fault_us))
 }
 
-/// What maps values to pixels: the same scale on both axes if `is_even`.
+/// Maps values to pixels, with the same scale on both axes if `is_even`.
 struct Frame {
     least: DVec2,
     scale: DVec2,
@@ -39,7 +39,7 @@ impl Frame {
     fn around(points: &[DVec2], is_even: bool) -> Self {
         let least = points.iter().fold(DVec2::INFINITY, |least, point| least.min(*point));
         let most = points.iter().fold(DVec2::NEG_INFINITY, |most, point| most.max(*point));
-        // A standing ego has no extent; a metre, or a second, is shown then.
+        // A standing ego has no extent; then a metre, or a second, is shown.
         let extent = (most - least).max(DVec2::ONE);
         let room_px = SIZE_PX - 2.0 * MARGIN_PX;
         let scale = room_px / extent;

@@ -13,7 +13,7 @@ use crate::error::SuiteError;
 use crate::file::read;
 use crate::limits;
 
-/// All episodes of a run, and what they say together. It has no times of the clock: the same drives give the same
+/// All episodes of a run, and their rates and means. It has no clock times, so that the same drives give the same
 /// bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SuiteResult {
@@ -43,7 +43,7 @@ pub struct SuiteResult {
     pub episodes: Vec<EpisodeEntry>,
 }
 
-/// What a run was.
+/// Setup of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct RunHead {
     /// Name of the suite.
@@ -58,7 +58,7 @@ pub(crate) struct RunHead {
     pub(crate) at_least: Option<f64>,
 }
 
-/// What says what a file is.
+/// The header of a result file: only its format, which is checked first.
 #[derive(Deserialize)]
 struct Head {
     format: String,
@@ -75,7 +75,7 @@ pub struct Counts {
     pub failed: u64,
     /// Left the trained area before any fault.
     pub off_model: u64,
-    /// Without what a verdict needs.
+    /// Episodes without the inputs of a verdict.
     pub not_judged: u64,
     /// Not driven, for technical reasons.
     pub technical: u64,
@@ -89,7 +89,7 @@ pub struct Counts {
 pub struct Rate {
     /// Passed.
     pub passed: u64,
-    /// Of so many that were judged.
+    /// Number of judged episodes.
     pub runs: u64,
     /// Passed/runs; null without runs.
     pub rate: Option<f64>,
@@ -153,7 +153,7 @@ impl SuiteResult {
     /// Reads the result of a run: its `result.json`, or the directory that has it.
     ///
     /// # Errors
-    /// The file cannot be read, or is no result of a run; names it, and the place of the first mistake.
+    /// The file cannot be read, or is not a result of a run; names the file, and the place of the first mistake.
     pub fn read(run: &Path) -> Result<Self, SuiteError> {
         let path = match run.is_dir() {
             true => run.join(Self::FILE),
@@ -218,8 +218,8 @@ fn means(by_scenario: &BTreeMap<String, Vec<&EpisodeEntry>>) -> BTreeMap<String,
     entries.collect()
 }
 
-/// Says which episodes were driven as an earlier one of their scenario was. Two seeds of a scenario without jitter are:
-/// counted twice, they would narrow the intervals without saying anything.
+/// Marks episodes that were driven in the same way as an earlier one of their scenario, as two seeds of a scenario
+/// without jitter are. Counted twice, they would narrow the intervals without adding information.
 fn mark_duplicates(episodes: &mut [EpisodeEntry]) {
     let mut first: BTreeMap<(String, Status, String), String> = BTreeMap::new();
     for episode in episodes.iter_mut().filter(|episode| !episode.drive_hash.is_empty()) {

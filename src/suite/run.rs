@@ -13,8 +13,8 @@ use wildcity_session::{Engine, EngineSettings, Outcome, Scenarios, Session};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::{Catalog, DiskCacheSettings};
 
+use crate::agent_process::{self, AgentProcess, NotDriven};
 use crate::case::Case;
-use crate::dial_in::{self, Dialled, NotDriven};
 use crate::driver::BuiltIn;
 use crate::entry::EpisodeEntry;
 use crate::error::SuiteError;
@@ -23,12 +23,12 @@ use crate::limits;
 use crate::result::{RunHead, SuiteResult};
 use crate::technical::Technical;
 
-/// What drives.
+/// The agent of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub enum AgentChoice {
     /// An agent that comes with the program.
     BuiltIn(BuiltIn),
-    /// A command, started once for each episode, that dials in.
+    /// The command of an external agent, started once for each episode.
     Command {
         /// Its name in results.
         name: String,
@@ -51,7 +51,7 @@ impl AgentChoice {
 pub struct RunSettings {
     /// Name of the suite.
     pub suite: String,
-    /// What drives.
+    /// The agent.
     pub agent: AgentChoice,
     /// Episodes at once.
     pub jobs: usize,
@@ -61,11 +61,11 @@ pub struct RunSettings {
     pub agent_timeout: Duration,
     /// Whether versions that scenarios name were ignored.
     pub latest: bool,
-    /// The least pass rate, for the lower end of its interval; every episode must pass without one.
+    /// Lower limit of the pass rate, which the lower end of its interval must reach. `None`: every episode must pass.
     pub at_least: Option<f64>,
     /// The twins.
     pub catalog: Catalog,
-    /// Their directory or URL, and the cache of parts of them, for the server that agents dial.
+    /// Directory or URL of the twins, for the server that external agents connect to.
     pub twins: PathBuf,
     /// The cache on disk.
     pub cache: Option<DiskCacheSettings>,
@@ -73,7 +73,7 @@ pub struct RunSettings {
     pub scenarios: PathBuf,
     /// The renderer.
     pub backend: Arc<dyn Backend>,
-    /// Where the episodes are recorded; must be empty.
+    /// Directory of the records, which must be empty.
     pub episodes: PathBuf,
     /// Whether each record also becomes an MCAP file.
     pub mcap: bool,
@@ -81,7 +81,7 @@ pub struct RunSettings {
     pub progress: Box<dyn Fn(&EpisodeEntry) + Send + Sync>,
 }
 
-/// What all episodes share.
+/// Settings and host that all episodes share.
 struct Shared {
     agent: AgentChoice,
     retries: u32,
@@ -125,7 +125,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         suite: settings.suite,
         agent: settings.agent.name().to_owned(),
         latest: settings.latest,
-        // That of the suite, alike for all of its cases.
+        // The step of the suite, which is the same for all cases.
         dt_us: cases.first().and_then(|case| case.options.dt_us),
         at_least: settings.at_least,
     };
@@ -155,7 +155,7 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         let entry = ended.map_err(|error| SuiteError::Task(error.to_string()));
         match entry.flatten() {
             Ok(entry) => entries.push(entry),
-            // What is cancelled then is not why the run failed.
+            // Keep the first error: later ones come from the tasks that are aborted here.
             Err(error) => {
                 failed.get_or_insert(error);
                 tasks.abort_all();
@@ -191,7 +191,7 @@ fn engine(settings: &RunSettings) -> Result<Arc<Engine>, SuiteError> {
     Ok(Engine::start(EngineSettings {
         cache: Cache::new(settings.catalog.clone()),
         episodes: settings.episodes.clone(),
-        // Scenarios come with their sessions; files that they name are beside the suite.
+        // Scenarios come with their sessions; files that they name are in the directory of the suite.
         scenarios: Scenarios::in_dir(&settings.scenarios),
         backend: settings.backend.clone(),
         step_timeout: Limits::default().step,
@@ -273,7 +273,7 @@ impl Shared {
 
     /// Drives a case. Returns the file of its record.
     async fn attempt(&self, case: &Case, attempt: u64) -> Result<PathBuf, NotDriven> {
-        // Each attempt has a session of its own: the server keeps one that was lost for a while.
+        // Each attempt has a session of its own: the server keeps a lost session for a while.
         let session = match attempt {
             1 => case.name.clone(),
             attempt => format!("{}.{attempt}", case.name),
@@ -285,8 +285,8 @@ impl Shared {
             }
             (Host::Server { url, .. }, AgentChoice::Command { name, line }) => {
                 let timeout = self.agent_timeout;
-                let dialled = Dialled { name, command: line, url, session: &session, timeout };
-                dial_in::drive(&dialled, case, &record).await?;
+                let process = AgentProcess { name, command: line, url, session: &session, timeout };
+                agent_process::drive(&process, case, &record).await?;
             }
             _ => return Err(Technical::server("the host does not fit the agent").into()),
         }

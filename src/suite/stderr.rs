@@ -1,4 +1,4 @@
-//! What an agent writes to its standard error: shown as it comes, and its last lines kept.
+//! The standard error of an agent: prints it as it arrives, and keeps its last lines.
 
 use std::collections::VecDeque;
 use std::io::{self, BufRead as _, BufReader, Read as _, Write as _};
@@ -35,7 +35,7 @@ impl Tail {
 
     /// The last lines, at the end of the stream or [`limits::STDERR_WAIT`] from now.
     pub(crate) async fn text(self) -> String {
-        // The end of the stream and the end of patience are alike here.
+        // A closed stream and a time-out are handled alike.
         let _ = timeout(limits::STDERR_WAIT, self.ended).await;
         let lines = self.lines.lock().unwrap_or_else(PoisonError::into_inner);
         let text = lines.iter().map(String::as_str).collect::<Vec<_>>().join("\n");
@@ -56,7 +56,7 @@ fn read(stream: ChildStderr, lines: &Mutex<VecDeque<String>>) {
         if !matches!(part, Ok(1..)) {
             return;
         }
-        // Without a standard error of its own, a run goes on.
+        // A run continues if its own standard error is closed.
         let _ = io::stderr().write_all(&bytes);
         let line = String::from_utf8_lossy(&bytes).trim_end().to_owned();
         let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);

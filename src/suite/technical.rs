@@ -5,9 +5,9 @@
 pub(crate) struct Technical {
     /// `server_error`, `agent_error`, `agent_timeout`, `agent_lost`.
     pub(crate) kind: &'static str,
-    /// What happened.
+    /// Description of the failure.
     pub(crate) message: String,
-    /// The last lines that the agent wrote to its standard error; none of a built-in one.
+    /// The last lines that the agent wrote to its standard error; empty for a built-in agent.
     pub(crate) stderr: String,
 }
 

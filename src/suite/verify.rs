@@ -26,7 +26,7 @@ pub fn verify(
         .collect()
 }
 
-/// What differs in an episode.
+/// The differences in an episode.
 fn differs(path: &Path, cache: &Cache, backend: &dyn Backend) -> Option<String> {
     let recording = match RecordedEpisode::read(path) {
         Ok(recording) => recording,

@@ -1,10 +1,10 @@
 //! An object store in memory that fails requests, loses answers, and stops the process between two requests.
 //!
-//! A put is all or nothing, and what was put is seen at once, as S3 promises. What can go wrong is the way there: a
-//! request is refused before or after it had its effect, and the last request of a process that is stopped has its
-//! effect now, later, or never. "Later" is within the life of the next process, for puts that replace nothing.
+//! A put is atomic and visible at once, as S3 guarantees. Faults are in the requests: a request fails before or after
+//! it took effect, and the last request of a process that is stopped takes effect now, later, or never. "Later" is
+//! during the next process, for puts that replace nothing.
 //!
-//! Requests run on one thread, each with its repetitions in the order in which they begin, so that a history follows
+//! Requests run on one thread, each with its repetitions in the order in which they start, so that a history follows
 //! from its seed.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -73,7 +73,7 @@ struct State {
     /// Objects whose put was answered and is not done ([`Plant::RecordBeforeObjects`]).
     withheld: Vec<(Key, Bytes)>,
     reads: Reads,
-    /// What counts as absent ([`Plant::FailedReadIsAbsent`]).
+    /// Keys that count as absent ([`Plant::FailedReadIsAbsent`]).
     absent: BTreeSet<Key>,
 }
 
@@ -85,7 +85,7 @@ pub(crate) struct SimBucket {
     is_dead: Arc<AtomicBool>,
 }
 
-/// What becomes of a write.
+/// Result of a write.
 enum Outcome {
     Done,
     /// It has its effect, and the answer is lost.
@@ -130,7 +130,7 @@ impl SimBucket {
         if self.is_stopped() { Err(refused()) } else { Ok(self.lock_state()) }
     }
 
-    /// The state for a read, unless it fails; and what is wrong with the bytes that are read.
+    /// Returns the state for a read, unless it fails, and the error in the bytes that are read.
     fn read(
         &self,
         key: &Key,
@@ -150,7 +150,7 @@ impl SimBucket {
         Ok((state, fault))
     }
 
-    /// The state for a write, and what becomes of the write. `put` is what it puts.
+    /// Returns the state for a write, and the result of the write. `put` is the written object.
     fn write(
         &self,
         put: Option<(&Key, &Bytes, &PutMode)>,
@@ -254,7 +254,7 @@ impl State {
         }
     }
 
-    /// Decides what becomes of the last put of a process that was stopped.
+    /// Decides whether the last put of a stopped process takes effect.
     fn end_process(&mut self, random: &mut Random, now_us: i64) {
         self.fault = None;
         self.refusals = None;
@@ -344,7 +344,7 @@ impl Medium for SimBucket {
     }
 
     fn commits_left(&self) -> Vec<String> {
-        // Garbage collection alone removes the objects of killed commits.
+        // Only garbage collection removes the objects of killed commits.
         Vec::new()
     }
 

@@ -2,9 +2,9 @@
 //! writes; and a clock that jumps.
 //!
 //! The disk has two states. The *live* one is what processes see. The *durable* one has the files as they were last
-//! synced, and the names as of the last sync of their directory. After a power cut, each name that was not synced is old
-//! or new, and each file that was not synced has its old content, some of the new one, or all of it: as file systems may
-//! do, in any combination.
+//! synced, and the names at the last sync of their directory. After a power cut, each name that was not synced is old
+//! or new, and each file that was not synced has its old content, a part of the new one, or all of it. File systems
+//! allow any combination of these.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Cursor, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -32,9 +32,9 @@ pub(crate) enum Plant {
     RecordBeforeObjects,
     /// A lease is not removed when its version is closed.
     LeakedLease,
-    /// In an object store, a log record is put in place of another one.
+    /// In an object store, a put of a log record replaces an existing one.
     RecordReplaced,
-    /// What the process once failed to read counts as absent until it ends.
+    /// A file that the process once failed to read counts as absent until the process ends.
     FailedReadIsAbsent,
     /// The content of files is not synced.
     UnsyncedFiles,
@@ -42,15 +42,14 @@ pub(crate) enum Plant {
     AnnouncedCounted,
 }
 
-/// What happens at a write.
+/// A fault at a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Fault {
-    /// The process is killed. What it wrote stays.
+    /// The process is killed. Its writes stay.
     Kill,
-    /// The power fails. Of an object store: the process is killed, and the request that it was making is on its way.
+    /// The power fails. In an object store: the process is killed during its request.
     PowerCut,
-    /// The disk is full, for this write alone. Of an object store: it refuses one to three writes, or loses the
-    /// answers.
+    /// The disk is full, for only this write. An object store refuses one to three writes, or loses the answers.
     Full,
 }
 
@@ -61,7 +60,7 @@ pub(crate) struct SimClock {
     monotonic_us: AtomicI64,
 }
 
-/// How far the time goes on with each look at the clock, so that no two events have the same.
+/// Time that passes with each read of the clock, so that no two events have the same time.
 const TICK_US: i64 = 1_000;
 
 impl SimClock {
@@ -122,7 +121,7 @@ struct State {
     /// Directories whose sync is withheld until the record's ([`Plant::RecordBeforeObjects`]).
     withheld: Vec<PathBuf>,
     reads: Reads,
-    /// What counts as absent ([`Plant::FailedReadIsAbsent`]).
+    /// Paths that count as absent ([`Plant::FailedReadIsAbsent`]).
     absent: BTreeSet<PathBuf>,
 }
 
@@ -166,7 +165,7 @@ impl SimDisk {
         Self { state: Arc::new(Mutex::new(state)), clock, is_dead: Arc::default() }
     }
 
-    /// Lets a fault happen at the write after so many others, or none.
+    /// Sets the fault that happens after a number of writes, or none.
     pub(crate) fn set_fault(&self, fault: Option<(u64, Fault)>) {
         self.lock_state().fault = fault;
     }
@@ -234,7 +233,7 @@ impl SimDisk {
         if self.is_stopped() { Err(stopped()) } else { Ok(self.lock_state()) }
     }
 
-    /// The state for a read, unless it fails; and what is wrong with the bytes that are read.
+    /// Returns the state for a read, unless it fails, and the error in the bytes that are read.
     fn read(
         &self,
         path: &Path,
@@ -248,7 +247,7 @@ impl SimDisk {
         if fault.is_some() && state.plant == Some(Plant::FailedReadIsAbsent) {
             state.absent.insert(path.to_owned());
         }
-        // What has content may fail later, when that is read.
+        // A file with content may fail later, when the content is read.
         if fault == Some(ReadFault::Error) && carries == Carries::Names {
             return Err(failed_read());
         }
@@ -296,7 +295,7 @@ impl State {
         }
     }
 
-    /// What the announcement beside an unfinished upload says.
+    /// Size in the announcement of an unfinished upload.
     fn announced_bytes(&self, path: &Path) -> Option<u64> {
         path.extension().filter(|kind| *kind == "part")?;
         let announcement = self.file(&path.with_extension("json")).ok()?;

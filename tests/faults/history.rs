@@ -1,4 +1,4 @@
-//! Histories: what is done, in what order, and what fails meanwhile.
+//! Histories: a sequence of operations, and the faults during them.
 
 use std::fmt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -16,13 +16,13 @@ pub(crate) enum Operation {
     Push { cells: u8, content: u64 },
     /// Begins a push of some cells, which is published later.
     Prepare { cells: u8, content: u64 },
-    /// Publishes what was prepared.
+    /// Publishes the prepared commit.
     PublishPrepared,
-    /// Makes the version so many before the latest the latest.
+    /// Rolls back by `back` versions.
     Rollback { back: u64 },
-    /// Opens the version so many before the latest in a session.
+    /// Opens the version that is `back` versions before the latest in a session.
     Open { back: u64 },
-    /// Reads all of the version so many before the latest.
+    /// Reads all of the version that is `back` versions before the latest.
     Read { back: u64 },
     /// Renews the leases of all sessions.
     Renew,
@@ -39,7 +39,7 @@ pub(crate) enum Operation {
 /// An operation, and a fault at one of its writes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step {
-    /// Seeds the chances of this step, so that they do not depend on the steps before it.
+    /// Seeds the chances of this step, so that they do not depend on earlier steps.
     pub(crate) seed: u64,
     pub(crate) operation: Operation,
     /// The writes before the fault, and the fault.
@@ -48,7 +48,7 @@ pub(crate) struct Step {
     pub(crate) bad_reads: Option<BadReads>,
 }
 
-/// What happens in one simulation.
+/// The events of one simulation.
 #[derive(Clone, Debug)]
 pub(crate) struct History {
     pub(crate) seed: u64,
@@ -69,7 +69,7 @@ const WRITES: u64 = 60;
 /// Reads of a push, about.
 const READS: u64 = 40;
 
-/// Reads of a version, about: the latest is looked up, then the version, and then its sections are read.
+/// Approximate number of reads of a version: the latest is looked up, then the version, and then its sections are read.
 const SECTION_READS: u64 = 16;
 
 /// Reads of a garbage collection that removes objects, about: it looks at each object twice.
@@ -103,7 +103,7 @@ impl History {
         world.finish().map_err(|reason| format!("at the end: {reason}"))
     }
 
-    /// The shortest failing history that leaving out operations and faults of this one leads to.
+    /// Shortens a failing history by leaving out operations and faults while it still fails.
     pub(crate) fn shrunk(self, kind: Kind, plant: Option<Plant>) -> Failure {
         let fails = |history: &Self| history.run(kind, plant).err();
         let mut reason = fails(&self).expect("it fails");

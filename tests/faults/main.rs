@@ -1,18 +1,18 @@
 //! Simulated faults: thousands of histories of commits, leases, garbage collections, rollbacks and reads on a disk that
 //! fails, and in an object store that refuses requests and loses answers, with a clock that jumps, in a process that is
-//! killed between any two writes. After each history nothing that was acknowledged is lost, no version is mixed,
-//! nothing in use is removed, and the store goes on working.
+//! killed between any two writes. After each history no acknowledged version is lost, no version is mixed, no data in
+//! use is removed, and the store still works.
 //!
-//! Reads fail, too: with an error, too early an end, wrong bits, or after a minute. A read that fails is an error of
-//! what needed it, and never another content; after it, the same read succeeds. Wrong bits are simulated in objects
-//! alone: log records, leases and the state of garbage collection have no digest.
+//! Reads fail as well: with an error, an early end, wrong bits, or a delay of a minute. A failed read causes an error
+//! of the operation that needed it, and never different content; after it, the same read succeeds. Wrong bits are
+//! simulated only in objects: log records, leases and the state of garbage collection have no digest.
 //!
-//! Not simulated: two processes that write at once, requests to the object store in another order than that in which
-//! they began, the disk cache of remote twins, and wrong bits that stay.
+//! Not simulated: two processes that write at once, requests to the object store that are carried out in a different
+//! order, the disk cache of remote twins, and wrong bits that stay.
 //!
 //! Uploads and connections are simulated in the package of the server, over the same disk: `tests/faults/server`.
 //!
-//! A history follows from its seed alone. A failure prints the seed and the shortest history that still fails; `SEED=n
+//! A history follows only from its seed. A failure prints the seed and the shortest history that still fails; `SEED=n
 //! cargo test -p wildcity-twin --test faults one_history` runs one on both, and `HISTORIES=n ... many_histories` any
 //! number, from the seed `FIRST_SEED` on.
 
@@ -34,10 +34,10 @@ use disk::Plant;
 use history::{Failure, History};
 use medium::Kind;
 
-/// Histories in the gate, on a disk. With those of uploads and connections there are 10,000.
+/// Histories in CI, on a disk. With those of uploads and connections there are 10,000.
 const HISTORIES: u64 = 4_000;
 
-/// Histories in the gate, in an object store, whose requests run on a thread of their own.
+/// Histories in CI, in an object store, whose requests run on a separate thread.
 const BUCKET_HISTORIES: u64 = 1_500;
 
 /// Histories after which the progress is printed.
@@ -108,7 +108,8 @@ fn one_history() {
     }
 }
 
-/// The simulation finds what it is made for: each planted fault of the store's use of the disk, or of an object store.
+/// The simulation detects the mutations that it is made for: each planted fault of the store's use of the disk, or of
+/// an object store.
 #[test]
 fn planted_faults_are_found() {
     let plants = [

@@ -1,4 +1,4 @@
-//! What a simulated twin is stored on.
+//! Storage of a simulated twin.
 
 use std::fmt::Debug;
 use std::path::Path;
@@ -28,7 +28,7 @@ pub(crate) trait Medium: Debug {
     /// Waits until the process has made all requests that it began. Returns at once on a disk.
     fn settle(&self, catalog: &Catalog);
 
-    /// Lets a fault happen at the write after so many others.
+    /// Sets the fault that happens after a number of writes.
     fn fail_after(&self, writes: u64, fault: Fault);
 
     /// Lets some reads fail.
@@ -61,8 +61,8 @@ pub(crate) trait Medium: Debug {
     /// The files of leases.
     fn leases_left(&self) -> Vec<String>;
 
-    /// Whether a lock keeps the version of a session and the objects of a commit in preparation. An object store has
-    /// none: there a session renews its lease in time, and garbage is not collected while commits are in preparation.
+    /// Whether a lock keeps the version of a session and the objects of a commit in preparation. An object store has no
+    /// locks: a session renews its lease in time, and garbage is not collected while commits are in preparation.
     fn has_locks(&self) -> bool;
 }
 

@@ -1,4 +1,4 @@
-//! Random numbers that follow from a seed alone.
+//! Random numbers that follow only from a seed.
 
 /// SplitMix64 (Steele, Lea and Flood, 2014).
 #[derive(Clone, Debug)]

@@ -1,19 +1,19 @@
 //! Reads that fail, that are slow, or that return the wrong bytes.
 
-/// What is wrong with a read.
+/// Fault of a read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum ReadFault {
     /// It fails.
     Error,
     /// It ends early.
     Short,
-    /// Some bits are wrong. Only in what has a digest.
+    /// Some bits are wrong. Only in files that have a digest.
     Flip,
     /// It takes a minute.
     Slow,
 }
 
-/// What a read returns.
+/// Content that a read returns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Carries {
     /// Names and sizes.
@@ -25,27 +25,27 @@ pub(crate) enum Carries {
     Digested,
 }
 
-/// Reads that fail, one after the other.
+/// Successive reads that fail.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BadReads {
     /// Reads before the first of them.
     pub(crate) after: u64,
     pub(crate) fault: ReadFault,
-    /// How many, one after the other.
+    /// Number of successive failures.
     pub(crate) times: u64,
 }
 
 /// The reads of a disk or bucket.
 #[derive(Debug, Default)]
 pub(crate) struct Reads {
-    /// Those that will fail.
+    /// The next failures.
     pub(crate) planned: Option<BadReads>,
     /// Number of reads that failed or were damaged.
     failed: u64,
 }
 
 impl Reads {
-    /// What is wrong with the next read. A slow one waits for some microseconds, and nothing else is wrong with it.
+    /// Returns the fault of the next read. A slow read only waits for some microseconds.
     pub(crate) fn next(&mut self, carries: Carries, wait: impl FnOnce(i64)) -> Option<ReadFault> {
         match self.next_planned(carries)? {
             ReadFault::Slow => {
@@ -91,12 +91,12 @@ impl ReadFault {
     /// How long a slow read takes.
     pub(crate) const SLOW_US: i64 = 60_000_000;
 
-    /// What is read in place of some bytes.
+    /// Damaged bytes for a read.
     pub(crate) fn damaged(self, mut bytes: Vec<u8>) -> Vec<u8> {
         match self {
             Self::Error | Self::Slow => {}
             Self::Short => bytes.truncate(bytes.len() / 2),
-            // So many that each section has one.
+            // Often enough that each section has a wrong bit.
             Self::Flip => bytes.iter_mut().step_by(16).for_each(|byte| *byte ^= 0x41),
         }
         bytes

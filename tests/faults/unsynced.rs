@@ -1,18 +1,19 @@
-//! What a stopped process, or one that failed to sync, left behind: everyone sees it, and a power cut may take it away.
-//! Each history has such a fault at each of the writes of one operation, goes on, and ends with a power cut.
+//! Unsynced writes of a process that was stopped or failed to sync: all later processes see them, and a power cut may
+//! undo them. Each history has such a fault at each of the writes of one operation, continues, and ends with a power
+//! cut.
 
 use crate::disk::Fault;
 use crate::history::{History, Operation, Step};
 use crate::medium::Kind;
 use crate::world::World;
 
-/// More writes than one operation makes.
+/// More than the number of writes of any operation.
 const WRITES: u64 = 64;
 
 /// More writes than a rollback makes.
 const ROLLBACK_WRITES: u64 = 24;
 
-/// Power cuts of each history: what survives one is a matter of chance.
+/// Power cuts of each history, because the surviving writes are random.
 const CUTS: u64 = 4;
 
 const PUSH: Operation = Operation::Push { cells: 1, content: 1 };
@@ -25,7 +26,7 @@ fn step(seed: u64, operation: Operation, fault: Option<(u64, Fault)>) -> Step {
     Step { seed, operation, fault, bad_reads: None }
 }
 
-/// Runs operations, one of which has a fault after so many writes, and cuts the power.
+/// Runs operations, one of which has a fault after a number of writes, and cuts the power.
 fn run(before: &[Operation], faulty: (Operation, u64, Fault), after: &[Step], seed: u64) {
     let mut operations: Vec<Step> = before.iter().map(|&one| step(seed, one, None)).collect();
     let (operation, writes, fault) = faulty;
@@ -38,7 +39,7 @@ fn run(before: &[Operation], faulty: (Operation, u64, Fault), after: &[Step], se
     }
 }
 
-/// Checks that an operation makes fewer writes than are tried: a fault after so many does not happen.
+/// Checks that an operation makes fewer than [`WRITES`] writes: a fault after this number does not happen.
 fn check_writes(before: &[Operation], operation: Operation, writes: u64) {
     let mut world = World::new(Kind::Disk, None).unwrap();
     before.iter().for_each(|&one| world.run(&step(1, one, None)).unwrap());
@@ -74,7 +75,7 @@ fn no_version_relies_on_a_folder_that_is_lost() {
 fn a_collected_version_stays_collected() {
     check(&[PUSH, OTHER_PUSH], COLLECT, &[COLLECT, COLLECT]);
     check(&[PUSH, OTHER_PUSH, COLLECT], COLLECT, &[COLLECT]);
-    // What a killed commit leaves is removed at the next start, and with it all that no version names.
+    // Files of a killed commit are removed at the next start, together with all files that no version names.
     check(&[PUSH, OTHER_PUSH, COLLECT, PREPARE], COLLECT, &[]);
 }
 

@@ -1,4 +1,4 @@
-//! One simulated machine with one twin, and what its users were promised.
+//! One simulated machine with one twin, and the promises to its users.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -18,7 +18,7 @@ use crate::random::Random;
 
 const TWIN: &str = "city";
 
-/// How long a lease holds without renewal.
+/// How long a lease is valid without renewal.
 const LEASE: Duration = Duration::from_secs(900);
 
 /// The content of a version: the number of Gaussians in each cell.
@@ -36,7 +36,7 @@ struct Prepared {
     commit: Commit,
     base: u64,
     cells: Cells,
-    /// Whether an upload may have failed, which an object store tells when the push is published.
+    /// Whether an upload may have failed, which an object store reports when the push is published.
     may_fail: bool,
 }
 
@@ -47,9 +47,9 @@ pub(crate) struct World {
     catalog: Catalog,
     sessions: Vec<Session>,
     prepared: Option<Prepared>,
-    /// Versions that a client was told of: they must stay, until garbage collection may remove them.
+    /// Versions that were acknowledged to a client: they must stay, until garbage collection may remove them.
     acknowledged: BTreeMap<u64, Cells>,
-    /// What versions may be that no client was told of: of pushes that were interrupted.
+    /// Possible contents of versions of interrupted pushes, which were not acknowledged.
     possible: BTreeMap<u64, Vec<Cells>>,
     /// Versions that garbage collection may have removed.
     collectable: BTreeSet<u64>,
@@ -156,9 +156,9 @@ impl World {
         match done {
             Ok(()) => {}
             Err(Failed::Broken(promise)) => return Err(promise),
-            // What is full refuses; without a fault everything works.
+            // A full disk or store refuses the write; without a fault every operation succeeds.
             Err(Failed::Refused(_)) if is_full => {}
-            // A read that fails is an error of the file, and never says that something does not exist.
+            // A read that fails is an error of the file, and never means that the file does not exist.
             Err(Failed::Refused(StoreError::Io { .. } | StoreError::Damaged { .. }))
                 if has_failed_reads => {}
             Err(Failed::Refused(error)) => return Err(format!("{error} without a fault")),
@@ -205,14 +205,15 @@ impl World {
         }
     }
 
-    /// The number of the version so many before the latest.
+    /// The number of the version that is `back` versions before the latest.
     fn number_before_latest(&self, back: u64) -> Result<Option<u64>, StoreError> {
         let latest = self.latest()?.map(|version| version.number);
         Ok(latest.map(|latest| latest.saturating_sub(back).max(1)))
     }
 
-    /// Carries out a commit upon the version `before`, and notes what its client is told. `content` is what the commit
-    /// makes of a version's content. The record of a stopped process may arrive meanwhile and be the version below.
+    /// Carries out a commit upon the version `before`, and notes the answer to its client. `content` maps the content
+    /// of a version to that after the commit. The record of a stopped process may arrive meanwhile and be the version
+    /// below.
     fn commit(
         &mut self,
         before: u64,
@@ -220,7 +221,7 @@ impl World {
         content: impl Fn(&Cells) -> Cells,
         commit: impl FnOnce(&mut Self) -> Result<Version, StoreError>,
     ) -> Result<(), StoreError> {
-        // Until the answer is there, the version may be or not be.
+        // Until the answer arrives, the version may or may not exist.
         let below = self.possible.get(&(before + 1)).cloned().unwrap_or_default();
         let mut candidates = vec![(before + 1, content(base))];
         candidates.extend(below.iter().map(|cells| (before + 2, content(cells))));
@@ -238,7 +239,7 @@ impl World {
                 self.possible.entry(number).or_default().pop();
             }
         }
-        // What follows is not part of the commit.
+        // The following reads are not part of the commit.
         self.medium.stop_failing_reads();
         let version = match result {
             Err(StoreError::NotSynced { .. } | StoreError::OutcomeUnknown { .. }) => return Ok(()),
@@ -336,7 +337,7 @@ impl World {
         Ok(())
     }
 
-    /// Reads a version as one does that leased nothing.
+    /// Reads a version without a lease.
     fn read(&self, back: u64) -> Result<(), Failed> {
         let Some(number) = self.number_before_latest(back)? else { return Ok(()) };
         let version = match self.catalog.version(TWIN, Some(number)) {
@@ -371,7 +372,7 @@ impl World {
         Ok(())
     }
 
-    /// Lets the clock jump. Where a lease alone protects a session's version, a process that lives renews it in time.
+    /// Lets the clock jump. If only a lease protects a session's version, a running process renews it in time.
     fn jump(&mut self, seconds: i64) -> Result<(), StoreError> {
         self.medium.apply_delayed_puts();
         self.clock.jump(seconds * 1_000_000);
@@ -477,7 +478,7 @@ impl World {
         }
     }
 
-    /// Checks that the store goes on working, and that nothing is left that no version needs.
+    /// Checks that the store still works, and that no unneeded object is left.
     pub(crate) fn finish(mut self) -> Promise {
         self.check()?;
         self.sessions.clear();

@@ -120,7 +120,7 @@ async fn several_sessions_of_one_connection() {
     assert_eq!(requests[1][1], resume);
 }
 
-/// A message that is not what its header says is refused.
+/// A message that differs from its header is refused.
 #[tokio::test]
 async fn damaged_answers_to_step_many() {
     let whole = read("vectors/many/two.bin");
@@ -294,7 +294,8 @@ async fn connecting_without_a_server_fails() {
     }
 }
 
-/// A server elsewhere names a path that is another file here, or none: it is not opened.
+/// A server on another machine names a path that is a different file on this machine, or does not exist: it is not
+/// opened.
 #[tokio::test]
 async fn memory_that_is_not_the_servers_is_not_opened() {
     for (path, target) in [("/proc/self/exe", "/memfd:wildcity (deleted)"), ("/none/such", "x")] {

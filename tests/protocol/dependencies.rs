@@ -1,4 +1,4 @@
-//! What a user of the client compiles.
+//! Packages that a user of the client compiles.
 
 use std::collections::BTreeSet;
 use std::process::Command;

@@ -16,7 +16,7 @@ use super::frames::Frame;
 use super::observations::raw_frame;
 use super::read;
 
-/// What the server does with one request.
+/// Reaction of the server to one request.
 #[derive(Clone)]
 pub(crate) enum Reply {
     /// Sends a golden answer with the request's number.

@@ -26,7 +26,7 @@ pub(crate) struct Frame {
     pub(crate) tensors: Vec<Tensor>,
 }
 
-/// What a frame contains.
+/// Contents of a frame.
 #[derive(Clone, Copy)]
 pub(crate) struct Recipe {
     pub(crate) encoding: Encoding,
@@ -37,8 +37,8 @@ pub(crate) struct Recipe {
     pub(crate) history: u64,
     pub(crate) normals: bool,
     pub(crate) instances: bool,
-    /// Whether the images come with their trust, the first camera is behind a windshield, and the place on the earth is
-    /// known.
+    /// Whether the images come with their trust, the first camera is behind a windshield, and the georeference is
+    /// present.
     pub(crate) trust_and_windshield: bool,
     /// Whether the session asked for repair: the first image is repaired, the second failed.
     pub(crate) repair: bool,

@@ -110,7 +110,7 @@ fn golden_requests_are_decoded_strictly() {
     }
 }
 
-/// Every schema of what clients send can be read.
+/// Every schema of messages of clients can be read.
 #[test]
 fn every_inbound_schema_has_shapes() {
     let digest = format!("blake3:{}", blake3::hash(b"x"));

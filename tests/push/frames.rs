@@ -1,5 +1,5 @@
-//! The frame of a push: what was trained in the axes of the capture lies where it would lie if it had been there when
-//! the twin was aligned.
+//! The frame of a push: a scene that was trained in the axes of the capture gets the same place as if it had been in
+//! the twin when the twin was aligned.
 
 use serde_json::{Value, json};
 use wildcity_client::{AllCells, CellSelection, NewPush, Push, PushFrame, PushState};
@@ -11,7 +11,7 @@ use crate::http::{client, get, in_cell, post, push_of, write};
 use crate::scene_files::gaussians;
 use crate::support::TestServer;
 
-/// Two alignments, one after the other: tilted ground and another unit, and then turned ground.
+/// Two alignments, one after the other: tilted ground and a different unit, and then rotated ground.
 fn edits() -> [Value; 2] {
     let ground = json!({"points": [[0, 0, 2], [4, 0, 3], [0, 4, 1]], "above": [0, 0, 50]});
     let scale = json!({"points": [[0, 0, 0], [0, 1, 0]], "distance_m": 1.75});
@@ -121,7 +121,7 @@ async fn a_push_in_the_frame_of_the_capture_lies_as_if_it_had_been_aligned_with_
     let report = pushed.report.unwrap();
     assert_eq!((report.frame, report.aligned), (Some(PushFrame::Capture), true));
 
-    // The one way stores f32 before the alignment, the other after it: equal up to the rounding of f32.
+    // One twin was stored as f32 before the alignment, the other one after it: equal up to the rounding of f32.
     let [before, after] = ["before", "after"].map(|twin| stored(&server, twin));
     let off = differences(&before, &after);
     assert!(off.iter().all(|&off| off < 3e-5), "{off:?}");
@@ -134,7 +134,7 @@ async fn a_push_in_the_frame_of_the_capture_lies_as_if_it_had_been_aligned_with_
         found.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)]);
     assert!((z_m(0) - found[0]).abs() < 1e-4 && (z_m(1) - found[1]).abs() < 1e-4, "{found:?}");
 
-    // The alignment stays, and the version says that its files were aligned.
+    // The alignment stays, and the version records that its files were aligned.
     let [before, after] = ["before", "after"].map(|twin| latest(&server, twin).manifest);
     assert_eq!(after.twin_from_capture, before.twin_from_capture);
     let alignment: Alignment = after.twin_from_capture.unwrap();
@@ -216,7 +216,8 @@ async fn a_frame_that_cannot_be_used_is_named() {
     reply.refused(400, "invalid_request");
     assert_eq!(reply.body["field"], "frame", "{reply:?}");
 
-    // Aligned by a factor of 1,000: what fits the bounds of a twin in the capture need not fit here.
+    // Aligned by a factor of 1,000: a scene that fits the bounds in the frame of the capture need not fit in that of
+    // the twin.
     push(&server, "street", &in_cell([0, 0], 40, 1), |_| {}).await;
     let small = json!({"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 1000}});
     edit(&server, "street", &small).await;

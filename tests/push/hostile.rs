@@ -127,7 +127,7 @@ async fn a_pushed_scene_names_only_files_of_its_push() {
         let reason = refused.error.unwrap().message;
         assert!(reason.contains(&format!("part {part:?}: is not the name of")), "{reason}");
     }
-    // The file that another one names is no scene, wherever it is listed.
+    // A file that another file names is not a scene, wherever it is listed.
     for uploads in [[&*buffer_id, &*scene_id], [&*scene_id, &*buffer_id]] {
         let ready = pushed(&uploads).await;
         assert_eq!(ready.state, PushState::Ready, "{ready:?}");

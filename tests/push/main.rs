@@ -1,5 +1,5 @@
-//! Uploads and pushes over HTTP: what is pushed is what agents see, whole, when they ask for it; and
-//! whatever goes wrong on the way changes nothing.
+//! Uploads and pushes over HTTP: agents see all of a pushed scene once they request the version, and a failed push
+//! changes nothing.
 
 #[path = "../support/data.rs"]
 mod data;

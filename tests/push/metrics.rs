@@ -56,7 +56,7 @@ async fn events_are_counted() {
     assert!(scrape(&idle).await.lines().any(|line| line == "wildcity_steps_total 0"));
 }
 
-/// The panels of the dashboard show what the server has.
+/// The panels of the dashboard use metrics that the server has.
 #[tokio::test]
 async fn the_dashboard_names_existing_metrics() {
     let server = TestServer::start().await;

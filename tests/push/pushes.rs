@@ -51,7 +51,7 @@ async fn a_push_replaces_the_cells_that_it_touches() {
         .refused(404, "unknown_version");
 }
 
-/// Axes and scale are those of each file; what is stored and reported is in the twin's.
+/// Axes and scale are those of each file; stored and reported values are in the twin's axes.
 #[tokio::test]
 async fn each_file_has_its_axes_and_its_scale() {
     let server = TestServer::start().await;
@@ -267,7 +267,7 @@ async fn views_before_and_after_are_compared() {
     assert_eq!(again.state, PushState::Ready, "{again:?}");
 }
 
-/// Levels of detail are no difference, though a twin is drawn with them from afar and a push has none yet.
+/// Levels of detail cause no difference, although a twin is rendered with them from afar and a push has none yet.
 #[tokio::test]
 async fn the_same_content_has_equal_views_from_afar() {
     let cpu = Arc::new(Cpu::new(2, Simd::Best).unwrap());
@@ -411,7 +411,7 @@ async fn a_slow_push_delays_no_other_twin_and_can_be_cancelled() {
     send(server.address(), &delete, b"").await.refused(409, "conflict");
 }
 
-/// A push that takes too long to check is refused, and the next one has its turn.
+/// A push that takes too long to check is refused, and the next one runs.
 #[tokio::test]
 async fn a_push_has_a_time_limit() {
     // The last push must be this fast, also on a busy machine.

@@ -1,4 +1,4 @@
-//! What each role may do.
+//! Rights of each role.
 
 use std::sync::Arc;
 
@@ -136,7 +136,7 @@ async fn sessions_need_the_role_drive_and_belong_to_their_token() {
     assert_eq!(upgrade(&server, None).await.err(), Some(401));
     assert_eq!(upgrade(&server, Some("rubbish")).await.err(), Some(401));
     assert_eq!(upgrade(&server, Some(SCRAPER)).await.err(), Some(403));
-    // To place a drive in the viewer is to drive and to edit: one token does both.
+    // Placing a drive in the viewer needs the rights to drive and to edit, and one token has both.
     let mut pusher = upgrade(&server, Some(PUSHER)).await.ok().unwrap();
     pusher.hello().await;
     pusher.open(json!({ "session": "placing" })).await;
@@ -187,7 +187,7 @@ async fn the_client_sends_its_token() {
     assert_eq!(driver.reset(0, None).await.unwrap().metadata().version, 2);
 }
 
-/// What a push did to the images is for all tokens that may push to the twin, and for no other.
+/// Changes of the images by a push are visible to all tokens that may push to the twin, and to no others.
 #[tokio::test]
 async fn the_report_of_a_push_is_for_those_that_may_push() {
     let cpu = Arc::new(Cpu::new(1, Simd::Best).unwrap());
@@ -296,7 +296,7 @@ async fn an_upload_is_that_of_its_token() {
     assert_eq!(begun.status, 201, "{begun:?}");
     let path = begun.header("location").unwrap().to_owned();
 
-    // What it does to that id is done to its own upload.
+    // Its requests with this id concern its own upload.
     let deleted = ask(&server, &format!("DELETE {path}"), Some(RIVAL), "").await;
     assert_eq!(deleted.status, 204);
     ask(&server, &format!("DELETE {path}"), Some(RIVAL), "").await.refused(404, "unknown_upload");
@@ -304,7 +304,7 @@ async fn an_upload_is_that_of_its_token() {
     let sent = send_part(&server, &format!("PATCH {path}"), PUSHER, content).await;
     assert_eq!(sent.body["complete"], true, "{sent:?}");
 
-    // Nor can it push what is not its own.
+    // It cannot push uploads of other tokens either.
     let push = json!({ "files": [{ "upload": begun.body["id"] }] }).to_string();
     let pushes = "POST /v1/twins/test/pushes";
     ask(&server, pushes, Some(RIVAL), &push).await.refused(404, "unknown_upload");

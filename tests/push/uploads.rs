@@ -37,7 +37,7 @@ fn spooled(server: &TestServer) -> Vec<String> {
     names
 }
 
-/// Waits until an upload has so many bytes.
+/// Waits until an upload has `offset` bytes.
 async fn reaches(server: &TestServer, path: &str, offset: u64) -> Value {
     let reached = async {
         loop {
@@ -147,7 +147,7 @@ async fn an_upload_that_does_not_match_its_announcement_is_removed() {
     let chunked = chunked.replace("{path}", &path);
     send(server.address(), &chunked, &body).await.refused(422, "upload_digest");
     assert_eq!(get(&server, &path).await.body["offset"], 0, "nothing of it stays");
-    // RFC 9530: a digest of this body alone.
+    // RFC 9530: a digest of only this body.
     let wrong = "Content-Digest: sha-256=:AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA=:";
     append(&server, &path, 0, wrong, &good[..100]).await.refused(422, "upload_digest");
     assert_eq!(get(&server, &path).await.body["offset"], 0);

@@ -23,7 +23,7 @@ use crate::support::{Agent, Seen, TEST_TIMEOUT, TestServer, commit_twin_of, pose
 /// Versions that are pushed while agents drive.
 const VERSIONS: u64 = 50;
 
-/// What an agent saw: the version, where it stood, and the frame's hash.
+/// An observation of an agent: the version, the ego's x, and the frame's hash.
 type Sight = (u64, u64, String);
 
 fn sight(seen: &Seen) -> Sight {
@@ -98,7 +98,7 @@ async fn agents_drive_while_versions_are_pushed() {
     let versions: std::collections::BTreeSet<_> = sights.iter().map(|sight| sight.0).collect();
     assert!(versions.len() > 3, "only {versions:?} were seen");
 
-    // Every observation shows one version alone: as a fresh server draws it.
+    // Every observation shows only one version, with the images of a new server.
     sights.extend(pinned_sights);
     let mut seen: BTreeMap<(u64, u64), String> = BTreeMap::new();
     for (version, x_m, hash) in sights {
@@ -161,7 +161,7 @@ async fn a_session_switches_between_steps_and_its_episode_goes_on() {
     assert_eq!(difference.line, 5);
 }
 
-/// While a new version is made ready, sessions that open the latest get the version before it.
+/// While a new version is made ready, sessions that open the latest get the previous version.
 #[tokio::test]
 async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     let server = TestServer::start().await;
@@ -195,7 +195,7 @@ async fn the_latest_is_the_one_before_until_the_new_one_is_ready() {
     assert_eq!((latest().await, listed().await), (2, 2), "nothing is held");
 }
 
-/// The same over the wire, during a push that takes a while to make its version ready.
+/// The same test over the wire, during a push that takes a while to load its version.
 #[tokio::test]
 async fn a_version_that_is_not_ready_is_not_the_latest() {
     let server = rendering(None).await;

@@ -1,4 +1,4 @@
-//! What a camera makes of an image: from the rig's JSON through crop and size to the pixels, and again.
+//! Appearance of a camera: from the rig's JSON through crop and size to the pixels, and back.
 
 use std::sync::Arc;
 
@@ -9,7 +9,7 @@ use wildcity_scene::appearance::Overlay;
 use crate::replay::replay;
 use crate::support::{Agent, TestServer, refused, rig};
 
-/// The front camera of the test's rig, 8 x 6 px, with more said of it.
+/// The front camera of the test's rig, 8 x 6 px, with additional fields.
 fn front(more: Value) -> Value {
     let mut rig = serde_json::to_value(rig()).unwrap();
     rig["cameras"].as_array_mut().unwrap().truncate(1);
@@ -78,7 +78,7 @@ async fn exposure_and_overlay_are_in_the_image_and_on_record() {
         assert_eq!(seen.chunks(3).all(|pixel| pixel == [0, 200, 0]), green);
     }
 
-    // What is recorded says all of it.
+    // The record has all of it.
     agent.ask(json!({ "type": "close" })).await;
     let path = server.recorded().into_iter().find(|path| path.ends_with("looks-1.jsonl")).unwrap();
     assert_eq!(replay(&server, &path, &cpu()).unwrap().difference, None);
@@ -106,7 +106,7 @@ async fn what_is_no_appearance_is_refused_by_its_field() {
         refused(&answer, "camera_invalid");
         assert_eq!(answer["field"], field);
     }
-    // Each alone would do: a PNG of 4,096 x 3,000 clear pixels is a few kilobytes.
+    // Each of the two is enough to be refused: a PNG of 4,096 x 3,000 clear pixels is a few kilobytes.
     let clear = Overlay::new(4096, vec![0; 4 * 4096 * 3000]).unwrap().to_data_uri();
     let mut rig = front(json!({ "width": 4096, "height": 3000, "overlay": clear }));
     let second = rig["cameras"][0].clone();

@@ -129,7 +129,7 @@ async fn agent_of(server: &TestServer, section: &str) -> (Agent, Check) {
     }
 }
 
-/// What the old server refused or took for something else, and what is valid.
+/// Requests that earlier servers refused or misread, and valid ones.
 #[tokio::test]
 async fn integers_may_have_a_point_or_an_exponent() {
     let server = TestServer::start().await;

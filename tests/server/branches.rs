@@ -1,4 +1,5 @@
-//! Snapshots, and sessions that begin in the middle of another episode: driven alike, they give the same bytes.
+//! Snapshots, and sessions that begin in the middle of another episode: with the same commands, they give the same
+//! bytes.
 
 use std::sync::Arc;
 
@@ -61,7 +62,7 @@ fn command(model: &str, step: u64) -> Value {
     }
 }
 
-/// Drives the steps after `done`, with the switches of version before them.
+/// Drives the steps after `done`, with the switches of version before these steps.
 async fn drive(agent: &mut Agent, model: &str, done: u64, until: u64) -> Vec<Seen> {
     let mut seen = Vec::new();
     for step in done + 1..=until {

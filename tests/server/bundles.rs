@@ -12,7 +12,7 @@ use wildcity_twin::store::Catalog;
 
 use crate::support::{Agent, Painter, Seen, TestServer, pose, refused, rig};
 
-/// What a camera of the rig sees when the rig is at a point of the x axis.
+/// Image of a camera of the rig when the rig is at a point of the x axis.
 fn painted(camera: usize, x_m: f64) -> Vec<u8> {
     let world_from_rig = Pose { position_m: glam::DVec3::new(x_m, 0.0, 0.0), ..Pose::IDENTITY };
     let camera = &rig().cameras[camera];
@@ -25,8 +25,7 @@ async fn open(server: &TestServer, more: Value) -> Agent {
     agent
 }
 
-/// When the frames of a camera were taken that an observation holds, in steps of 0.1 s, and their
-/// pixels: those of now first.
+/// Times of the frames of a camera in an observation, in steps of 0.1 s, and their pixels: the present one first.
 fn bundle(seen: &Seen, camera: &str) -> Vec<(i64, Vec<u8>)> {
     let entries = ["images", "history"].map(|list| seen.meta[list].as_array().cloned());
     let entries = entries.into_iter().flatten().flatten().filter(|image| image["camera"] == camera);
@@ -87,7 +86,7 @@ async fn the_last_frames_of_each_camera_newest_first() {
         assert_eq!((&past["back"], &past["index"]), (&json!(1), &json!(0)));
         assert_eq!(past["tensor"], "camera/front/history/1/rgb");
     }
-    // A new episode begins with nothing of the old one.
+    // A new episode has no frames of the old one.
     let again = agent.look(json!({ "type": "reset" })).await;
     assert_eq!(bundle(&again, "front"), driven(0, &[0]));
     // Images of `observe` are not part of the history.
@@ -213,7 +212,7 @@ async fn the_drive_before_the_start_is_history_and_frames() {
     let next = agent.step(6.5).await;
     let now = (1, painted(0, 6.5));
     assert_eq!(bundle(&next, "front"), [now.clone(), logged(0), logged(1), logged(2)]);
-    // A step without a reset before it shows the same.
+    // A step without a previous reset shows the same frames.
     let at_once = json!({ "outputs": outputs, "start": start, "warm_up_us": 500_000 });
     let mut agent = open(&server, at_once).await;
     let seen = agent.step(6.5).await;

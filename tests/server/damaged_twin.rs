@@ -1,4 +1,4 @@
-//! A damaged twin beside nine good ones: the nine are listed and served, from the start on.
+//! A damaged twin among nine good ones: the nine are listed and served from the start.
 
 use std::path::Path;
 

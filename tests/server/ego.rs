@@ -23,8 +23,8 @@ async fn act(agent: &mut Agent, acceleration: f64, curvature: f64) -> Seen {
     agent.look(json!({ "type": "step", "action": action })).await
 }
 
-/// What is left of a circle of 25 m radius driven at 5 m/s, of which `driven_s` are over, in the frame of
-/// a rig beside it: 2 s of poses.
+/// The rest of a circle of 25 m radius that is driven at 5 m/s, after `driven_s`, in the frame of a rig near it: 2 s of
+/// poses.
 fn rest_of_circle(ego: &Value, driven_s: f64) -> Value {
     let xyz = numbers(&ego["pose"]["xyz"]);
     let q = numbers(&ego["pose"]["q"]);
@@ -236,7 +236,7 @@ async fn a_lap_driven_twice_is_the_same_and_is_on_record() {
     let report = replay(&server, &path, &Painter::default()).unwrap();
     assert_eq!((report.images, report.diverged, report.difference), (82, None, None));
 
-    // A hundredth of a metre per second squared leads elsewhere, and the step says so.
+    // An error of 0.01 m/s² changes the poses, and the report names the step.
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, text.replacen(":1.5,", ":1.49,", 1)).unwrap();
     let diverged = replay(&server, &path, &Painter::default()).unwrap().diverged.unwrap();

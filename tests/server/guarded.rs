@@ -57,7 +57,7 @@ async fn a_ticket_is_for_a_websocket_and_survives_a_refused_handshake() {
     };
     let good = handshake("localhost", "wildcity.v1");
     for (lines, status) in [
-        // No route of a WebSocket, although its path ends like one.
+        // Not a route of a WebSocket, although its path ends like one.
         (with("DELETE", "/v1/uploads/watch", "Host: localhost"), 401),
         (with("GET", "/v1/twins/watch", "Host: localhost"), 401),
         // Refused before the ticket is looked at.
@@ -67,7 +67,7 @@ async fn a_ticket_is_for_a_websocket_and_survives_a_refused_handshake() {
         (with("HEAD", "/v1/session", "Host: localhost"), 426),
         (with("GET", "/v1/session", &handshake("localhost", "wildcity.v2")), 400),
         (with("GET", "/v1/sessions/a/watch", &good), 400),
-        // It is still good, and then used.
+        // It is still valid, and is used then.
         (with("GET", "/v1/session", &good), 101),
         (with("GET", "/v1/session", &good), 401),
     ] {
@@ -139,7 +139,7 @@ async fn hosts_and_origins_are_there_once_and_a_foreign_host_is_told_how_to_be_l
     }
     let (_, body) = ask(&server, &get("Host: evil.example.org")).await;
     let message = body["message"].as_str().unwrap();
-    assert!(message.contains("not called \"evil.example.org\""), "{message}");
+    assert!(message.contains("host name \"evil.example.org\" is not accepted"), "{message}");
     assert!(message.contains("--origin") && !message.contains("token"), "{message}");
 }
 

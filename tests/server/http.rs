@@ -79,7 +79,7 @@ async fn refusals_are_json_with_a_code_and_a_field() {
         // The server has no tokens.
         assert!(!message.contains("token") && !message.is_empty(), "{message}");
     }
-    // What a client of another version of WebSocket has to know (RFC 6455, section 4.4).
+    // The answer to a client of a different WebSocket version has the supported version (RFC 6455, section 4.4).
     let (_, answer) = request(&server, &upgrade("Version: 13", "Version: 8")).await;
     assert!(answer.contains("sec-websocket-version: 13"), "{answer}");
 

@@ -1,5 +1,5 @@
-//! Levels of detail are chosen for all cameras of a frame. What is rendered again on its own, or instead of a lost frame,
-//! must have the levels that it would have had in its frame.
+//! Levels of detail are chosen for all cameras of a frame. An image that is rendered again separately, or instead of a
+//! lost frame, must have the same levels as in its frame.
 
 use std::sync::Arc;
 
@@ -92,7 +92,8 @@ fn hash<'a>(seen: &'a Seen, camera: &str) -> &'a Value {
     &images.iter().find(|image| image["camera"] == camera).unwrap()["hash"]
 }
 
-/// The other tests of this file rest on this: beside a long focal length, the wide camera sees finer levels.
+/// The other tests of this file depend on this: together with a camera of long focal length, the wide camera gets finer
+/// levels.
 #[tokio::test]
 async fn cameras_of_a_frame_share_its_levels() {
     let server = server().await;

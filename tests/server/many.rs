@@ -73,7 +73,7 @@ fn three(names: [&str; 3], k: u32) -> [Value; 3] {
     ]
 }
 
-/// What must not depend on how the step was asked for.
+/// Values that must not depend on the kind of request.
 fn facts(seen: &Seen) -> Value {
     let mut meta = seen.meta.clone();
     for name in ["seq", "session", "timings", "residency"] {
@@ -283,7 +283,7 @@ async fn what_cannot_be_resumed_together() {
     assert_eq!(agent.ask(resume).await["type"], "resumed");
     agent.seq = 3;
     assert_eq!(agent.step_many(json!([to("a", 1.0), to("b", 1.0)])).await.seen.len(), 2);
-    // Another client takes one of them: the connection loses both.
+    // Another client resumes one of them: the connection loses both.
     let mut thief = server.agent().await;
     let resume = json!({ "type": "resume", "session": "b", "last_seq": 3 });
     assert_eq!(thief.ask(resume).await["type"], "resumed");

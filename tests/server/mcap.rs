@@ -1,4 +1,4 @@
-//! MCAP files of episodes that end: written beside the records, delivered, and refused with the reason.
+//! MCAP files of episodes that end: written next to the records, delivered, and refused with the reason.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -79,7 +79,7 @@ async fn an_episode_that_ended_is_delivered_as_mcap() {
     let topics = mcap::MessageStream::new(&body).unwrap();
     let topics: Vec<String> = topics.map(|m| m.unwrap().channel.topic.clone()).collect();
     assert_eq!(topics.iter().filter(|topic| *topic == "/wildcity/step").count(), 2, "{topics:?}");
-    // It is what the command makes of the record.
+    // It equals the file that the command makes from the record.
     let by_hand = server.twins.path().join("by-hand.mcap");
     export_file(&server.recorded()[0], &by_hand).unwrap();
     // The order of the index differs from file to file.
@@ -123,10 +123,10 @@ async fn what_was_cut_has_no_mcap_file_until_it_is_exported_by_hand() {
     assert_eq!((cut, cut), (exported.messages, whole));
 }
 
-/// Ends the reading of a pipe: gives a line to the first reader, as soon as it is told to, or after [`TEST_TIMEOUT`], or
-/// when it can be told no more. Then gives its name to a file. Returns whether it was told to.
+/// Ends the reading of a pipe: gives a line to the first reader when it is notified, after [`TEST_TIMEOUT`], or when
+/// the sender is dropped. Then renames a file to the path of the pipe. Returns whether it was notified.
 ///
-/// What waits for the pipe goes on in any case, so that a test that fails also ends.
+/// Readers of the pipe continue in any case, so that a failing test also ends.
 fn release(pipe: &Path, file: &Path, told: &Receiver<()>) -> bool {
     let is_told = told.recv_timeout(TEST_TIMEOUT).is_ok();
     let begun = Instant::now();
@@ -172,7 +172,7 @@ async fn no_request_waits_for_an_export() {
     let text = std::fs::read_to_string(server.episodes.path().join("b-2.jsonl")).unwrap();
     assert!(text.lines().last().unwrap().contains("\"outcome\":\"completed\""), "{text}");
 
-    // What comes out of the pipe is no record: this export fails, and the others follow.
+    // The line from the pipe is not a record: this export fails, and the others follow.
     tell.send(()).unwrap();
     let (status, _, _) = get(&server, "/v1/episodes/b-2/mcap").await;
     assert_eq!(status, 200);

@@ -137,7 +137,7 @@ async fn memory_and_socket_have_the_same_bytes() {
     }
 }
 
-/// An observation stays as it is until the third one after it is asked for.
+/// An observation is unchanged until the third one after it is requested.
 #[tokio::test]
 async fn slots_are_used_in_turn() {
     let server = TestServer::start().await;
@@ -275,7 +275,7 @@ async fn memory_is_given_back() {
                 assert_eq!(agent.ask(json!({ "type": "close" })).await["type"], "closed");
             }
             "kill" => {
-                // What the kernel does for a killed process that left bytes unread.
+                // Reset the connection, as the kernel does for a killed process that left bytes unread.
                 agent.send(step(9.0)).await;
                 let socket = socket2::SockRef::from(&*agent.tcp()).set_linger(Some(Duration::ZERO));
                 socket.unwrap();
@@ -302,7 +302,7 @@ async fn memory_is_given_back() {
     agent.open(json!({ "session": "last" })).await;
     agent.place(step(1.0)).await;
     let target = memory.target.clone();
-    // The observation itself is gone with the next answer. What counts then is the shared memory.
+    // The observation itself is gone with the next answer. After that, only the shared memory counts.
     let prefetch = json!({ "type": "prefetch", "poses": [pose(1.0)] });
     assert_eq!(agent.ask(prefetch).await["type"], "ok");
     assert!(engine.reserve_answer_bytes(ANSWERS_BYTES).is_err(), "the memory is counted");
@@ -331,8 +331,8 @@ async fn a_full_budget_sends_through_the_socket() {
     agent.open(json!({ "session": "a", "outputs": outputs })).await;
     assert_eq!(agent.place(step(1.0)).await.slot, 0);
 
-    // All of the budget, but for what the next observation itself takes. It is larger than the one before, whose memory
-    // is free by the time that the next one is delivered.
+    // Reserve all of the budget except the bytes of the next observation. It is larger than the previous one, whose
+    // memory is free by the time that the next one is delivered.
     let places: Vec<Value> = (0..8).map(|k| pose(f64::from(k))).collect();
     let mut all = 0;
     for power in (10..34).rev() {
@@ -374,7 +374,7 @@ async fn the_size_cannot_be_changed() {
         assert_eq!(refused.kind(), std::io::ErrorKind::PermissionDenied, "{refused}");
     }
     assert_eq!(file.metadata().unwrap().len(), 3 * SLOT_BYTES);
-    // Nothing but the proof takes memory.
+    // Only the proof takes memory.
     assert!(std::os::unix::fs::MetadataExt::blocks(&file.metadata().unwrap()) <= 8);
 }
 

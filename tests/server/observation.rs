@@ -111,7 +111,7 @@ async fn raw_pixels_and_maps_are_the_renderers() {
     assert_eq!(seen.meta["timings"]["stages_ms"], json!([{ "name": "paint", "ms": 0.5 }]));
 }
 
-/// The header takes what it holds, and at most 7 spaces; the tensors begin at a multiple of 8.
+/// The header has no padding except at most 7 spaces; the tensors begin at a multiple of 8.
 #[tokio::test]
 async fn the_header_has_the_size_of_its_contents() {
     let server = TestServer::start().await;
@@ -200,7 +200,7 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
     // A disc of 5 px around the middle of 12 x 12.
     let share = image["seen"].as_f64().unwrap();
     assert!((share - 25.0 * std::f64::consts::PI / 144.0).abs() < 0.05, "{share}");
-    // What does not lie within the image is refused.
+    // A crop that is not within the image is refused.
     let mut agent = server.agent().await;
     for (part, code, field) in [
         (json!({ "front": { "crop": [0, 0, 9, 6] } }), "out_of_range", "outputs.images.front.crop"),
@@ -217,8 +217,8 @@ async fn lenses_shutters_and_parts_of_images_are_described_as_sent() {
 async fn trust_is_sent_if_it_is_requested() {
     let server = TestServer::start().await;
     let mut agent = open(&server, json!({ "encoding": "raw", "trust": true })).await;
-    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the
-    // horizon. What is looked at of the small rear image is above it.
+    // The drive ends at 9 m; the painter's opacity is a quarter everywhere: a hole, where it is below the horizon. The
+    // sampled pixels of the small rear image are above it.
     let seen = agent.step(20.0).await;
     for (image, low_coverage) in seen.meta["images"].as_array().unwrap().iter().zip([1.0, 0.0]) {
         let trust = &image["trust"];
@@ -228,7 +228,7 @@ async fn trust_is_sent_if_it_is_requested() {
         assert!((trust["value"].as_f64().unwrap() - value).abs() < 1e-9, "{trust}");
     }
     assert!(!seen.tensors().names().iter().any(|name| name.ends_with("opacity")), "not asked for");
-    // Eleven metres off, and half of what is seen is a hole.
+    // Eleven metres off the drive, and half of the visible ground is a hole.
     let summary = &agent.ask(json!({ "type": "close" })).await["summary"];
     assert_eq!(summary["outcome"], "off_model");
     let least = summary["least_trust"].as_f64().unwrap();

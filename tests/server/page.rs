@@ -126,7 +126,7 @@ fn ranges_of_the_schema_are_those_of_the_program() {
         (
             &definition("Imu")["bias_period_us"],
             range,
-            [*session::WANDER_PERIOD_US.start() as f64, *session::WANDER_PERIOD_US.end() as f64],
+            [*session::DRIFT_PERIOD_US.start() as f64, *session::DRIFT_PERIOD_US.end() as f64],
         ),
     ] {
         let found = keywords.map(|keyword| field[keyword].as_f64());

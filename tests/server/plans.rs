@@ -16,7 +16,7 @@ fn straight(poses: u32) -> Value {
     (1..=poses).map(timed).collect()
 }
 
-/// Asserts that two observations show the same, but for what says which request of which session they answer.
+/// Asserts that two observations are equal except for the fields of their request and session.
 fn assert_same(one: &Seen, other: &Seen) {
     for field in ["step", "time_us", "frame_hash", "ego", "images", "history"] {
         assert_eq!(one.meta[field], other.meta[field], "{field}");
@@ -148,7 +148,7 @@ async fn a_car_follows_a_trajectory_for_several_steps() {
     }
 }
 
-/// Every JSON value but `null` comes back from the record as it was sent, and means nothing to anything else.
+/// Every JSON value but `null` is in the record as it was sent, and has no other effect.
 #[tokio::test]
 async fn notes_go_into_the_record_untouched() {
     let server = TestServer::start().await;

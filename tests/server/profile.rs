@@ -54,7 +54,7 @@ async fn a_profile_that_cannot_be_had_is_refused_by_its_field() {
         (json!({ "fov": 90 }), "invalid_request", "profile.fov"),
         (json!({ "antialiased": "yes" }), "invalid_request", "profile.antialiased"),
         (json!({ "near": 2.0, "far": 1.0 }), "out_of_range", "profile.far"),
-        // The backend draws splats only: this is no error of the first frame.
+        // The backend draws splats only: the error comes at `open`, and not with the first frame.
         (json!({ "rays": "exact" }), "out_of_range", "profile"),
     ] {
         let answer = agent.try_open(json!({ "profile": profile.clone() })).await;

@@ -1,4 +1,4 @@
-//! What is on record.
+//! Contents of the records of episodes.
 
 use serde_json::json;
 

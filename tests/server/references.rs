@@ -1,5 +1,5 @@
-//! Recorded images beside a session's views, end to end: a wall whose image is known, a model that returns the
-//! references in the view, and the pure warp.
+//! References of a session's views, end to end: a wall whose image is known, a model that returns the references in the
+//! view, and the pure warp.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -21,8 +21,8 @@ use crate::onnx_models::{Folder, library};
 use crate::repair::{beside, opening, pixels, statuses, step};
 use crate::support::{Agent, TestServer, refused};
 
-/// Draws a wall that crosses the road, 16 m ahead of the world's origin. Its image is right on the drive; beside it, it
-/// is redder, as that of a twin that was never trained there.
+/// Draws a wall that crosses the road, 16 m ahead of the world's origin. Its image is correct on the drive, and redder
+/// off the trajectory, like that of a twin that was not trained there.
 #[derive(Debug, Default)]
 pub(crate) struct Wall {
     views: AtomicU64,
@@ -130,12 +130,12 @@ fn view_at(width_px: u32, x_m: f64, y_m: f64) -> View {
     View::new(camera, world_from_rig * rig_from_camera)
 }
 
-/// What the model should return for a camera beside the drive: references at 0, 2 and 4 m, of both cameras.
+/// Expected output of the model for a camera off the drive: references at 0, 2 and 4 m, of both cameras.
 fn expected(width_px: u32, y_m: f64, paint: Option<[u8; 3]>, stations: &[f64]) -> Vec<u8> {
     expected_of(width_px, y_m, paint, stations, false)
 }
 
-/// The same; if `masked`, without the left halves of the references.
+/// As [`expected`]; if `masked`, without the left halves of the references.
 fn expected_of(
     width_px: u32,
     y_m: f64,
@@ -189,7 +189,7 @@ async fn a_twin_without_recorded_images_is_drawn_on_its_drive() {
     let opened = open(&mut agent, "a", "warped").await;
     assert_eq!(opened["repair"]["references"], "rendered");
 
-    // On the drive nothing is drawn beside the two images.
+    // On the drive only the two images are rendered.
     let before = wall.views.load(Ordering::SeqCst);
     assert_eq!(statuses(&step(&mut agent, 0.0).await), ["kept"; 2]);
     assert_eq!(wall.views.load(Ordering::SeqCst) - before, 2);
@@ -199,7 +199,7 @@ async fn a_twin_without_recorded_images_is_drawn_on_its_drive() {
     for (index, (camera, width_px)) in [("left", 24), ("right", 20)].into_iter().enumerate() {
         let wanted = expected(width_px, 2.0, None, &[0.0, 2.0, 4.0]);
         assert_eq!(pixels(&seen, camera), wanted, "{camera}");
-        // Most of it is what the wall looks like, and not what is rendered there.
+        // Most pixels have the real colour of the wall, and not the rendered one.
         let (rendered, _) = Wall::picture(&view_at(width_px, 3.0, 2.0));
         let changed = wanted.chunks(3).zip(rendered.rgb8.chunks(3)).filter(|(a, b)| a != b).count();
         assert!(changed > wanted.len() / 3 / 2, "{changed}");
@@ -221,7 +221,7 @@ async fn a_twin_without_recorded_images_is_drawn_on_its_drive() {
     replayed(&server, &folder, "a-1", 4);
 }
 
-/// Replays an episode and repairs again; so many images are compared.
+/// Replays an episode and repairs again; `repaired` images are compared.
 fn replayed(server: &TestServer, folder: &Folder, episode: &str, repaired: u64) {
     let path = server.episodes.path().join(format!("{episode}.jsonl"));
     let recording = RecordedEpisode::read(&path).unwrap();

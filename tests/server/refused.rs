@@ -385,7 +385,7 @@ async fn pings_of_a_client_that_does_not_read_are_no_life() {
     };
     let ended = tokio::time::timeout(support::TEST_TIMEOUT / 2, flood).await;
     assert!(ended.is_ok(), "still connected after {written_bytes} bytes of pings");
-    // What the kernel's buffers hold, and no more.
+    // Only the bytes that fit into the kernel's buffers.
     assert!(written_bytes < 64 << 20, "{written_bytes} bytes of pings were read");
     server.still_serves().await;
 }

@@ -14,7 +14,7 @@ use crate::onnx_doubles as doubles;
 use crate::onnx_models::{Folder, library, trained};
 use crate::support::{Agent, Painter, Seen, TestServer, refused};
 
-/// The models of some folders, with so many threads.
+/// The models of some folders, with a number of threads.
 fn models(folders: &[&Folder], threads: usize) -> Arc<Models> {
     let paths: Vec<_> = folders.iter().map(|folder| folder.path()).collect();
     let options = LoadOptions { threads, ..LoadOptions::new(library()) };
@@ -31,8 +31,8 @@ pub(crate) fn brighter() -> Folder {
     Folder::new(&doubles::arithmetic("Add", 0.1), json!({"name": "brighter", "timeout_ms": 10_000}))
 }
 
-/// Two cameras that see no ground, so that the trust depends on the distance from the drive alone: half of it
-/// is lost in 3.5 m.
+/// Two cameras without ground in their images, so that the trust depends only on the distance from the drive: half of
+/// it is lost in 3.5 m.
 fn rig() -> Value {
     let camera = |name: &str, width: u64| {
         json!({"name": name, "width": width, "height": 16, "fx": 20.0, "fy": 20.0, "cx": 12.0, "cy": 12.0,
@@ -41,7 +41,7 @@ fn rig() -> Value {
     json!({"name": "pair", "cameras": [camera("left", 24), camera("right", 20)]})
 }
 
-/// What `open` has beside the repair.
+/// Fields of `open` in addition to the repair.
 pub(crate) fn opening(name: &str, repair: Value) -> Value {
     let mut open =
         json!({"session": name, "rig": rig(), "outputs": {"encoding": "raw", "trust": true}});
@@ -51,7 +51,7 @@ pub(crate) fn opening(name: &str, repair: Value) -> Value {
     open
 }
 
-/// A step to a place beside the drive.
+/// A step to a pose with a lateral offset from the drive.
 pub(crate) fn beside(y_m: f64) -> Value {
     json!({"type": "step", "pose": {"xyz": [3.0, y_m, 0.0], "q": [1.0, 0.0, 0.0, 0.0]}})
 }
@@ -121,7 +121,7 @@ async fn beside_the_drive_images_are_repaired_and_on_it_no_byte_changes() {
             assert_eq!(bytes == before, status == "kept", "{y_m} {camera}");
         }
         assert!(seen.meta["timings"]["repair_ms"].is_number());
-        // A session that does not ask is told nothing of it.
+        // A session that does not ask for repair gets no field of it.
         assert_eq!(rendered.meta["images"][0].get("repair"), None);
         assert_eq!(rendered.meta["timings"].get("repair_ms"), None);
     }
@@ -139,7 +139,7 @@ async fn files_that_are_sent_are_of_the_repaired_pixels_and_the_count_is_per_pos
     let server = server(&[&folder], 1).await;
     let mut agent = server.agent().await;
     let mut open = opening("a", json!({"model": "brighter", "per_step": 1}));
-    // Without `outputs.trust` images are selected alike, and no trust is told.
+    // Without `outputs.trust` the same images are selected, but their trust is not reported.
     open["outputs"] = json!({"encoding": "png", "frames": 2});
     assert_eq!(agent.open(open).await["outputs"]["trust"], false);
     for _ in 0..2 {

@@ -1,4 +1,4 @@
-//! Models that fail, hang, are swapped or cannot be used: each has its own refusal or flag, and sessions go on.
+//! Models that fail, hang, are swapped or cannot be used: each has its own refusal or flag, and sessions continue.
 
 use std::fs;
 
@@ -65,7 +65,7 @@ async fn what_cannot_be_repaired_is_refused_at_open_and_names_the_field() {
         assert_eq!(answer["field"], field, "{repair}: {answer}");
         assert!(answer["message"].as_str().unwrap().contains(message), "{repair}: {answer}");
     }
-    // The connection goes on.
+    // The connection continues.
     agent.open(opening("a", Value::Null)).await;
     step(&mut agent, 2.0).await;
     assert_eq!(server.recorded().len(), 1);
@@ -95,7 +95,7 @@ async fn a_hung_model_flags_the_frame_and_is_loaded_again_after_ten() {
     let mut plain = server.agent().await;
     plain.open(opening("b", Value::Null)).await;
     assert_eq!(statuses(&step(&mut agent, 2.0).await), ["repaired", "kept"]);
-    // The trust is 0.3 at 6 m: the model does not end, the frame comes as rendered and says so.
+    // The trust is 0.3 at 6 m: the model does not end, and the frame is delivered as rendered and marked so.
     let rendered = step(&mut plain, 6.0).await;
     for _ in 0..9 {
         let seen = step(&mut agent, 6.0).await;
@@ -115,7 +115,7 @@ async fn a_hung_model_flags_the_frame_and_is_loaded_again_after_ten() {
     let mut other = server.agent().await;
     other.open(opening("c", json!({"model": "hung"}))).await;
     assert_eq!(statuses(&step(&mut other, 2.0).await), ["repaired"; 2]);
-    // What failed is on record as such, and a replay agrees.
+    // The failure is on record, and a replay agrees.
     agent.ask(json!({"type": "close"})).await;
     let report = replay(&server, "a-1", &Models::default());
     assert_eq!((report.difference, report.wrong_value), (None, None));

@@ -72,7 +72,7 @@ async fn an_agent_killed_in_mid_step_finds_its_answer() {
         server.painter.begins(begun + 1).await;
         let last_seq = agent.seq - 2;
         if reset {
-            // What the kernel does for a killed process that left bytes unread.
+            // Reset the connection, as the kernel does for a killed process that left bytes unread.
             let socket = socket2::SockRef::from(&*agent.tcp()).set_linger(Some(Duration::ZERO));
             socket.unwrap();
         }
@@ -155,7 +155,7 @@ async fn a_lost_answer_to_close_can_be_repeated() {
         assert_eq!(found, [&json!("resumed"), &json!(seq), &json!(1), &json!(100_000)]);
         agent.seq = seq;
         assert_eq!(agent.ask(json!({ "type": "close" })).await, closed);
-        // The connection goes on with the next number.
+        // The connection continues with the next number.
         refused(&agent.ask(json!({ "type": "close" })).await, "session_state");
         agent.open(json!({ "session": "b" })).await;
         agent.ask(json!({ "type": "close" })).await;

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use crate::support::{Agent, TestServer, pose, refused};
 
-/// On the 9 m of the twin `test`: a car that stands at 8 m, a walker that appears, and a van beside.
+/// On the 9 m of the twin `test`: a car that stands at 8 m, a walker that appears, and a van next to the drive.
 fn scenario() -> Value {
     json!({
         "format": "wildcity.scenario/1", "name": "short", "twin": {"name": "test"},
@@ -119,7 +119,7 @@ async fn a_seed_repeats_its_episode_and_another_differs() {
             let metadata = to(&mut agent, 0.3 * f64::from(step)).await;
             seen.push((metadata["actors"].clone(), metadata["route"].clone()));
         }
-        // A snapshot goes on alike.
+        // A session from a snapshot continues in the same way.
         agent.ask(json!({ "type": "snapshot", "name": "here" })).await;
         let once = to(&mut agent, 1.6).await;
         agent.look(json!({ "type": "restore", "name": "here" })).await;

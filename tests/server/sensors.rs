@@ -1,4 +1,4 @@
-//! Effects of sensors: what they change, that a seed decides it, and that branches, replays and records have it.
+//! Effects of sensors: their changes, which depend only on a seed, and are the same in branches, replays and records.
 
 use std::collections::BTreeSet;
 
@@ -97,7 +97,7 @@ async fn a_branch_with_every_effect_gives_the_same_bytes_over_200_steps() {
         }
         original.extend(drive(&mut agent, model, 101, 200).await);
 
-        // The session itself, and another one beside it.
+        // The session itself, and then another session.
         for done in [37, 0] {
             let name = format!("at-{done}");
             let restored = agent.look(json!({ "type": "restore", "name": name })).await;
@@ -136,7 +136,7 @@ async fn a_branch_with_every_effect_gives_the_same_bytes_over_200_steps() {
     }
 }
 
-/// The same with numbers that are floats, as answers have them.
+/// Converts numbers to floats, as they are in answers.
 fn json_with_floats(sensors: Value) -> Value {
     let typed: wildcity_protocol::message::Sensors = serde_json::from_value(sensors).unwrap();
     serde_json::to_value(typed).unwrap()
@@ -356,7 +356,7 @@ async fn a_delayed_plan_must_be_long_enough() {
         (&json!("session_state"), &json!("pose")),
         "refused now, not later"
     );
-    // Actions take effect after two steps: until then the car rolls on.
+    // Actions take effect after two steps: until then the car keeps its speed.
     let mut agent = server.agent().await;
     open(&mut agent, "acting", "kinematic", json!({ "delay_us": 200_000 })).await;
     agent.look(json!({ "type": "reset" })).await;
@@ -371,7 +371,7 @@ async fn a_delayed_plan_must_be_long_enough() {
     }
 }
 
-/// A record whose image was taken at another time than the settings say is found out.
+/// A replay detects a record whose image was not taken at the time that the settings give.
 #[tokio::test]
 async fn a_replay_decides_again() {
     let server = TestServer::start().await;
@@ -398,7 +398,7 @@ async fn a_replay_decides_again() {
     assert!(report.difference.is_some() && report.wrong_value.is_none());
 }
 
-/// Room for the header is reserved before the header is known, also for what is told of every image.
+/// Room for the header is reserved before the header is known, also for the sensor effects of every image.
 #[tokio::test]
 async fn the_longest_header_of_sensors_fits() {
     let server = TestServer::start().await;

@@ -94,7 +94,7 @@ async fn requests_that_come_early_wait_in_order() {
     assert_eq!(agent.seen().await.meta["step"], 2);
     assert_eq!(agent.seen().await.meta["step"], 3);
 
-    // More than the server holds: the rest waits in the socket, and comes in order too.
+    // More than the server holds: the rest waits in the socket, and arrives in order as well.
     server.painter.slow_ms.store(300, Ordering::SeqCst);
     agent.send(json!({ "type": "step", "pose": pose(4.0) })).await;
     server.painter.slow_ms.store(0, Ordering::SeqCst);
@@ -189,7 +189,7 @@ async fn the_servers_own_close_frame_says_why() {
     stopping.await.unwrap();
 }
 
-/// A watcher gets pongs, and the Close frame that says why its connection ends.
+/// A watcher gets pongs, and a Close frame with the reason of the end.
 #[tokio::test]
 async fn watchers_are_told_why_they_end() {
     let server = TestServer::start().await;

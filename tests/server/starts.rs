@@ -1,4 +1,4 @@
-//! Starts that are drawn with a seed, and episodes with dynamics of their own.
+//! Starts that are sampled with a seed, and episodes with their own dynamics.
 
 use serde_json::{Value, json};
 
@@ -37,7 +37,7 @@ async fn a_random_start_is_drawn_with_the_seed_of_the_episode() {
         }
         places.push([along_m, left_m, heading_rad]);
     }
-    // Each draw uses its whole range, and none follows from another one.
+    // Each sampled value uses its whole range, and is independent of the others.
     let spread = |axis: usize| {
         let values = || places.iter().map(|place| place[axis]);
         values().fold(f64::MIN, f64::max) - values().fold(f64::MAX, f64::min)
@@ -131,7 +131,7 @@ async fn what_is_no_start_is_refused() {
     }
 }
 
-/// After a switch of version and a reset, `resumed` tells what holds now.
+/// After a switch of version and a reset, `resumed` has the present settings.
 #[tokio::test]
 async fn resumed_tells_the_settings_of_now() {
     let server = TestServer::start().await;

@@ -14,7 +14,7 @@ use wildcity_server::{Config, ServerError, TlsFiles};
 
 use crate::support::{TEST_TIMEOUT, TestServer};
 
-/// Writes a new certificate for 127.0.0.1, and returns a client's options that trust it alone.
+/// Writes a new certificate for 127.0.0.1, and returns a client's options that trust only this certificate.
 fn certify(dir: &Path) -> ConnectOptions {
     let CertifiedKey { cert, signing_key } =
         generate_simple_self_signed(vec!["127.0.0.1".to_owned()]).unwrap();
@@ -92,7 +92,7 @@ async fn other_clients_trust_a_private_authority() {
     let key = KeyPair::generate().unwrap();
     let names = vec!["127.0.0.1".to_owned(), "localhost".to_owned()];
     let mut cert = CertificateParams::new(names).unwrap();
-    // Python wants to see whose signature it is.
+    // Python requires the key identifier of the signer.
     cert.use_authority_key_identifier_extension = true;
     let cert = cert.signed_by(&key, &issuer).unwrap();
     fs::write(dir.path().join("ca.pem"), root.pem()).unwrap();

@@ -60,12 +60,12 @@ impl Visit for Seen {
     }
 }
 
-/// A step is one tree of spans: what a collector shows of it.
+/// A step is one tree of spans, as a collector shows it.
 #[tokio::test]
 async fn a_step_is_traced_with_its_parts() {
     let spans = Spans::default();
     let subscriber = tracing_subscriber::registry().with(spans.clone());
-    // Also of the tests beside this one.
+    // It also receives the spans of tests that run at the same time.
     tracing::subscriber::set_global_default(subscriber).unwrap();
     let server = TestServer::start().await;
     let mut agent = server.agent().await;
@@ -78,7 +78,7 @@ async fn a_step_is_traced_with_its_parts() {
         seen.fields.get("type").is_some_and(|kind| kind == "step")
             && seen.fields.get("session").is_some_and(|session| session == "traced")
     };
-    // The answer is sent before its span ends: a thread that drew it may hold a part of it for a moment.
+    // The answer is sent before its span ends: a thread that rendered it may hold a part of it for a moment.
     let has_ended = async {
         while !spans.0.lock().unwrap().values().any(|seen| is_step(seen) && seen.ended) {
             tokio::time::sleep(Duration::from_millis(5)).await;

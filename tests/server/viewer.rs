@@ -89,7 +89,7 @@ async fn a_ticket_opens_one_connection_with_the_rights_of_its_token() {
     let mut agent = connect(server.address(), &path, "wildcity.v1", None).await.ok().unwrap();
     agent.hello().await;
     agent.open(json!({ "session": "mine" })).await;
-    // It was used; and it is no token, and opens nothing else.
+    // It was used already, and it is neither a token nor valid for other routes.
     let again = connect(server.address(), &path, "wildcity.v1", None).await;
     assert_eq!(again.err(), Some(401));
     let (_, issued) = ask(&server, "POST /v1/tickets", ADMIN).await;
@@ -178,7 +178,7 @@ async fn a_session_is_watched_by_its_token_and_by_administrators() {
         let connected = connect(server.address(), path, protocol, token).await;
         assert_eq!(connected.err(), refused, "{path} {token:?}");
     }
-    // What a watcher sends ends its connection, and nothing else.
+    // A message of a watcher ends only its own connection.
     let path = "/v1/sessions/a/watch";
     let mut watcher = connect(server.address(), path, WATCH, Some(DRIVER)).await.ok().unwrap();
     watcher.send_text("{}").await;

@@ -1,5 +1,5 @@
-//! Actors in records: replayed with their assets, refused if the scenario does not have them; and what was cut out of a
-//! twin and put back as an actor.
+//! Actors in records: replayed with their assets, refused if the scenario does not have them; and an object that was
+//! cut out of a twin and put back as an actor.
 
 use std::sync::OnceLock;
 
@@ -23,7 +23,7 @@ use crate::driving::bench;
 use crate::images::{psnr, render, view_along};
 use crate::streaming::{PROFILE, eyes};
 
-/// A twin with a recorded drive of 60 m along x, and the car's asset beside it.
+/// A twin with a recorded drive of 60 m along x, and the asset of the car.
 fn straight() -> &'static (tempfile::TempDir, Catalog) {
     static STRAIGHT: OnceLock<(tempfile::TempDir, Catalog)> = OnceLock::new();
     STRAIGHT.get_or_init(|| {
@@ -55,7 +55,7 @@ fn straight() -> &'static (tempfile::TempDir, Catalog) {
     })
 }
 
-/// A record has where the actors were: in the warm-up, within plans, and when they come and go.
+/// A record has the poses of the actors: in the warm-up, within plans, and when they appear and disappear.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_recorded_episode_is_rendered_again_with_its_actors() {
     let (_, catalog) = straight();

@@ -1,4 +1,4 @@
-//! Sessions with actors: each frame draws them where they are at its time, and nothing else changes.
+//! Sessions with actors: each frame shows them at their poses at its time, and nothing else changes.
 
 use std::sync::{Arc, OnceLock};
 
@@ -70,12 +70,12 @@ fn rig(shutters: bool) -> Vec<RigCamera> {
     cameras.map(camera).collect()
 }
 
-/// A point of the road that is seen from the ego: so far ahead and to the left, in metres.
+/// A point of the road at a distance ahead and to the left of the ego, in metres.
 fn ahead(ahead_m: f64, left_m: f64) -> [f64; 3] {
     demo().at(EGO_M).transform_point(DVec3::new(ahead_m, left_m, 0.0)).to_array()
 }
 
-/// A car that drives away from the ego, and one that stands beside it.
+/// A car that drives away from the ego, and a car that stands next to it.
 pub(crate) fn actors(asset: &Value) -> Value {
     json!([
         {"name": "away", "asset": asset, "path": {"points": [ahead(12.0, 0.5), ahead(80.0, 0.5)], "speed": 9}},
@@ -119,7 +119,7 @@ async fn standing(session: &mut Session, steps: u32) -> Vec<Vec<blake3::Hash>> {
     seen
 }
 
-/// What the images of an ego that stands must be, with actors at their poses now and at the start of the exposure.
+/// Expected images of an ego at rest, with actors at their poses now and at the start of the exposure.
 fn expected(placed: &[(u16, Pose, Pose)], shutters: bool) -> Vec<blake3::Hash> {
     let views = View::of_rig(&rig(shutters), demo().at(EGO_M));
     let resident = unlimited().open("demo", None).unwrap();
@@ -186,7 +186,7 @@ async fn every_frame_draws_the_actors_of_its_time() {
     }
 }
 
-/// A camera whose frames all arrive 0.3 s late shows what it showed then, actors included.
+/// A camera whose frames all arrive 0.3 s late shows the image of that time, including the actors.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_late_frame_shows_the_actors_of_when_it_was_taken() {
     let bench = bench(unlimited());
@@ -214,7 +214,7 @@ async fn a_late_frame_shows_the_actors_of_when_it_was_taken() {
         }
         assert_ne!(truth[2][0], truth[5][0], "the car must be seen to move");
 
-        // The same from a snapshot, and in a replay of both records.
+        // The images are the same from a snapshot, and in a replay of both records.
         assert_eq!(hashes(&session.restore("two").await.unwrap()), seen[2]);
         for (step, before) in seen.iter().enumerate().skip(3) {
             let again = hashes(&session.step(demo().at(EGO_M), false).await.unwrap());
@@ -261,7 +261,7 @@ async fn without_actors_nothing_changes() {
     let wanted = standing(&mut open(&bench, "bare", bare).await, 2).await;
     let none = options(&json!([]), true);
     assert_eq!(standing(&mut open(&bench, "none", none).await, 2).await, wanted);
-    // Actors without an asset move and are told, and are not drawn.
+    // Actors without an asset move and are reported, but are not drawn.
     let boxes = options(&actors(&Value::Null), true);
     assert_eq!(standing(&mut open(&bench, "boxes", boxes).await, 2).await, wanted);
     let drawn = options(&actors(&Value::from(&*car().hash)), true);
@@ -372,7 +372,7 @@ async fn plans_and_warm_ups_draw_the_actors_of_each_frame() {
     assert_eq!(history(&last).len(), 6);
 }
 
-/// The ids of pixels are those of the scenario's actors, whatever is there.
+/// The ids of pixels are those of the scenario's actors, whichever actors are present.
 #[tokio::test(flavor = "multi_thread")]
 async fn instances_tell_whose_pixels_they_are() {
     let bench = bench(unlimited());
@@ -432,7 +432,7 @@ async fn assets_count_against_the_memory_of_twins() {
     assert!(error.contains("red-box") && error.contains("--memory-gib"), "{error}");
 }
 
-/// The oracle of these tests places what it is given.
+/// The reference of these tests places the given actors.
 #[test]
 fn the_tests_see_the_car() {
     let at = |yaw_rad: f64, x_m: f64| Pose {

@@ -28,8 +28,8 @@ pub(crate) fn bench(cache: Cache) -> Bench {
     bench_with(cache, Arc::new(ForSections(crate::images::cpu())))
 }
 
-/// The cpu backend with no memory set aside for its stages: small limits are then those of sections. Buffers hold other
-/// values before it writes them.
+/// The cpu backend without memory for intermediate buffers, so that small limits apply only to sections. Buffers hold
+/// other values before it writes them.
 struct ForSections(Cpu);
 
 impl Backend for ForSections {
@@ -283,7 +283,7 @@ async fn a_session_that_does_not_fit_is_refused_until_another_closes() {
     let probe = bench(unlimited());
     let reserved_bytes = probe.session("probe", None).await.unwrap().reserved_bytes();
     assert!(2 * reserved_bytes < all.total_bytes());
-    // What frames hold while they are rendered counts once.
+    // The renderer's intermediate buffers count once.
     let bench = bench(Cache::limited(demo().catalog(), Some(reserved_bytes * 3 / 2)));
     let first = bench.session("first", None).await.unwrap();
     let refused = bench.session("second", None).await.unwrap_err();
@@ -292,7 +292,7 @@ async fn a_session_that_does_not_fit_is_refused_until_another_closes() {
     bench.session("second", None).await.unwrap();
 }
 
-/// What the renderer holds between its stages is within what is reserved, and the budget decides how much that is.
+/// The renderer's intermediate buffers stay within the reserved memory, whose size the budget determines.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_session_reserves_what_its_frames_hold() {
     let mut reserved = Vec::new();

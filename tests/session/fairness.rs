@@ -1,4 +1,4 @@
-//! A session with small images beside sessions with the largest ones, on the cpu backend.
+//! A session with small images together with sessions with the largest ones, on the cpu backend.
 //!
 //! `FAIRNESS_SESSIONS=12 FAIRNESS_SIZE=16384x8192 FAIRNESS_SECONDS=120` is the full size: 12 answers of 400 MB.
 
@@ -74,7 +74,7 @@ async fn a_small_session_keeps_driving_beside_large_ones() {
     assert!(u64::from(width_px) * u64::from(height_px) > limits::LARGE_PIXELS);
     let bench = Arc::new(bench(Cache::new(demo().catalog())));
 
-    // The large ones alone, if the full size is asked for; and then beside the small one.
+    // The large sessions without the small one, if the full size is requested, and then with it.
     let large = async |prefix: &str, end: Instant| {
         let names = (0..sessions).map(|k| format!("{prefix}-{k}"));
         let opened = names.map(|name| session(&bench, name, width_px, height_px));
@@ -97,7 +97,7 @@ async fn a_small_session_keeps_driving_beside_large_ones() {
     if let Some(alone) = alone {
         let needed = 10 * sessions;
         assert!(alone >= needed, "{alone} large frames, compare {needed}: raise FAIRNESS_SECONDS");
-        // Of each session, the frame that is being drawn at the end is not counted.
+        // The last frame of each session, which is being rendered at the end, is not counted.
         let counted = together + sessions;
         assert!(10 * counted >= 9 * alone, "{together} large frames, {alone} alone");
     }

@@ -49,7 +49,7 @@ fn map() -> Value {
     json!({"format": "wildcity.map/1", "lanes": [lane]})
 }
 
-/// The ego climbs with the lane, and the record alone is enough to drive it again.
+/// The ego climbs with the lane, and the record is enough to drive it again.
 #[tokio::test(flavor = "multi_thread")]
 async fn the_ego_climbs_with_a_lane_and_its_record_is_driven_again() {
     let (_dir, catalog) = hill();
@@ -92,7 +92,7 @@ async fn the_ego_climbs_with_a_lane_and_its_record_is_driven_again() {
     let report = replay(&path, &catalog);
     assert_eq!((report.diverged, &report.wrong_value, report.difference), (None, &None, None));
     assert!(report.images >= 12, "{}", report.images);
-    // The map's file is gone, and its road is another in the record: the ego is then elsewhere.
+    // The map's file is deleted, and the record has a different road, so that the ego has different poses.
     drop(scenarios);
     assert_eq!(replay(&path, &catalog).diverged, None);
     let text = std::fs::read_to_string(&path).unwrap();

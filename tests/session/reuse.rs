@@ -1,4 +1,4 @@
-//! Answers have the memory of those before them: nothing of these may show.
+//! Answers reuse the memory of earlier answers, whose contents must not appear in them.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use crate::streaming::{demo, unlimited};
 const ALL_MAPS: PixelMaps =
     PixelMaps { depth: true, opacity: true, normals: true, instances: true };
 
-/// Sessions whose answers have about the same size and hold different things; one has a lens whose field ends within the
+/// Sessions whose answers have about the same size and different contents; one has a lens whose field ends within the
 /// image.
 fn sessions() -> Vec<SessionOptions> {
     let of = |encoding: Encoding, maps: PixelMaps, frames: u64| {

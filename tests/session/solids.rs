@@ -17,7 +17,7 @@ use wildcity_twin::store::{Catalog, NewVersion};
 use crate::driving::{Bench, bench, rig};
 use crate::streaming::PROFILE;
 
-/// A twin whose second version has a wall beside the recorded drive, 5 m to its left, from 20 m on.
+/// A twin whose second version has a wall 5 m to the left of the recorded drive, from 20 m on.
 fn walled() -> (TempDir, Catalog) {
     let dir = tempfile::tempdir().unwrap();
     let catalog = Catalog::open(dir.path()).unwrap();
@@ -80,7 +80,7 @@ async fn open(bench: &Bench, name: &str, version: u64) -> Session {
     session
 }
 
-/// Drives from one metre to another, 1 m a step. Returns the metre at which the twin was met.
+/// Drives from one metre to another, 1 m per step. Returns the metre at which the ego had contact with the twin.
 async fn met(session: &mut Session, from_m: u32, to_m: u32) -> Option<u32> {
     for x_m in from_m + 1..=to_m {
         session.step(at(x_m.into()), false).await.unwrap();
@@ -102,7 +102,7 @@ async fn a_switch_of_version_changes_what_the_ego_meets() {
     let met_m = met(&mut wall, 0, 30).await.unwrap();
     assert!((14..=20).contains(&met_m), "{met_m}");
 
-    // Into the version with the wall: it is met where it is in a session that was opened there.
+    // Switch to the version with the wall: the contact is at the same place as in a session that was opened with it.
     let mut session = open(&bench, "into", 1).await;
     assert_eq!(met(&mut session, 0, 5).await, None);
     session.take_snapshot("before".to_owned()).unwrap();
@@ -119,7 +119,7 @@ async fn a_switch_of_version_changes_what_the_ego_meets() {
     assert_eq!(met(&mut session, 0, 5).await, None);
     session.switch_version(Some(1)).await.unwrap();
     assert_eq!(met(&mut session, 5, 30).await, None);
-    // What the ego already stands in when it comes back is no contact.
+    // A wall that the ego overlaps already when the version changes is not a contact.
     session.switch_version(Some(2)).await.unwrap();
     assert_eq!(met(&mut session, 30, 32).await, None);
 }

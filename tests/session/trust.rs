@@ -1,8 +1,8 @@
-//! The trust of images, compared with what a twin that was recorded on one drive gets wrong.
+//! The trust of images, compared with the errors of a twin that was recorded on one drive.
 //!
-//! The demo street plays the real world. Its twin has only the Gaussians that a camera of the drive saw. A
-//! pixel is right if it differs from the world's by at most 16 of 255. Training has errors also in what it
-//! saw, so a real twin is right in fewer pixels than this one: the test gives an upper bound.
+//! The demo street stands for the real world. Its twin has only the Gaussians that a camera of the drive saw. A pixel
+//! is correct if it differs from the world's by at most 16 of 255. Training has errors in the recorded parts as well,
+//! so a real twin has fewer correct pixels than this one: the test gives an upper bound.
 
 use glam::{DQuat, DVec3};
 use wildcity_generate::{Street, StreetSettings};
@@ -28,7 +28,7 @@ struct Pair {
     cpu: Cpu,
 }
 
-/// Means over all cameras at some places: the share of right pixels, and the trust with its parts.
+/// Means over all cameras at some places: the share of correct pixels, and the trust with its parts.
 #[derive(Clone, Copy, Debug)]
 struct Measured {
     right: f64,

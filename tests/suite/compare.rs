@@ -115,7 +115,7 @@ async fn a_run_of_a_worse_driver_is_worse_and_the_other_way_round_better() {
     assert_eq!((better.worse, changes(&better)), (false, vec![Change::Better; 4]));
     assert!(better.conclusion().starts_with("not worse"), "{}", better.conclusion());
 
-    // What is read from a file is what was driven, to the last digit.
+    // Values that are read from a file equal the driven ones to the last digit.
     let same = compare(&before, &log, &[]);
     assert_eq!((same.worse, changes(&same)), (false, vec![Change::Same; 4]));
     let mut compared = same.scores.values().filter(|score| score.pairs > 0).peekable();
@@ -135,7 +135,7 @@ async fn a_run_of_a_worse_driver_is_worse_and_the_other_way_round_better() {
     let error = CompareError::NoValue { name: "a".to_owned() };
     assert_eq!(Ending::of(&log, Some(&Err(error))).code, ExitCode::Usage);
 
-    // What can be said before anything is driven.
+    // Comparisons that can be checked before anything is driven.
     let cases = bench.cases(&bench.path("suite.json")).unwrap();
     let check = |before: &SuiteResult, tolerances: &[&str], cases: &[wildcity_suite::Case]| {
         let checked = Comparison::check(before, cases, &rule(tolerances));
@@ -232,7 +232,7 @@ fn scores_are_held_against_their_tolerance_in_their_direction() {
     let lost = compare(&before, &made(&[80.0], &[]), &[]);
     assert_eq!((lost.scores[DRIVING].pairs, lost.scores[DRIVING].only_before), (1, 3));
     assert!(lost.to_text().contains("3 pairs have it before alone"), "{}", lost.to_text());
-    // No value in both runs is no sameness.
+    // Missing values in both runs do not count as equal.
     let gone = compare(&before, &made(&[], &[]), &[]);
     assert_eq!((gone.scores[DRIVING].difference, gone.scores[DRIVING].pairs), (None, 0));
     assert_eq!(gone.scores[DRIVING].direction, Direction::Unclear);
@@ -288,7 +288,7 @@ fn what_is_not_the_same_episode_is_not_compared() {
     timed.dt_us = Some(100_000);
     assert!(error(&timed, slower, &[]).contains("steps took 100000 µs before and take 50000 µs"));
     assert!(error(&one, Made::passing(1).value(), &["driving=1"]).contains("no such score"));
-    // Of a run that drove nothing, there is nothing to say about scores.
+    // A run without driven episodes has no scores to compare.
     let mut empty = Made::passing(1).value();
     empty["episodes"][0]["scores"] = json!({});
     empty["episodes"][0]["status"] = json!("technical");
@@ -315,7 +315,7 @@ fn scores_of_two_versions_are_not_compared() {
     let gone = compare(&before.result(), &renamed(DRIVING, "bench2drive.new@1"), &[]);
     let wanted = [format!("{DRIVING} before alone"), "bench2drive.new@1 now alone".to_owned()];
     assert_eq!(gone.scores_not_compared, wanted);
-    // A flip of the verdict could be one of its rules.
+    // A changed verdict could be caused by its rules.
     let later = renamed(VERDICT, "wildcity.verdict@2");
     let error = Comparison::new(&before.result(), &later, &Rule::default()).unwrap_err();
     assert!(matches!(error, CompareError::VerdictVersion { .. }), "{error}");

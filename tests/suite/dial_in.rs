@@ -1,4 +1,4 @@
-//! Agents that are commands. The command is this test's own binary, which drives if it is told to.
+//! External agents. The command is the binary of this test, which drives if an environment variable is set.
 
 use std::env;
 
@@ -16,7 +16,7 @@ fn command(manner: &str) -> AgentChoice {
     AgentChoice::Command { name: manner.to_owned(), line }
 }
 
-/// Not a test: the agent, if the suite has started this binary as one.
+/// Not a test: the agent, if the suite has started this binary.
 #[test]
 fn the_agent() {
     let Ok(open) = env::var("WILDCITY_OPEN") else { return };
@@ -98,7 +98,7 @@ async fn an_agent_that_drives_nothing_is_quoted() {
         let error = &result.episodes[0].errors[0];
         assert!(error.message.contains(status), "{}", error.message);
         assert!(error.message.contains("drove nothing: it must connect"), "{}", error.message);
-        // Nothing is waited for that cannot come: the record of an agent that never reset its session.
+        // There is no wait for the record of an agent that never reset its session.
         assert!(begin.elapsed() < wildcity_suite::limits::CLOSE_WAIT, "{:?}", begin.elapsed());
         if manner == "fails" {
             assert!(error.stderr.ends_with("line 29\nline 30"), "{}", error.stderr);
@@ -125,7 +125,7 @@ async fn a_command_that_is_not_there_ends_the_run_at_once() {
         let names = ["log, stand or idm", "egodriver:HOST:PORT", line];
         assert!(names.iter().all(|name| error.contains(name)), "{error}");
     }
-    // A command that drove, and did not find something then, is another matter.
+    // An agent that drove, and then did not find a command, is a different case.
     let binary = env::current_exe().unwrap();
     let test = "dial_in::the_agent --exact --nocapture";
     let line = format!("AGENT_MANNER=follows {} {test}; no-such-clean-up", binary.display());

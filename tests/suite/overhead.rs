@@ -1,4 +1,4 @@
-//! What a run costs beside rendering.
+//! Overhead of a run in addition to rendering.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -42,8 +42,8 @@ impl Backend for Timed {
     }
 }
 
-/// One camera of 1440 x 928 px on the demo street, with one thread and one episode at a time: what is not rendering adds up.
-/// Around a step of 11 ms, as of 160 x 103 px, it is a tenth.
+/// One camera of 1440 x 928 px on the demo street, with one thread and one episode at a time: the overhead of all steps
+/// adds up. With steps of 11 ms, as at 160 x 103 px, it is a tenth.
 #[tokio::test(flavor = "multi_thread")]
 async fn a_run_takes_less_than_five_percent_more_than_its_rendering() {
     let bench = Bench::new();
@@ -68,7 +68,7 @@ async fn a_run_takes_less_than_five_percent_more_than_its_rendering() {
     });
     let suite = bench.write("suite.json", &suite);
     let mut shares = Vec::new();
-    // Other programs run beside this one: one undisturbed attempt is enough.
+    // Other programs may run at the same time, so one undisturbed attempt is enough.
     for attempt in 0..8 {
         let cpu = Cpu::new(1, Simd::Best).unwrap();
         let timed = Arc::new(Timed { cpu, spent: Mutex::default() });

@@ -1,4 +1,4 @@
-//! Runs with the built-in agents, and what is written about them.
+//! Runs with the built-in agents, and their output files.
 
 use serde_json::json;
 use wildcity_episode::{EpisodeFile, diff, export_file, result};
@@ -250,7 +250,7 @@ fn exit_codes_are_technical_before_driving() {
     assert_eq!(ending.code, ExitCode::Passed);
     assert!(ending.why.contains("of 4 episodes 1 failed"), "{}", ending.why);
     assert!(ending.why.ends_with("at least 0.342, as wanted (0.3)"), "{}", ending.why);
-    // The failure stays one, and the report says why the exit code is 0.
+    // The failure is still reported, and the report says why the exit code is 0.
     let xml = junit(&rated, &ending);
     assert!(xml.contains("failures=\"1\"") && xml.contains("\"exit_code\" value=\"0\""), "{xml}");
     let html = page(&rated, &ending, &[], &bench.path("log"));

@@ -28,7 +28,7 @@ pub(crate) struct Bench {
 }
 
 impl Bench {
-    /// The twin `street`: 200 m at 10 m/s along x, posts beside it, two cameras.
+    /// The twin `street`: 200 m at 10 m/s along x, posts next to it, two cameras.
     pub(crate) fn new() -> Self {
         let dir = tempfile::tempdir().unwrap();
         let count = 400;

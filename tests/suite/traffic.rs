@@ -1,4 +1,4 @@
-//! Suites with actors: contacts, the verdict, and what the record says.
+//! Suites with actors: contacts, the verdict, and the record.
 
 use serde_json::{Value, json};
 use wildcity_episode::{EpisodeFile, Event, result};
@@ -37,7 +37,7 @@ async fn a_driver_that_ignores_the_pedestrian_fails_for_contact() {
     let html = page(&failed, &Ending::of(&failed, None), &shown, &bench.path("log"));
     assert!(html.contains("contact.pedestrian with walker") && html.contains("image/jpeg"));
 
-    // The same scenario without its actors is passed: it is the scenario's own test.
+    // The same scenario without its actors must pass, which checks the scenario itself.
     let bare = drive(&bench, BuiltIn::Log, true, "bare").await;
     assert_eq!(bare.counts.passed, 1, "{}", bare.to_json());
 }
@@ -103,7 +103,7 @@ async fn a_driver_that_leaves_the_road_meets_the_twin() {
     let bench = Bench::new();
     let mut value = scenario("posts", &json!({ "model": "kinematic", "speed": 10.0 }));
     value["end"] = json!({ "time_s": 4.0, "contact": "static" });
-    // Onto the posts, which stand 5 m beside the drive.
+    // Onto the posts, which have a lateral offset of 5 m from the drive.
     let points = [[20.0, 0.0, 0.0], [30.0, 0.0, 0.0], [45.0, 5.0, 0.0], [90.0, 5.0, 0.0]];
     value["route"] = json!({ "points": points });
     let path = bench.write("posts.json", &value);
@@ -111,7 +111,7 @@ async fn a_driver_that_leaves_the_road_meets_the_twin() {
         let cases = bench.cases(&path).unwrap();
         run(bench.settings(AgentChoice::BuiltIn(agent), 1, out), cases).await.unwrap()
     };
-    // `idm` follows the route, `log` the drive: what the drive meets is free.
+    // `idm` follows the route, `log` the drive, on which no contact counts.
     let off_road = drive(BuiltIn::Idm, "idm").await;
     let episode = &off_road.episodes[0];
     assert_eq!(episode.faults[0].fault, "contact.static", "{}", off_road.to_json());

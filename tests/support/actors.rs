@@ -78,7 +78,7 @@ pub(crate) fn views() -> Vec<(&'static str, View)> {
     ]
 }
 
-/// The twin, three actors in it (two share a chunk, two overlap), and the same as one set of Gaussians.
+/// The twin, three actors in it (two share a chunk, two overlap), and the same scene as one set of Gaussians.
 pub(crate) fn street_with_actors() -> (Scene, Scene) {
     let mut twin = street(10_000, 1, 31);
     let car = actor(3_000, 3, 5);
@@ -121,7 +121,7 @@ pub(crate) fn check_merged(backend: &dyn Backend) {
     check_merged_views(backend, views());
 }
 
-/// The same through every lens and with every shutter.
+/// As [`check_merged`], for every lens and shutter.
 pub(crate) fn check_merged_lenses(backend: &dyn Backend) {
     check_merged_views(backend, lens_views());
 }
@@ -143,8 +143,8 @@ fn check_merged_views(backend: &dyn Backend, views: Vec<(impl std::fmt::Display,
     }
 }
 
-/// Asserts that what an actor's motion does to an image with a rolling shutter is what the opposite motion of the
-/// camera does.
+/// Asserts that in an image with a rolling shutter, the motion of an actor has the same effect as the opposite motion
+/// of the camera.
 pub(crate) fn check_motion(backend: &dyn Backend) {
     let chunk = chunk_of(&actor(3_000, 3, 7));
     let profile = RenderProfile::default();
@@ -157,7 +157,8 @@ pub(crate) fn check_motion(backend: &dyn Backend) {
         };
         let truth = render_one(backend, &still, &profile, rolling);
 
-        // At the start the actor lies where the moving camera sees it, seen from the camera at rest.
+        // At the start of the exposure, the actor has the same pose relative to the camera at rest as to the moving
+        // camera.
         let world_from_first = shutter.world_from_camera_first;
         let world_from_actor_at_start =
             rolling.world_from_camera * world_from_first.inverse() * pose;
@@ -194,7 +195,7 @@ pub(crate) fn check_light(backend: &dyn Backend, reference: &dyn Backend) {
         placed.tint = [1.5, 0.5, 0.25];
         placed.shadow = shadow;
     }
-    // Above the ground by what the wheels of a parked car do not touch.
+    // Raised above the ground by the gap under a parked car.
     lit.placed[2].world_from_actor.position_m.y += 0.1;
     let profile = RenderProfile::default();
     for (name, view) in views() {
@@ -213,8 +214,8 @@ pub(crate) fn check_light(backend: &dyn Backend, reference: &dyn Backend) {
     }
 }
 
-/// Asserts that frames leave nothing behind: what a backend drew with actors does not change a frame without them,
-/// nor do actors that no view sees.
+/// Asserts that frames do not affect later frames: a frame with actors does not change a frame without them. Actors
+/// outside of all views change nothing either.
 pub(crate) fn check_ghosts(backend: &dyn Backend) {
     let (scene, _) = street_with_actors();
     let twin = Scene { placed: Vec::new(), ..scene.clone() };
@@ -246,8 +247,8 @@ pub(crate) fn instances(backend: &dyn Backend, scene: &Scene, view: View) -> (Ve
     (ids, opacity)
 }
 
-/// Asserts that instance ids are those of the reference backend, that they name what is seen, and that asking for them
-/// changes no other image.
+/// Asserts that instance ids are those of the reference backend, that they belong to the visible actors, and that
+/// requesting them changes no other image.
 pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
     let (mut scene, _) = street_with_actors();
     scene.placed[2].actor = 40;
@@ -281,7 +282,7 @@ pub(crate) fn check_instances(backend: &dyn Backend, reference: &dyn Backend) {
     }
 }
 
-/// Asserts that layers, seen one behind the other, give the instance ids of the vectors.
+/// Asserts that layers behind each other give the instance ids of the vectors.
 pub(crate) fn check_instance_vectors(backend: &dyn Backend) {
     let Some(cases) = cases("own", "instance") else { return };
     for case in cases {
@@ -294,7 +295,7 @@ pub(crate) fn check_instance_vectors(backend: &dyn Backend) {
         assert_eq!(f64::from(id), number(&case.expected["instance"]), "{}", case.name);
         let wanted = number(&case.expected["transmittance"]);
         assert!((left - wanted).abs() < 1e-6, "{}: {left}, not {wanted}", case.name);
-        // What is behind changes nothing.
+        // Layers behind it change nothing.
         let behind = decides.map_or(&[][..], |decides| &after[decides..]);
         assert!(behind.iter().all(|later| later.0 == id), "{}: {after:?}", case.name);
     }

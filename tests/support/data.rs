@@ -1,4 +1,4 @@
-//! The real data: `$WILDCITY_DATA`, or `../shared/data` beside the project.
+//! The real data: `$WILDCITY_DATA`, or `../shared/data` next to the project.
 
 use std::io::Write;
 use std::path::PathBuf;

@@ -91,7 +91,7 @@ pub(crate) fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// An SPZ file (Niantic) of version 4, with an extension that no reader knows.
+/// An SPZ file (Niantic) of version 4, with an unknown extension.
 pub(crate) fn spz4(g: &Gaussians) -> Vec<u8> {
     let streams = spz_attributes(g, 4).into_iter().filter(|stream| !stream.is_empty());
     let streams: Vec<_> = streams.collect();
@@ -201,8 +201,8 @@ pub(crate) fn webp(pixels: &[[u8; 4]], width_px: usize) -> Vec<u8> {
 /// The files of a folder; the first one refers to the others.
 pub(crate) type Files = Vec<(String, Vec<u8>)>;
 
-/// PlayCanvas' SOG: every Gaussian's colours of higher degrees are an entry of their own, so at most
-/// 65,536 of them. Version 1 has ranges, version 2 codebooks of evenly spaced values.
+/// PlayCanvas' SOG: the colours of higher degrees of every Gaussian are a separate entry, so that there are at most
+/// 65,536 Gaussians. Version 1 has ranges, version 2 codebooks of evenly spaced values.
 pub(crate) fn sog(g: &Gaussians, version: u32) -> Files {
     let logarithm = |m: f64| m.signum() * m.abs().ln_1p();
     let range = |values: &mut dyn Iterator<Item = f64>| {

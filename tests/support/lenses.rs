@@ -1,4 +1,4 @@
-//! A camera of every model, and what its images must show.
+//! A camera of every model, and checks of its images.
 
 use glam::{DQuat, DVec2, DVec3};
 use wildcity_render::compare::gaussians::{GaussianSpec, scene_of};
@@ -82,8 +82,8 @@ pub(crate) fn sideways_rolling_view() -> View {
     View { rolling_shutter: Some(rolling_shutter), ..View::new(camera, Pose::IDENTITY) }
 }
 
-/// Asserts that small balls, `apart_m` apart in a plane 2 m ahead, each rendered alone, appear at the pixels
-/// that the camera model gives. Returns the number of visible balls.
+/// Asserts that small balls, `apart_m` apart in a plane 2 m ahead, each rendered separately, appear at the pixels that
+/// the camera model gives. Returns the number of visible balls.
 pub(crate) fn check_projections(
     backend: &dyn Backend,
     name: &str,

@@ -1,4 +1,4 @@
-//! Graphs that stand in for models: each does one thing.
+//! Graphs that replace models in tests. Each has one property.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -50,7 +50,7 @@ pub(crate) fn six_channels() -> Vec<u8> {
     rgb(vec![node("Concat", &["image", "image"], &["repaired"], &[int("axis", 1)])], Vec::new())
 }
 
-/// A convolution of `side` x `side`, with a stride of `stride` there and back. Its halo is known.
+/// A convolution of `side` x `side`, with a stride of `stride` down and up again. Its halo is known.
 pub(crate) fn convolution(side: usize, stride: usize) -> Vec<u8> {
     let pad = (side / 2) as u64;
     // Depthwise: each channel by itself, weights that are all different.
@@ -136,12 +136,12 @@ pub(crate) fn nan_if_doubtful() -> Vec<u8> {
     .onnx()
 }
 
-/// A loop with as many iterations as `trips` says.
+/// A loop with `trips` iterations.
 fn add_in_a_loop(nodes: Vec<Message>, constants: Vec<Message>) -> Vec<u8> {
     graph_in_a_loop(nodes, constants, Vec::new())
 }
 
-/// The same with more inputs than the image.
+/// As [`add_in_a_loop`], with inputs in addition to the image.
 fn graph_in_a_loop(
     mut nodes: Vec<Message>,
     mut constants: Vec<Message>,

@@ -11,7 +11,7 @@ use wildcity_repair::{LoadOptions, Model, RepairError};
 
 use crate::root::root;
 
-/// The runtime library. Panics with what to do if there is none.
+/// The runtime library. Panics with the remedy if there is none.
 pub(crate) fn library() -> PathBuf {
     if let Some(path) = std::env::var_os("ORT_DYLIB_PATH").filter(|path| !path.is_empty()) {
         return path.into();

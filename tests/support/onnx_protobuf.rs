@@ -98,7 +98,7 @@ pub(crate) fn port(name: &str, data_type: u64, dims: &[Dim]) -> Message {
     Message::default().text(1, name).message(2, &Message::default().message(1, &tensor))
 }
 
-/// What a graph has.
+/// Contents of a graph.
 #[derive(Default)]
 pub(crate) struct Graph {
     pub(crate) nodes: Vec<Message>,

@@ -34,7 +34,7 @@ impl Reply {
     }
 }
 
-/// Sends bytes as they are on a connection of their own, and reads until the server closes.
+/// Sends bytes unchanged on a new connection, and reads until the server closes.
 pub(crate) async fn send(address: SocketAddr, head: &str, body: &[u8]) -> Reply {
     let mut stream = TcpStream::connect(address).await.unwrap();
     let head = format!("{}\r\nHost: localhost\r\nConnection: close\r\n\r\n", head.trim_end());
@@ -97,7 +97,7 @@ pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
     }
 }
 
-/// Uploads a scene, pushes it as `change` says, and waits for the end.
+/// Uploads a scene, pushes it with the options that `change` sets, and waits for the end.
 pub(crate) async fn push(
     server: &TestServer,
     gaussians: &Gaussians,

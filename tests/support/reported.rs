@@ -18,7 +18,7 @@ pub(crate) fn commit(dir: &std::path::Path, trajectories: Vec<Trajectory>) -> Ar
     commit_reaching(dir, trajectories, None)
 }
 
-/// The same, drawn up to a distance from each camera, in metres.
+/// As [`commit`], drawn up to a distance from each camera, in metres.
 pub(crate) fn commit_reaching(
     dir: &std::path::Path,
     trajectories: Vec<Trajectory>,
@@ -27,7 +27,7 @@ pub(crate) fn commit_reaching(
     let catalog = Catalog::open(dir).unwrap();
     let street = wildcity_generate::canyon(30_000, &mut |_, _| {});
     let new = NewVersion {
-        // Full detail, so that other errors are measured alone.
+        // Full detail, so that only other errors are measured.
         profile: RenderProfile { tau_px: 0.0, reach_m, ..RenderProfile::DEFAULT },
         rig: Some(rig()),
         trajectories,

@@ -115,7 +115,7 @@ fn value(g: &Gaussians, index: usize, name: &str) -> f64 {
 /// A tensor of a safetensors file: name, shape, values.
 pub(crate) type Tensor = (&'static str, Vec<usize>, Vec<f64>);
 
-/// What a gsplat checkpoint holds.
+/// Tensors of a gsplat checkpoint.
 pub(crate) fn gsplat_tensors(g: &Gaussians) -> Vec<Tensor> {
     let (n, k) = (g.len(), sh::coefficients(g.sh_degree));
     let double = |values: &[f32]| values.iter().map(|&v| f64::from(v)).collect::<Vec<_>>();

@@ -29,7 +29,7 @@ use wildcity_twin::store::{Catalog, NewVersion};
 /// How long a test waits for anything before it fails.
 pub(crate) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// A backend that paints a pattern that depends on the pose of the camera alone.
+/// A backend that paints a pattern that depends only on the pose of the camera.
 #[derive(Debug, Default)]
 pub(crate) struct Painter {
     /// Milliseconds that a frame takes.
@@ -54,7 +54,7 @@ impl Painter {
         (mixed >> 56) as u8
     }
 
-    /// Waits for this number of frames to begin, from the first on.
+    /// Waits until this number of frames has begun since the start.
     pub(crate) async fn begins(&self, frames: u64) {
         let beginning = async {
             while self.begun.load(Ordering::SeqCst) < frames {
@@ -279,7 +279,7 @@ impl TestServer {
     }
 }
 
-/// A client without a library: it sends exactly what the test says.
+/// A client without a library, which sends exactly the bytes of the test.
 pub(crate) struct Agent {
     pub(crate) socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
     pub(crate) seq: u64,

@@ -2,7 +2,7 @@
 
 use crate::scene_files::Tensor;
 
-/// A small network of gentle weights; another one for every `seed`.
+/// A small network with small weights, which depend on `seed`.
 pub(crate) fn tensors(seed: usize) -> Vec<Tensor> {
     let tensor = |name: &'static str, shape: &[usize]| {
         let count: usize = shape.iter().product();

@@ -22,7 +22,7 @@ pub(crate) type Place = ([i32; 2], u8, u8);
 pub(crate) enum Fault {
     /// It cannot be read.
     Unreadable,
-    /// Its bytes differ from what was committed.
+    /// Its bytes differ from the committed ones.
     Damaged,
     /// Reading it panics.
     Crash,

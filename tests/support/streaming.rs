@@ -20,7 +20,7 @@ use crate::images::{cpu, render, view_along};
 /// How long a test waits for anything before it fails.
 pub(crate) const TEST_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// The profile: a frame draws what is within 120 m, so that a drive needs different parts over time.
+/// The profile: a frame draws sections within 120 m, so that a drive needs different parts over time.
 pub(crate) const PROFILE: RenderProfile =
     RenderProfile { reach_m: Some(120.0), ..RenderProfile::DEFAULT };
 
@@ -94,7 +94,7 @@ pub(crate) fn bytes(resident: &Resident, needed: &[SectionRef]) -> u64 {
     needed.iter().map(of).sum()
 }
 
-/// What a frame of the demo street needs at a pose, in bytes.
+/// Memory that a frame of the demo street needs at a pose, in bytes.
 pub(crate) fn need_bytes(resident: &Resident, world_from_rig: Pose) -> u64 {
     bytes(resident, &resident.demand(&eyes(&views(world_from_rig)), &PROFILE))
 }

@@ -1,4 +1,4 @@
-//! The vectors of contacts and scores in the real data: inputs, and what the published definitions make of them.
+//! The vectors of contacts and scores in the real data: inputs, and results of the published definitions.
 
 #![allow(dead_code, reason = "every test binary uses another part of it")]
 
@@ -11,16 +11,16 @@ use crate::data;
 pub(crate) struct Case {
     /// Its name.
     pub(crate) name: String,
-    /// What goes in.
+    /// The input.
     pub(crate) input: Value,
-    /// What must come out.
+    /// The expected result.
     pub(crate) expected: Value,
 }
 
 /// The cases of `scores/<file>.json` whose names start with `prefix`; `None` without the data.
 ///
 /// # Panics
-/// If there is no such case: then the test would assert nothing.
+/// If there is no such case, because the test would then assert nothing.
 pub(crate) fn cases(file: &str, prefix: &str) -> Option<Vec<Case>> {
     let path = data::real(&format!("scores/{file}.json"))?;
     let text = std::fs::read_to_string(path).unwrap();

@@ -1,4 +1,5 @@
-//! Measures steps per second of several sessions: on one connection with `step_many`, and on as many connections.
+//! Measures steps per second of several sessions: on one connection with `step_many`, and on one connection per
+//! session.
 //!
 //! Each session has one camera of 96 x 60 px with raw images. The two ways take turns, and must give the same images.
 //!
@@ -116,7 +117,7 @@ async fn many_connections(
     Ok((seconds, hashes))
 }
 
-/// A pose 0.1 m further with each step, and beside the start by the session's number.
+/// A pose 0.1 m further with each step, and offset from the start by the number of the session.
 fn ahead(start: Pose, step: u32, session: usize) -> Pose {
     let [x, y, z] = start.xyz;
     let forward_m = 0.1 * f64::from(step + 1);

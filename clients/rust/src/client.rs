@@ -57,9 +57,9 @@ pub struct Client {
     welcome: Welcome,
     /// Names of the open sessions.
     sessions: Vec<String>,
-    /// The one that calls are for.
+    /// The session that calls are for.
     selected: Option<String>,
-    /// Number of the first request of a connection after those that begin it.
+    /// Number of the first request of a connection after `hello` and `share_memory`.
     first_seq: u64,
     next_seq: u64,
     answer_timeout: Duration,
@@ -100,13 +100,13 @@ impl Movement {
     }
 }
 
-/// How a step is made, beside its movement.
+/// Options of a step in addition to its movement.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepOptions {
     /// For how long the movement, a trajectory or an action, is followed, in microseconds: a whole number of
     /// steps. One step if `None`.
     pub until_us: Option<i64>,
-    /// What the agent notes about the step, for the record: any JSON of at most 65,536 bytes.
+    /// Notes of the agent about the step, for the record: any JSON of at most 65,536 bytes.
     pub notes: Option<serde_json::Value>,
     /// Whether the episode ends with this step.
     pub terminate: bool,
@@ -211,8 +211,8 @@ impl Client {
     /// (`metadata().seq` of an observation).
     ///
     /// # Errors
-    /// [`Code::UnknownSession`] if the session ended or its time to resume is over. After any error but that
-    /// one the connection is lost.
+    /// [`Code::UnknownSession`] if the session ended or its time to resume is over. After any other error the
+    /// connection is lost.
     pub async fn resume(&mut self, session: &str, last_seq: u64) -> Result<Resumed, ClientError> {
         self.resume_with(session, &[], last_seq).await
     }
@@ -389,11 +389,11 @@ impl Client {
         self.exchange_for_observation(&request).await
     }
 
-    /// Steps several sessions of this connection, 1 to 64, in one message. A session whose step is refused does not stop
-    /// the others. What they gave comes in the order of `steps`.
+    /// Steps several sessions of this connection, 1 to 64, in one message. A session whose step is refused does not
+    /// stop the others. The results are in the order of `steps`.
     ///
     /// # Errors
-    /// [`ClientError::Refused`] if the list itself is refused: then no session was stepped. Otherwise as
+    /// [`ClientError::Refused`] if the list itself is refused; then no session was stepped. Otherwise as
     /// [`Client::step`].
     pub async fn step_many(
         &mut self,
@@ -442,7 +442,7 @@ impl Client {
         self.reset_with(ResetOptions { seed, start, ..ResetOptions::default() }).await
     }
 
-    /// As [`Client::reset`], with dynamics or a speed for this episode alone.
+    /// As [`Client::reset`], with dynamics or a speed for only this episode.
     ///
     /// # Errors
     /// As [`Client::step`].
@@ -513,7 +513,7 @@ impl Client {
         result
     }
 
-    /// Continues the sessions on a new connection, of which this is the first request after those that begin it.
+    /// Resumes sessions on a new connection. Must be its first request after `hello` and `share_memory`.
     async fn resume_sessions(&mut self, last_seq: u64) -> Result<Resumed, ClientError> {
         let mut connection = self.take_connection()?;
         let mut names = self.sessions.iter().cloned();
@@ -555,7 +555,7 @@ impl Client {
         }
     }
 
-    /// The name of the selected session for a request, which needs one only if there are several.
+    /// The name of the selected session for a request, which needs a name only if there are several sessions.
     fn named(&self) -> Option<String> {
         self.selected.clone().filter(|_| self.sessions.len() > 1)
     }
@@ -598,7 +598,7 @@ impl Client {
     }
 }
 
-/// Connects, says `hello`, and shares memory if that is asked for.
+/// Connects, says `hello`, and shares memory if this is requested.
 async fn begin(endpoint: &Endpoint, name: &str) -> Result<(Connection, Welcome), ClientError> {
     let mut connection = endpoint.connect().await?;
     let welcome = hello(&mut connection, name).await?;

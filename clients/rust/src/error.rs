@@ -20,9 +20,9 @@ pub enum ClientError {
     /// The server refused the request. Nothing changed, and the request can be sent again.
     #[error("refused, {code:?}: {message}")]
     Refused {
-        /// What went wrong.
+        /// Code of the error.
         code: Code,
-        /// What went wrong and how to fix it, in words.
+        /// Description of the error and of its remedy.
         message: String,
         /// The field at fault, for example `pose.q[2]`.
         field: Option<String>,

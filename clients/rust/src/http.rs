@@ -1,7 +1,7 @@
 //! The HTTP client: pushes and versions. Uploads are in `upload`.
 //!
-//! Each request opens a connection of its own. There are few of them, and a connection that is kept open may
-//! be the one that a broken network cuts.
+//! Each request opens a new connection, because requests are rare, and a connection that is kept open may be cut by a
+//! broken network.
 
 use std::error::Error;
 use std::fmt::{self, Display};
@@ -74,16 +74,16 @@ pub enum HttpError {
     Refused {
         /// HTTP status.
         status: u16,
-        /// What went wrong; `None` if the answer is not of this protocol.
+        /// Code of the error; `None` if the answer is not of this protocol.
         code: Option<Code>,
-        /// What went wrong and how to fix it, in words.
+        /// Description of the error and of its remedy.
         message: String,
         /// The cells at fault, as (x, y), if the error concerns cells.
         cells: Vec<[i32; 2]>,
-        /// The offset at which an upload must continue, in bytes, if the request had another one.
+        /// The offset at which an upload must continue, in bytes, if the request had a different one.
         offset: Option<u64>,
     },
-    /// The answer is not what the protocol defines.
+    /// The answer does not conform to the protocol.
     #[error("cannot read the answer of {server}: {reason}")]
     Answer {
         /// The server.
@@ -318,7 +318,7 @@ fn parse_server(text: &str) -> Option<Url> {
     (is_http && url.has_host() && is_plain && is_anonymous).then_some(url)
 }
 
-/// What went wrong, with its causes: the error itself says only that a request failed.
+/// Describes an error with its causes: the error itself only says that a request failed.
 fn describe(error: reqwest::Error) -> String {
     let error = error.without_url();
     let mut causes = Vec::new();

@@ -25,8 +25,8 @@
 //! # fn my_policy(_: &[u8], pose: Pose) -> Pose { pose }
 //! ```
 //!
-//! The examples beside this package follow a trajectory and push a checkpoint. Units, frames, error codes and
-//! limits are in `protocol/README.md` of the project.
+//! The examples of this package follow a trajectory and push a checkpoint. Units, frames, error codes and limits are in
+//! `protocol/README.md` of the project.
 
 mod actors;
 mod client;

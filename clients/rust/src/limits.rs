@@ -29,8 +29,8 @@ pub const UPLOAD_BYTES_PER_S: u64 = 1 << 20;
 /// Largest HTTP answer that a client reads: the report of a push to 100,000 cells takes 5 MB.
 pub const HTTP_ANSWER_BYTES: usize = 64 << 20;
 
-/// How many attempts in a row may fail before a client gives up. An attempt that transfers at least one
-/// byte starts the count again.
+/// How many successive attempts may fail before a client gives up. An attempt that transfers at least one byte starts
+/// the count again.
 pub const HTTP_ATTEMPTS: u32 = 6;
 
 /// How long a client waits before it repeats a failed attempt. The wait doubles with every further attempt

@@ -8,12 +8,12 @@ use wildcity_protocol::observation::{ManyMetadata, SessionAnswer, SessionRefusal
 use crate::error::FrameError;
 use crate::observation::{Observation, check_header_length};
 
-/// What the step of one session gave.
+/// Result of the step of one session.
 #[derive(Clone, Debug)]
 pub struct Stepped {
     /// Name of the session.
     pub session: String,
-    /// Its observation, or why its step was refused: then the session is as it was before.
+    /// Its observation, or why its step was refused: then the session is unchanged.
     pub result: Result<Observation, SessionRefusal>,
 }
 

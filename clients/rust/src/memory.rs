@@ -23,7 +23,7 @@ pub(crate) struct SharedMemory {
     size: u64,
 }
 
-/// What a server says of the memory that it offers.
+/// The server's description of the memory that it offers.
 pub(crate) struct Offer {
     pub(crate) path: String,
     pub(crate) target: String,
@@ -44,7 +44,8 @@ impl SharedMemory {
                 offer.path
             ))
         };
-        // The server of another machine or container may name what is another file here: it is not opened.
+        // If the server is on another machine or in another container, its path may be of another file, which must not
+        // be opened.
         let found = std::fs::read_link(&offer.path).map_err(|error| failed(error.to_string()))?;
         if found.as_os_str() != offer.target.as_str() {
             return Err(failed(format!("it is {}, not {}", found.display(), offer.target)));

@@ -18,10 +18,10 @@ const HISTORY_ROT: &str = "ego.history_rot";
 const IMU: &str = "sensor.imu";
 const WHEEL_SPEED: &str = "sensor.wheel_speed";
 
-/// What the ego sees at one time: metadata, images, and the ego's past poses.
+/// An observation of the ego at one time: metadata, images, and the ego's past poses.
 ///
-/// [`Observation::decode`] checks everything but two things: the contents of JPEG and PNG files, which are
-/// decoded on demand by [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
+/// [`Observation::decode`] checks everything except the contents of JPEG and PNG files, which are decoded on demand by
+/// [`ImageView::rgb`], and the hashes, which [`Observation::verify`] compares.
 ///
 /// ```
 /// use wildcity_client::Observation;
@@ -56,7 +56,7 @@ impl Observation {
     /// Decodes a binary frame.
     ///
     /// # Errors
-    /// The frame is not in safetensors layout, or a tensor is missing or differs from what the metadata says.
+    /// The frame is not in safetensors layout, or a tensor is missing or differs from the metadata.
     pub fn decode(frame: impl Into<Bytes>) -> Result<Self, FrameError> {
         let frame = frame.into();
         check_header_length(&frame)?;
@@ -72,7 +72,7 @@ impl Observation {
         Ok(observation)
     }
 
-    /// Everything that the observation holds beside its tensors.
+    /// All values of the observation except its tensors.
     pub fn metadata(&self) -> &ObservationMetadata {
         &self.metadata
     }
@@ -122,8 +122,8 @@ impl Observation {
         floats(self.tensor_bytes(HISTORY_ROT))
     }
 
-    /// What the inertial measurement unit measured, f32 `[n, 6]`: specific force in m/s² and angular velocity in rad/s,
-    /// in the rig's axes, for each step since the observation before. Empty unless the session asked for it.
+    /// Samples of the inertial measurement unit, f32 `[n, 6]`: specific force in m/s² and angular velocity in rad/s, in
+    /// the rig's axes, for each step since the previous observation. Empty unless the session asked for it.
     pub fn imu(&self) -> Cow<'_, [f32]> {
         floats(self.tensor_bytes(IMU))
     }
@@ -168,7 +168,7 @@ impl Observation {
     fn check_tensors(&self) -> Result<(), FrameError> {
         self.check_tensor(HISTORY_XYZ, Dtype::F32, &[HISTORY_POSES, 3])?;
         self.check_tensor(HISTORY_ROT, Dtype::F32, &[HISTORY_POSES, 3, 3])?;
-        // These are there only if the session asked for them.
+        // These exist only if the session asked for them.
         for (name, columns) in [(IMU, &[6][..]), (WHEEL_SPEED, &[])] {
             if let Some(info) = self.tensors.info(name) {
                 let samples = info.shape.first().copied().unwrap_or_default();
@@ -184,7 +184,7 @@ impl Observation {
                 }
                 Encoding::Jpeg | Encoding::Png => self.check_file(&metadata.tensor)?,
             }
-            // These are there only if the session asked for them.
+            // These exist only if the session asked for them.
             let maps: [(&str, &[usize]); 3] = [
                 ("depth", &[height, width]),
                 ("opacity", &[height, width]),
@@ -246,7 +246,7 @@ impl<'a> ImageView<'a> {
     /// returned in place, the others are decoded by every call.
     ///
     /// # Errors
-    /// The JPEG or PNG file cannot be decoded, or has another size than the metadata says.
+    /// The JPEG or PNG file cannot be decoded, or its size differs from the metadata.
     pub fn rgb(&self) -> Result<Cow<'a, [u8]>, FrameError> {
         let size = self.size();
         let decoded = match self.metadata.encoding {

@@ -1,4 +1,4 @@
-//! What a client needs to know about a server beside its address.
+//! Options of a client in addition to the address of the server.
 
 use std::fmt;
 
@@ -20,7 +20,7 @@ pub struct ConnectOptions {
     /// Root certificates in PEM format that `wss://` and `https://` trust in addition to those of the
     /// operating system, for example that of a private certificate authority.
     pub root_certificates_pem: Vec<u8>,
-    /// Whether observations come in memory that the server shares, in place of the socket. The server must run on this
+    /// Whether observations arrive in memory that the server shares, instead of the socket. The server must run on this
     /// machine, in the same container and as the same user; otherwise connecting fails.
     pub shared_memory: bool,
 }

@@ -10,8 +10,7 @@ use rustls::{ClientConfig, RootCertStore};
 /// A configuration that trusts the operating system's root certificates, and those in `extra_roots_pem`.
 ///
 /// # Errors
-/// A text that says what to do: `extra_roots_pem` holds no certificate or a damaged one, or there is no root
-/// certificate at all.
+/// A text with the remedy: `extra_roots_pem` has no certificate or a damaged one, or there is no root certificate.
 pub(crate) fn client_config(extra_roots_pem: &[u8]) -> Result<ClientConfig, String> {
     let mut roots = RootCertStore::empty();
     add_pem_roots(&mut roots, extra_roots_pem)?;
@@ -51,7 +50,7 @@ fn add_pem_roots(roots: &mut RootCertStore, pem: &[u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// The cryptography is named here, as rustls otherwise asks for a default of the process, which may not be set.
+/// Name the cryptography provider, because rustls otherwise uses the default of the process, which may not be set.
 fn config(roots: RootCertStore) -> Result<ClientConfig, String> {
     let builder = ClientConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()

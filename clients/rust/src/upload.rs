@@ -65,7 +65,7 @@ impl HttpClient {
             .map_err(|cause| unreadable_file(path, cause))
     }
 
-    /// Tells the server what will be sent, and learns how much of it is there already.
+    /// Announces the upload to the server, and returns how many of its bytes the server has.
     async fn start_upload(&self, announcement: &NewUpload) -> Result<Upload, HttpError> {
         self.request_json(Method::POST, &["v1", "uploads"], Some(announcement)).await
     }

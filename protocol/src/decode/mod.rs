@@ -1,16 +1,16 @@
-//! Strict decoding of what clients send.
+//! Strict decoding of messages of clients.
 //!
-//! serde accepts more than the protocol: an array in place of an object, `null` in place of an absent field,
-//! fields that do not exist, and the last of two fields of one name. With an agent that has a mistake, each of
-//! these becomes a wrong drive instead of an error. So a message is first compared with its JSON schema, the one
-//! in `protocol/schema` that is generated from the types, and only then read by serde. The rules:
+//! serde accepts more than the protocol: an array in place of an object, `null` in place of an absent field, fields
+//! that do not exist, and the last of two fields of one name. If an agent has such a mistake, it gets wrong results
+//! instead of an error. So a message is first compared with its JSON schema, the one in `protocol/schema` that is
+//! generated from the types, and only then read by serde. The rules:
 //!
-//! - Objects are objects. No field is unknown, missing or doubled.
+//! - Objects are not arrays. Unknown, missing and duplicate fields are refused.
 //! - `null` is refused everywhere: an option that is not set is left out. Where a number belongs, `null` counts as
 //!   NaN, because JavaScript writes NaN so.
 //! - A number with a point or an exponent is an integer if its value is one, as in JSON Schema: `1e5`.
 //! - NaN and infinities, which JSON cannot represent, are found in all usual spellings (`non_finite`).
-//! - A message is nested at most 128 deep (`serde_json`'s limit).
+//! - A message is nested at most 127 deep: `serde_json` refuses the 128th level.
 //!
 //! Every [`Mistake`] has the path of the field, for example `rig.cameras[2].lens.k[1]`. Ranges of numbers, counts
 //! and names are not checked here: the package that knows the limit refuses them, with a code of its own.
@@ -60,20 +60,20 @@ inbound!(NewActor, "new_actor");
 /// Why a message was refused.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refused {
-    /// The message's `seq`, if it has exactly one and that is a number.
+    /// The message's `seq`, if it has exactly one and it is a number.
     pub seq: Option<u64>,
-    /// What is wrong.
+    /// The mistake.
     pub mistake: Mistake,
 }
 
-/// What is wrong with a message.
+/// A mistake in a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mistake {
-    /// What kind of mistake it is.
+    /// Kind of the mistake.
     pub kind: MistakeKind,
     /// Path of the field. `None` if the message is not JSON, or not an object.
     pub field: Option<String>,
-    /// What is wrong and what is expected, for people.
+    /// Description of the mistake and of the expected value, for people.
     pub reason: String,
 }
 

@@ -1,7 +1,7 @@
-//! What a JSON schema says of types and fields, in a form that is quick to compare with.
+//! Types and fields of a JSON schema, in a form that is fast to compare with.
 //!
-//! Only the keywords that schemars writes for this package's types are read. Those of ranges, counts and name
-//! patterns are left to the packages that know the limits.
+//! Only the keywords that schemars writes for this package's types are read. Ranges, counts and name patterns are
+//! checked by the packages that have the limits.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -16,7 +16,7 @@ pub struct Shapes {
     pub(super) definitions: BTreeMap<String, Shape>,
 }
 
-/// What a value may be.
+/// Allowed values.
 #[derive(Debug)]
 pub(super) enum Shape {
     /// Anything but `null`.
@@ -29,7 +29,7 @@ pub(super) enum Shape {
     Text,
     /// One of some strings.
     Word(Vec<String>),
-    /// A list; if `len` is given, of exactly so many items.
+    /// A list; if `len` is given, of exactly this number of items.
     List {
         item: Box<Shape>,
         len: Option<usize>,
@@ -51,7 +51,7 @@ pub(super) enum Shape {
 pub(super) struct ObjectShape {
     pub(super) fields: BTreeMap<String, Shape>,
     pub(super) required: Vec<String>,
-    /// What fields of any other name hold; they are refused if there is no shape.
+    /// Values of fields of any other name, which are refused if there is no shape.
     pub(super) others: Option<Box<Shape>>,
 }
 
@@ -59,7 +59,7 @@ impl Shapes {
     /// Reads a schema of this package.
     ///
     /// # Panics
-    /// The schema has a keyword that this module does not know. A test reads every schema.
+    /// The schema has a keyword that this module does not support. A test reads every schema.
     pub(super) fn of(schema: &str) -> Self {
         let schema: Value = serde_json::from_str(schema).expect("a schema is JSON");
         let definitions = schema["$defs"].as_object().into_iter().flatten();
@@ -82,7 +82,7 @@ impl Shape {
         if let Some(Value::String(target)) = keywords.get("$ref") {
             return Self::Defined(target.trim_start_matches("#/$defs/").to_owned());
         }
-        // Beside `properties`, `oneOf` says which fields exclude each other. serde's types know that.
+        // In addition to `properties`, `oneOf` says which fields exclude each other. serde's types check this.
         let alternatives = ["anyOf", "oneOf"].into_iter().find_map(|name| keywords.get(name));
         if let Some(Value::Array(alternatives)) = alternatives
             && !keywords.contains_key("properties")
@@ -146,7 +146,7 @@ impl ObjectShape {
         }
     }
 
-    /// The only word that a field may hold.
+    /// The only allowed text of a field.
     fn word(&self, field: &str) -> Option<&str> {
         match self.fields.get(field) {
             Some(Shape::Word(words)) if words.len() == 1 => Some(&words[0]),
@@ -155,7 +155,7 @@ impl ObjectShape {
     }
 }
 
-/// The field that tells objects apart, if there is one: it holds another word in each of them.
+/// The field that distinguishes objects, if there is one: its text is different in each of them.
 fn tag(shapes: &[Shape]) -> Option<String> {
     let Some(Shape::Object(first)) = shapes.first() else { return None };
     let tells_apart = |field: &&String| {

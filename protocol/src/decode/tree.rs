@@ -1,4 +1,4 @@
-//! JSON as it was sent: with doubled fields, and in the order of the text.
+//! JSON as it was sent: with duplicate fields, and in the order of the text.
 
 use std::fmt;
 
@@ -18,14 +18,14 @@ pub(super) enum Tree {
 }
 
 impl Tree {
-    /// Reads a text that is one JSON value; an error says where it is not.
+    /// Reads a text that is one JSON value. An error has the position of the mistake.
     pub(super) fn parse(text: &str) -> Result<Self, String> {
         serde_json::from_str(text).map_err(|error| {
             error.to_string().replace("recursion limit exceeded", "nested more than 127 deep")
         })
     }
 
-    /// What the value is, for messages.
+    /// Kind of the value, for messages.
     pub(super) fn kind(&self) -> &'static str {
         match self {
             Self::Null => "null",

@@ -8,14 +8,14 @@ use super::shape::{ObjectShape, Shape, Shapes};
 use super::tree::Tree;
 use super::{Mistake, MistakeKind};
 
-/// Integers up to here are exact as floating-point numbers: 2^53. A larger number with a point or an exponent does
-/// not say which integer is meant.
+/// Integers up to here are exact as floating-point numbers: 2^53. A larger number with a point or an exponent may stand
+/// for several integers.
 const EXACT: i128 = 1 << 53;
 
 /// Longest name of an unknown field that a path repeats, in characters.
 const NAME_CHARS: usize = 64;
 
-/// The message with its numbers as the types want them, or its first mistake.
+/// The message with its numbers as the types require them, or its first mistake.
 pub(super) fn checked(shapes: &Shapes, tree: &Tree) -> Result<Value, Mistake> {
     Walk { shapes, path: String::new(), in_pose: false }.value(&shapes.root, tree)
 }
@@ -36,7 +36,7 @@ struct Walk<'a> {
     shapes: &'a Shapes,
     /// Path of the value that is compared.
     path: String,
-    /// Whether that value is within a pose.
+    /// Whether this value is within a pose.
     in_pose: bool,
 }
 
@@ -155,8 +155,8 @@ impl Walk<'_> {
         }
     }
 
-    /// Of several shapes, compares with the one that the value was probably meant to have: of its own type, and
-    /// among objects the one that knows the most of its fields.
+    /// Compares a value with the most likely one of several shapes: of its own type, and among objects the shape that
+    /// has the most of its fields.
     fn choice(&mut self, shapes: &[Shape], tree: &Tree) -> Result<Value, Mistake> {
         let mut best: Option<(usize, &Shape)> = None;
         let mut objects: Vec<String> = Vec::new();
@@ -232,7 +232,7 @@ impl Walk<'_> {
         Mistake { kind, field: Some(self.path.clone()), reason }
     }
 
-    /// What a shape is, for messages.
+    /// Name of a shape, for messages.
     fn name(&self, shape: &Shape) -> &'static str {
         match self.shapes.resolve(shape) {
             Shape::Any | Shape::Defined(_) => "a value",
@@ -247,7 +247,7 @@ impl Walk<'_> {
     }
 }
 
-/// Whether a number says exactly which integer it is, if it is one.
+/// Whether a number stands for exactly one integer, if it is an integer.
 fn is_exact(number: &Number) -> bool {
     let has_point = !number.is_u64() && !number.is_i64();
     !has_point || integer(number).is_some_and(|whole| whole.abs() <= EXACT)
@@ -262,7 +262,7 @@ fn integer(number: &Number) -> Option<i128> {
         return Some(number.into());
     }
     let number = number.as_f64()?;
-    // `as` saturates: no type of the protocol reaches so far.
+    // `as` saturates: no type of the protocol has numbers of this size.
     (number.fract() == 0.0).then_some(number as i128)
 }
 

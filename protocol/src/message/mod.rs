@@ -29,11 +29,11 @@ pub use sensors::{
     Sensors, WheelSpeed,
 };
 
-/// What names are, as a regular expression.
+/// Pattern of names, as a regular expression.
 #[cfg(feature = "schema")]
 pub const NAME_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}$";
 
-/// What names of recorded episodes are: the name of a session, a hyphen and a number.
+/// Pattern of names of recorded episodes: the name of a session, a hyphen and a number.
 #[cfg(feature = "schema")]
 pub(crate) const EPISODE_PATTERN: &str = "^[a-z0-9_-][a-z0-9._-]{0,63}-[0-9]{1,20}$";
 

@@ -1,6 +1,5 @@
-//! What the sensors of the ego do to what they see: effects that a session asks for. All are drawn with the
-//! episode's seed. Answers repeat these types, and a newer server may add fields to them; in requests, unknown fields are
-//! refused by `decode`.
+//! Sensor effects, which a session asks for. All are sampled with the episode's seed. Answers repeat these types, and a
+//! newer server may add fields to them; in requests, unknown fields are refused by `decode`.
 
 use std::collections::BTreeMap;
 

@@ -33,8 +33,8 @@ pub fn available(camera: &RigCamera) -> wire::AvailableCamera {
     };
     wire::AvailableCamera {
         intrinsics: Some(spec),
-        // Called `rig_to_camera` there, and rig_from_camera by its value: the runtime multiplies it to the
-        // ego's pose from the right.
+        // AlpaSim calls it `rig_to_camera`, but its value is rig_from_camera: the runtime multiplies the ego's pose
+        // with it from the right.
         rig_to_camera: Some(pose_to_wire(rig_from_camera)),
         logical_id: logical_id(name),
     }

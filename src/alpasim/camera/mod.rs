@@ -1,8 +1,8 @@
 //! Cameras and shutters, to and from AlpaSim's messages.
 //!
 //! # Principal points
-//! AlpaSim counts that of an f-theta camera from the centre of the first pixel, 0.5 less than here. Those of OpenCV's
-//! models are counted from the corner, as here.
+//! AlpaSim measures the principal point of an f-theta camera from the centre of the first pixel, so that its value is
+//! 0.5 less than in this project. For OpenCV's models it is measured from the corner, as in this project.
 
 mod listed;
 mod polynomial;
@@ -28,7 +28,7 @@ pub enum CameraSpecError {
     Field {
         /// The field.
         field: &'static str,
-        /// What must hold.
+        /// The requirement.
         must: String,
     },
     /// The numbers are no camera.

@@ -55,11 +55,11 @@ pub fn view(request: &wire::RgbRenderRequest, frame: &LocalFrame) -> Result<View
         return Ok(View::new(camera, end));
     };
     let first = frame.world_from("sensor_pose.start_pose", pair.start_pose.as_ref())?;
-    // A camera at rest has no motion to render, as in a session, but sees objects move.
+    // A camera at rest has no motion to render, as in a session, but objects move in its image.
     let moves = first != end;
     let rolling_shutter =
         moves.then_some(RollingShutter { direction, world_from_camera_first: first });
-    // The poses of a request's objects are those at the start and the end of its own exposure.
+    // A request has the poses of its objects at the start and the end of its own exposure.
     let readout = Some(Readout { direction, share: 1.0 });
     Ok(View { camera, world_from_camera: end, rolling_shutter, readout })
 }

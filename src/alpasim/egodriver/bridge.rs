@@ -1,7 +1,8 @@
-//! One episode: a session of wildcity, and one of a driver.
+//! One episode with a session of wildcity and a session of a driver.
 //!
 //! At each decision the driver gets the images that are new, the ego's poses, and the route; then it is asked for a
-//! plan, which the ego follows for one step. Simulated times are sent as `EPISODE_US` more, because they are unsigned.
+//! plan, which the ego follows for one step. `EPISODE_US` is added to the simulated times that are sent, because they
+//! are unsigned.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -27,7 +28,7 @@ use crate::scene::LocalFrame;
 use crate::wire::common::{PoseAtTime, Trajectory, Vec3};
 use crate::wire::egodriver as wire;
 
-/// What a simulated time of 0 is for the driver, in microseconds.
+/// Time of the driver at the simulated time 0, in microseconds.
 const EPISODE_US: i64 = 1_000_000_000;
 
 /// Time between two poses of the history.
@@ -42,12 +43,12 @@ pub struct EpisodeSettings {
     pub token: Option<String>,
     /// `HOST:PORT` of the driver.
     pub driver: String,
-    /// What is opened: twin, version, rig, scenario, times. Its outputs are not used. Without dynamics, the ego is
-    /// `model` at `speed_m_s`.
+    /// Options of the session: twin, version, rig, scenario, times. Its outputs are not used. Without dynamics, the ego
+    /// is `model` at `speed_m_s`.
     pub open: Open,
-    /// Name of the drive to follow; the one of the start, or the first of the twin, if absent.
+    /// Name of the drive to follow; if absent, the drive of the start, or else the first one of the twin.
     pub trajectory: Option<String>,
-    /// Where to start along it, in metres; as `open` says if absent.
+    /// Start along the drive, in metres; if absent, the start of `open`.
     pub start_m: Option<f64>,
     /// Cameras to send; all of the rig if absent.
     pub cameras: Option<Vec<String>>,
@@ -80,7 +81,7 @@ pub enum Outcome {
     AgentLost,
 }
 
-/// What an episode was.
+/// Result of an episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeReport {
     /// Its seed.
@@ -93,11 +94,11 @@ pub struct EpisodeReport {
     pub steps: u64,
     /// Length of the driven path, in metres.
     pub distance_m: f64,
-    /// BLAKE3 of the frame hashes of all observations, one after the other, in hex.
+    /// BLAKE3 of the concatenated frame hashes of all observations, in hex.
     pub frames_hash: String,
 }
 
-/// Why there is no report: the server, and not the driver, is at fault, or the settings are.
+/// Why there is no report: an error of the server or of the settings, and not of the driver.
 #[derive(Debug, thiserror::Error)]
 pub enum BridgeError {
     /// The server refused, or went away.
@@ -109,8 +110,8 @@ pub enum BridgeError {
     /// A setting cannot be used.
     #[error("{0}")]
     Setting(String),
-    /// The server sent a pose that is none.
-    #[error("the server sent a pose that is none: {0}")]
+    /// The server sent an invalid pose.
+    #[error("the server sent an invalid pose: {0}")]
     Pose(#[from] PoseError),
     /// No driver answers, so that no episode began.
     #[error(transparent)]
@@ -120,7 +121,7 @@ pub enum BridgeError {
 /// Drives one episode.
 ///
 /// # Errors
-/// The server or the settings are at fault. What the driver does wrong is in the report.
+/// The server or the settings are at fault. Errors of the driver are in the report.
 pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, BridgeError> {
     // The driver first: it may take minutes to load, and a session would wait for it.
     let uuid = format!("wildcity-{}-{}", std::process::id(), settings.seed);
@@ -136,7 +137,7 @@ pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, 
 
     let driven = episode.drive(&mut client, &mut driver, first).await;
     let closed = client.close().await?;
-    // The driver may be gone, which the report says then.
+    // The driver may be gone; the report then has this error.
     let _ = driver.close_session().await;
     let failure = match driven {
         Ok(()) => None,
@@ -282,7 +283,7 @@ impl<'a> Episode<'a> {
         opened: &Opened,
         drive: Drive,
     ) -> Result<Self, BridgeError> {
-        // A camera on the wire is one in a rig file.
+        // A camera has the same format on the wire and in a rig file.
         let cameras = opened.cameras.iter().map(|camera| {
             let json = serde_json::to_value(camera);
             json.and_then(serde_json::from_value)
@@ -366,8 +367,8 @@ impl<'a> Episode<'a> {
         Ok(())
     }
 
-    /// The driven poses of the ego's history, the present one last. Their speeds are differences; the present one
-    /// is the ego's own.
+    /// The driven poses of the ego's history, the present one last. Their speeds are computed from differences; the
+    /// present speed is that of the ego.
     fn history(
         &self,
         seen: &Observation,

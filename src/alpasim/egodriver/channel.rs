@@ -21,13 +21,13 @@ pub(super) struct Channel(SendRequest<Body>);
 type Sent = Result<http::Response<hyper::body::Incoming>, hyper::Error>;
 
 impl Channel {
-    /// Connects to `HOST:PORT`, and tries again until `patience` is over: a driver that loads a network starts
+    /// Connects to `HOST:PORT`, and tries again until `max_wait` is over: a driver that loads a network starts
     /// to listen late.
     ///
     /// # Errors
     /// The last reason.
-    pub(super) async fn connect(address: &str, patience: Duration) -> Result<Self, String> {
-        let deadline = Instant::now() + patience;
+    pub(super) async fn connect(address: &str, max_wait: Duration) -> Result<Self, String> {
+        let deadline = Instant::now() + max_wait;
         loop {
             match Self::try_connect(address).await {
                 Ok(channel) => return Ok(channel),
@@ -42,7 +42,8 @@ impl Channel {
         stream.set_nodelay(true).map_err(|error| error.to_string())?;
         let handshake = http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await;
         let (sender, connection) = handshake.map_err(|error| error.to_string())?;
-        // Ends when the last clone of the sender is dropped, or the driver is gone: then calls fail.
+        // The task ends when the last clone of the sender is dropped, or the driver disconnects, after which calls
+        // fail.
         tokio::spawn(connection);
         Ok(Self(sender))
     }

@@ -20,7 +20,7 @@ const CONTRACT: (&str, &str) = ("carla-driver-interface-contract", "2");
 /// Why a driver did not answer as it must.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum DriverError {
-    /// The address is not one.
+    /// The address is invalid.
     #[error("{0:?} is no address of a driver; expected HOST:PORT")]
     Address(String),
     /// It cannot be reached, or went away.
@@ -63,7 +63,7 @@ pub enum DriverError {
 pub(super) struct Driver {
     grpc: Grpc<Channel>,
     uuid: String,
-    patience: Duration,
+    max_wait: Duration,
 }
 
 impl Driver {
@@ -74,14 +74,14 @@ impl Driver {
     pub(super) async fn connect(
         address: &str,
         uuid: String,
-        patience: Duration,
+        max_wait: Duration,
     ) -> Result<Self, DriverError> {
         let no_address = |_| DriverError::Address(address.to_owned());
         let origin: Uri = format!("http://{address}").parse().map_err(no_address)?;
         let channel = Channel::connect(address, limits::DRIVER_START).await;
         let channel =
             channel.map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
-        let mut driver = Self { grpc: Grpc::with_origin(channel, origin), uuid, patience };
+        let mut driver = Self { grpc: Grpc::with_origin(channel, origin), uuid, max_wait };
         let version: common::VersionId = driver.call("get_version", common::Empty {}).await?;
         tracing::info!(driver = version.version_id, "connected");
         Ok(driver)
@@ -162,7 +162,7 @@ impl Driver {
         let mut request = Request::new(message);
         let (key, value) = CONTRACT;
         request.metadata_mut().insert(key, tonic::metadata::MetadataValue::from_static(value));
-        let patience = self.patience;
+        let max_wait = self.max_wait;
         let grpc = &mut self.grpc;
         let calling = async {
             grpc.ready().await.map_err(|error| DriverError::Lost(error.to_string()))?;
@@ -170,8 +170,8 @@ impl Driver {
             let answer = grpc.unary(request, path, codec).await;
             answer.map(tonic::Response::into_inner).map_err(|status| of_status(method, &status))
         };
-        let seconds = patience.as_secs_f64();
-        timeout(patience, calling).await.unwrap_or(Err(DriverError::TimedOut { method, seconds }))
+        let seconds = max_wait.as_secs_f64();
+        timeout(max_wait, calling).await.unwrap_or(Err(DriverError::TimedOut { method, seconds }))
     }
 }
 

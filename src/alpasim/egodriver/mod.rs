@@ -5,7 +5,7 @@
 //! driver    the methods of a driver
 //! route     the recorded drive ahead
 //! plan      a driver's answer as a trajectory
-//! bridge    one episode: a session of wildcity, and one of a driver
+//! bridge    one episode with a session of wildcity and a session of a driver
 //! ```
 
 mod bridge;

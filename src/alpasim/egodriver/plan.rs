@@ -8,10 +8,10 @@ use crate::limits;
 use crate::scene::LocalFrame;
 use crate::wire::common::Trajectory;
 
-/// The poses after `now_us`, in the rig frame of now. Drivers begin with the present pose.
+/// The poses after `now_us`, in the present rig frame. Drivers begin with the present pose.
 ///
 /// # Errors
-/// There is none, it ends before the step does, a pose is invalid, or times do not rise.
+/// There is no pose after `now_us`, the plan ends before the step does, a pose is invalid, or times do not rise.
 pub(super) fn trajectory(
     plan: Option<&Trajectory>,
     frame: &LocalFrame,

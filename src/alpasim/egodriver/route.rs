@@ -6,11 +6,11 @@ use wildcity_scene::geometry::Pose;
 
 use crate::wire::common::Vec3;
 
-/// Waypoints of a route, and how far they reach: what AlpaSim sends.
+/// Number of waypoints of a route, and their reach, as AlpaSim sends them.
 const WAYPOINTS: usize = 20;
 const AHEAD_M: f64 = 80.0;
 
-/// How far from the last station the next one is looked for, because a drive may cross itself.
+/// Search range of the next station around the last one, because a drive may cross itself.
 const NEAR_M: f64 = 40.0;
 
 /// The polyline through the poses of a recorded drive.
@@ -29,8 +29,8 @@ impl Route {
         Self { points, stations_m, at_m: None }
     }
 
-    /// 20 points of the drive from where the ego is to 80 m ahead, in the rig frame, at height 0. After the end
-    /// of the drive they go straight on: a driver stops at an end.
+    /// 20 points of the drive from where the ego is to 80 m ahead, in the rig frame, at height 0. After the end of the
+    /// drive they continue straight, because a driver stops at the end of a route.
     pub(super) fn ahead(&mut self, world_from_rig: &Pose) -> Vec<Vec3> {
         let ego = world_from_rig.position_m.truncate();
         let at_m = self.nearest_m(ego);
@@ -76,8 +76,8 @@ impl Route {
     }
 }
 
-/// The 20 points of a scenario's route, which are in the rig frame and have the same distances, at height 0. A route that
-/// ends before goes straight on.
+/// The 20 points of a scenario's route, which are in the rig frame and have the same distances, at height 0. A shorter
+/// route is extended straight.
 pub(super) fn waypoints(points: &[[f64; 3]]) -> Vec<Vec3> {
     let mut ahead: Vec<DVec2> = points.iter().map(|&[x, y, _]| DVec2::new(x, y)).collect();
     let direction = match ahead.as_slice() {

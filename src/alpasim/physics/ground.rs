@@ -12,8 +12,8 @@ use crate::wire::physics::Status;
 /// Puts a box on the ground: moves it vertically and tilts it, so that it stands on the ground's plane, and keeps its
 /// heading and the x and y of its middle. `world_from_box` is the pose of its middle.
 ///
-/// The pose is returned as it was, with the reason, where there is no ground, or if it would move by more than
-/// [`limits::PHYSICS_TRANSLATION_M`] or turn by more than [`limits::PHYSICS_ROTATION_RAD`]: AlpaSim's own service
+/// The pose is returned unchanged, with the reason, if there is no ground at the box, or if it would move by more than
+/// [`limits::PHYSICS_TRANSLATION_M`] or rotate by more than [`limits::PHYSICS_ROTATION_RAD`]: AlpaSim's own service
 /// does the same.
 pub fn on_ground(ground: &Ground<'_>, world_from_box: &Pose, height_m: f64) -> (Pose, Status) {
     match placed(ground, world_from_box, height_m) {

@@ -22,8 +22,8 @@ use crate::wire::physics as wire;
 
 pub use ground::on_ground;
 
-/// Puts the ego's boxes, and those of others, on the ground of a scene. `running` has a permit for each request that
-/// may run at once.
+/// Puts the boxes of the ego and of other actors on the ground of a scene. `running` has a permit for each request that
+/// may run at the same time.
 ///
 /// # Errors
 /// There is no such scene, or a pose or a size is missing or invalid, or too many requests run.
@@ -36,7 +36,7 @@ pub(crate) async fn ground_intersection(
     let scene = OpenScene::open(engine, &asked.scene_id).await?;
     // Every keyframe of the drives is tested for every box.
     let work = move || {
-        // Held until the work ends, even if the client goes away before.
+        // Held until the work ends, even if the client disconnects earlier.
         let _permit = permit;
         let drives = &scene.resident.version.manifest.trajectories;
         answer(drives, &scene.frame, &asked)

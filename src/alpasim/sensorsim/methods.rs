@@ -36,7 +36,7 @@ impl Sensorsim {
         Self { engine, open, assets, physics, stopping }
     }
 
-    /// Frees the memory of scenes that are not drawn any more, until dropped.
+    /// Frees the memory of scenes that are no longer drawn, until dropped.
     pub(super) async fn forget_idle(&self) {
         loop {
             tokio::time::sleep(Duration::from_secs(60)).await;
@@ -79,7 +79,7 @@ impl Sensorsim {
         Ok(common::AvailableScenesReturn { scene_ids })
     }
 
-    /// The scenes drawn lately.
+    /// The scenes that were drawn recently.
     pub(super) async fn get_loaded_scenes(&self) -> Result<wire::LoadedScenesReturn, Status> {
         let entry = |scene_id| wire::LoadedSceneEntry {
             scene_id,
@@ -146,8 +146,8 @@ impl Sensorsim {
         Ok(image?)
     }
 
-    /// Several images. A bad camera, pose or size fails its own image; what concerns all of them fails the
-    /// request, so that a client can tell a wrong request from a server that is busy.
+    /// Several images. An invalid camera, pose or size fails only its own image. An error that concerns all images
+    /// fails the request, so that a client can distinguish an invalid request from a busy server.
     pub(super) async fn batch_render_rgb(
         &self,
         asked: wire::BatchRgbRenderRequest,

@@ -1,8 +1,8 @@
-//! The assets of dynamic objects that were drawn lately.
+//! The assets of dynamic objects that were drawn recently.
 //!
-//! A rollout asks for the same objects ten times a second: an asset stays in memory for [`limits::SCENE_IDLE`], so that
-//! neither is a box made nor an asset read again. Names are resolved anew for every request, because an asset may be
-//! removed, and another get its name.
+//! A rollout requests the same objects ten times a second. So an asset stays in memory for [`limits::SCENE_IDLE`], and
+//! is not made or read again. Names are resolved anew for every request, because an asset may be removed, and its name
+//! given to another one.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,11 +20,11 @@ use crate::object::{ObjectShape, actor_of_centre};
 use crate::scene::{LocalFrame, SceneError};
 use crate::wire::sensorsim as wire;
 
-/// Assets by the hash of one of the store, or by the key of a box, and when they were drawn last.
+/// Assets and the times when they were last drawn, by hash for assets of the store, and by key for boxes.
 #[derive(Default)]
 pub(super) struct ObjectAssets(Mutex<BTreeMap<String, (Arc<ResidentActor>, Instant)>>);
 
-/// A dynamic object of a request: what it is drawn from, and the poses of the middle of its box in the world.
+/// A dynamic object of a request: its shape, and the poses of the middle of its box in the world.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Object {
     shape: ObjectShape,
@@ -52,14 +52,14 @@ impl Object {
         Ok(Self { shape, world_from_centre: end, world_from_centre_at_start: start })
     }
 
-    /// Whether its id does not say what it is.
+    /// Whether its id does not describe the object.
     pub(super) fn is_unknown(&self) -> bool {
         self.shape == ObjectShape::Unknown
     }
 }
 
 impl ObjectAssets {
-    /// What is drawn of some objects.
+    /// The actors to draw for some objects.
     ///
     /// # Errors
     /// There is no such asset, or too little memory for it.
@@ -118,7 +118,7 @@ impl ObjectAssets {
         shape: &ObjectShape,
         key: &str,
     ) -> Result<Arc<ResidentActor>, SensorsimError> {
-        // That of a box, or of a whole hash: no name is a key here.
+        // The asset of a box or of a complete hash. Names are not keys.
         if let Some(asset) = self.known(key) {
             return Ok(asset);
         }
@@ -141,7 +141,8 @@ impl ObjectAssets {
         Some(asset.clone())
     }
 
-    /// Brings an asset into memory. If there is no room, forgets those that no request draws, and tries once more.
+    /// Loads an asset into memory. If there is too little memory, drops assets that no request draws, and tries once
+    /// more.
     fn load(
         &self,
         key: &str,
@@ -164,7 +165,7 @@ impl ObjectAssets {
         Ok(asset)
     }
 
-    /// Forgets the assets that were not drawn for [`limits::SCENE_IDLE`].
+    /// Drops the assets that were not drawn for [`limits::SCENE_IDLE`].
     pub(super) fn forget_idle(&self) {
         self.0.lock().retain(|_, (_, drawn)| drawn.elapsed() < limits::SCENE_IDLE);
     }
@@ -176,7 +177,7 @@ mod tests {
     use wildcity_twin::residency::Cache;
     use wildcity_twin::store::Catalog;
 
-    /// Where there is no room, assets that no request draws give way, and only those.
+    /// If there is too little memory, only assets that no request draws are dropped.
     #[test]
     fn assets_that_no_request_draws_make_room() {
         let shape = ObjectShape::of_track("7@4x2x1").unwrap();
@@ -192,7 +193,7 @@ mod tests {
         assert!(known("drawn") && !known("idle") && known("third"));
         assert_eq!(cache.stats().reserved_bytes, 2 * asset.bytes());
 
-        // All that is in memory is drawn: the request is refused, and nothing is lost.
+        // All assets in memory are being drawn, so the request is refused, and no asset is dropped.
         let refused = load("fourth").unwrap_err();
         assert!(refused.to_string().contains("memory"), "{refused}");
         assert!(known("drawn") && known("third") && !known("fourth"));

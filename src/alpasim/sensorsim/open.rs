@@ -16,7 +16,7 @@ use crate::limits;
 /// A version of a twin, and the memory for its worst frame.
 struct OpenVersion {
     stills: Arc<Stills>,
-    /// The scenes that were drawn, and when last.
+    /// The scenes that were drawn, with the time of the last frame.
     scenes: BTreeMap<String, Instant>,
 }
 
@@ -24,12 +24,12 @@ struct OpenVersion {
 #[derive(Default)]
 pub(super) struct OpenVersions {
     versions: Mutex<BTreeMap<(String, u64), OpenVersion>>,
-    /// Scenes that were asked for with objects of which nothing is known, each logged once.
+    /// Scenes that were requested with unknown objects, each logged once.
     warned: parking_lot::Mutex<BTreeSet<String>>,
 }
 
 impl OpenVersions {
-    /// What renders a version, with enough memory for these views.
+    /// Returns the renderer of a version, with enough memory for these views.
     ///
     /// # Errors
     /// Too many versions are open, or too little memory is left.
@@ -74,7 +74,7 @@ impl OpenVersions {
         open.values().flat_map(|version| version.scenes.keys().cloned()).collect()
     }
 
-    /// Logs, once a scene, that objects are drawn as grey boxes.
+    /// Logs, once per scene, that objects are drawn as grey boxes.
     pub(super) fn warn_of_unknown_objects(&self, scene: &str) {
         let mut warned = self.warned.lock();
         if warned.len() < limits::LISTED_SCENES && warned.insert(scene.to_owned()) {
@@ -82,7 +82,7 @@ impl OpenVersions {
         }
     }
 
-    /// Forgets scenes that were not drawn for [`limits::SCENE_IDLE`], and frees the memory of their versions.
+    /// Drops scenes that were not drawn for [`limits::SCENE_IDLE`], and frees the memory of their versions.
     pub(super) async fn forget_idle(&self) {
         let mut open = self.versions.lock().await;
         open.retain(|_, version| {

@@ -22,7 +22,7 @@ use crate::wire::sensorsim as wire;
 /// The rig of a twin without one, as for sessions.
 const RIG: &str = wildcity_session::limits::RIG;
 
-/// The preset with cameras that every scene offers beside those of its twin.
+/// The preset with cameras that every scene offers in addition to those of its twin.
 const OFFERED: &str = "alpamayo2";
 
 /// A scene that was opened.
@@ -36,7 +36,7 @@ impl OpenScene {
     /// Opens a scene.
     ///
     /// # Errors
-    /// There is none of this id, or its twin cannot be read.
+    /// There is no scene of this id, or its twin cannot be read.
     pub(crate) async fn open(engine: &Arc<Engine>, id: &str) -> Result<Self, SensorsimError> {
         let id: SceneId = id.parse()?;
         let resident = engine.open_version(id.twin.clone(), Some(id.version)).await?;
@@ -107,7 +107,7 @@ pub fn offered_cameras(manifest: &Manifest) -> Vec<RigCamera> {
     with_preset(&own, Rig::preset(OFFERED).map(|rig| rig.cameras).unwrap_or_default())
 }
 
-/// What images are made with.
+/// Settings for the images of requests.
 #[derive(Clone, Copy)]
 pub(super) struct Renderer<'a> {
     pub(super) engine: &'a Arc<Engine>,
@@ -118,7 +118,7 @@ pub(super) struct Renderer<'a> {
 /// A request's image, or why there is none.
 type Image = Result<wire::RgbRenderReturn, SensorsimError>;
 
-/// Requests that are rendered together: they are of one scene, and show the same objects.
+/// Requests that are rendered together because they have the same scene and objects.
 struct Group {
     objects: Vec<Object>,
     /// Indices of the requests.
@@ -219,8 +219,8 @@ fn no_image() -> Image {
     Err(SensorsimError::Invalid("no image was made".to_owned()))
 }
 
-/// The same error for each of several requests. Errors cannot be cloned, because those of the operating
-/// system cannot; what a client sees of them can.
+/// The same error for each of several requests. Errors of the operating system cannot be cloned, but the messages for
+/// the client can.
 fn repeated(error: &SensorsimError, count: usize) -> impl Iterator<Item = Image> + use<> {
     let status = error.status();
     (0..count).map(move |_| Err(SensorsimError::Repeated(status.clone())))

@@ -37,7 +37,7 @@ pub(crate) enum SensorsimError {
     /// Not offered.
     #[error("{0}")]
     Unimplemented(&'static str),
-    /// What another request of the same scene was refused with.
+    /// The error of another request of the same scene.
     #[error("{}", .0.message())]
     Repeated(Status),
 }
@@ -54,7 +54,7 @@ impl From<SceneError> for SensorsimError {
 }
 
 impl SensorsimError {
-    /// What the client gets: a message of at most [`limits::STATUS_BYTES`].
+    /// The status that the client gets: a message of at most [`limits::STATUS_BYTES`].
     pub(crate) fn status(&self) -> Status {
         let text = self.to_string();
         let status = match self {
@@ -115,7 +115,7 @@ mod tests {
     use super::*;
     use tonic::Code;
 
-    /// Every row of the table in docs/alpasim.md that a request alone cannot provoke.
+    /// Every row of the table in docs/alpasim.md that a single request cannot cause.
     #[test]
     fn each_error_has_its_status() {
         let session = |error: SessionError| SensorsimError::from(error);
@@ -162,7 +162,7 @@ mod tests {
             let status = error.status();
             assert_eq!(status.code(), code, "{status}");
             assert!(status.message().starts_with(start), "{status}");
-            // What several requests of one scene get is the same.
+            // Several requests of one scene get the same status.
             let repeated = SensorsimError::Repeated(error.status()).status();
             assert_eq!((repeated.code(), repeated.message()), (code, status.message()));
         }

@@ -1,4 +1,4 @@
-//! Package `egodriver`: what a runtime sends to a driver, and its plan.
+//! Package `egodriver`: inputs of a driver from a runtime, and its plan.
 
 #![allow(missing_docs, reason = "the fields are AlpaSim's, and are explained there")]
 

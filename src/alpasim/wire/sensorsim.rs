@@ -255,7 +255,7 @@ pub struct BatchRgbRenderReturnItem {
     pub error_message: String,
 }
 
-/// The fields of a lidar request that are read here: none, because lidars are not rendered.
+/// A lidar request, of which no field is read, because lidars are not rendered.
 #[derive(Clone, PartialEq, prost::Message)]
 pub struct LidarRenderRequest {
     #[prost(string, tag = "1")]

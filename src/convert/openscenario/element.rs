@@ -35,7 +35,7 @@ impl<'a> Element<'a> {
         self.children().filter(move |child| child.name() == name)
     }
 
-    /// The only child of a name; `None` without one.
+    /// The only child with a name; `None` without one.
     pub(super) fn find(&self, name: &str) -> Result<Option<Self>, ConvertError> {
         let mut found = self.all(name);
         let first = found.next();

@@ -87,7 +87,7 @@ impl Parser<'_> {
             false => word,
         };
         let value: Option<f64> = number.parse().ok();
-        value.map(|value| sign * value).ok_or_else(|| format!("{number:?} is no number"))
+        value.map(|value| sign * value).ok_or_else(|| format!("{number:?} is not a number"))
     }
 }
 

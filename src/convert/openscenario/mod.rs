@@ -30,7 +30,7 @@ const NODES: u32 = 1_000_000;
 /// An actor that has no trajectory drives straight on for this distance, in metres.
 const STRAIGHT_M: f64 = 1000.0;
 
-/// What the file does not say.
+/// Values that the file does not have.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Settings {
     /// Name of the scenario.
@@ -51,7 +51,7 @@ struct Entity {
     /// From the reference point, the middle of the rear axle, forward to the box's centre, in metres.
     center_x_m: f64,
     place: Option<Place>,
-    /// The speed after what was read so far, in m/s.
+    /// The speed after the actions that were read so far, in m/s.
     speed_mps: f64,
     begin_mps: f64,
     /// Points of a trajectory, and their times if they count.
@@ -140,7 +140,7 @@ pub fn read(bytes: &[u8], settings: &Settings) -> Result<ScenarioFile, ConvertEr
     })
 }
 
-/// The parameters, whose values may use those before them.
+/// The parameters, whose values may use earlier parameters.
 fn parameters_of(root: Element<'_>) -> Result<BTreeMap<String, String>, ConvertError> {
     let mut parameters = BTreeMap::new();
     let Some(section) = root.find("ParameterDeclarations")? else { return Ok(parameters) };
@@ -203,7 +203,7 @@ fn entities_of(section: Element<'_>) -> Result<BTreeMap<String, Entity>, Convert
     Ok(entities)
 }
 
-/// Puts the actor in front of each trigger that a condition names, since OpenSCENARIO names events alone.
+/// Puts the actor in front of each trigger that a condition names, because OpenSCENARIO names only events.
 fn name_owners(entities: &mut BTreeMap<String, Entity>) -> Result<(), ConvertError> {
     let mut owners: BTreeMap<String, String> = BTreeMap::new();
     for entity in entities.values() {

@@ -67,7 +67,8 @@ pub(super) fn place_of(
     }
 }
 
-/// The heading of an `<Orientation>`: absolute, or relative to that of an entity, which it is without one.
+/// The heading of an `<Orientation>`: absolute, or relative to an entity, whose heading is returned without an
+/// `<Orientation>`.
 fn heading_rad(kind: &Element<'_>, base_rad: f64) -> Result<f64, ConvertError> {
     kind.only(&["Orientation"])?;
     let Some(orientation) = kind.find("Orientation")? else { return Ok(base_rad) };

@@ -1,4 +1,4 @@
-//! What happens: `Init`, the events of the stories, and when it stops.
+//! Reads the storyboard: `Init`, the events of the stories, and the stop trigger.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ const LEAST_MPS2: f64 = 0.01;
 
 type Entities = BTreeMap<String, Entity>;
 
-/// Reads the actions before the start.
+/// Reads the actions of `Init`.
 pub(super) fn read_init(init: Element<'_>, entities: &mut Entities) -> Result<(), ConvertError> {
     init.only(&["Actions"])?;
     let actions = init.need("Actions")?;
@@ -275,7 +275,7 @@ fn trajectory_of(action: Element<'_>, entities: &Entities) -> Result<TimedPoints
     }
 }
 
-/// Adds the conditions of a trigger, all of which must hold.
+/// Adds the conditions of a trigger, all of which must be true.
 fn add_conditions(
     start: Element<'_>,
     own: &str,

@@ -1,6 +1,6 @@
-//! Lenses as Foxglove's calibrations describe them, and how far such a description is off.
+//! Lenses as Foxglove's calibrations describe them, and the error of such a description.
 //!
-//! Foxglove knows OpenCV's models alone. A lens that is none of them gets the nearest one: f-theta gets OpenCV's
+//! Foxglove supports only OpenCV's models. Any other lens is approximated by the nearest one: f-theta gets OpenCV's
 //! fisheye with the focal length and the four coefficients that fit best. Windshields and thin prisms are left out. The
 //! lens itself is in `/wildcity/episode`.
 
@@ -122,7 +122,7 @@ impl Nearest {
             let projected_px = center_px + self.focal_px * self.model.plane(direction);
             Some(projected_px.distance(at_px))
         });
-        // NaN, of a fit that failed, is no small error.
+        // NaN, the result of a failed fit, must not count as a small error.
         off_px.fold(0.0, |most: f64, off| if off <= most { most } else { off.min(f64::INFINITY) })
     }
 }

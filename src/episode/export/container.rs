@@ -32,7 +32,7 @@ impl<W: Write + Seek> McapFile<W> {
         let options = WriteOptions::new()
             .compression(Some(Compression::Zstd))
             .chunk_size(Some(CHUNK_BYTES))
-            // Without threads of its own: a record is small.
+            // No additional threads, because a record is small.
             .compression_threads(0)
             .library(concat!("wildcity ", env!("CARGO_PKG_VERSION")));
         let failure = Failure::default();

@@ -4,7 +4,7 @@ use wildcity_scene::geometry::Pose;
 
 use super::messages as foxglove;
 
-/// What is added to the times of an episode, in microseconds.
+/// Offset that is added to the times of an episode, in microseconds.
 const TIME_OFFSET_US: i64 = 1_000_000_000;
 
 pub(super) fn nanoseconds(time_us: i64) -> u64 {

@@ -1,7 +1,7 @@
-//! The protobuf descriptors of Foxglove's messages, which an MCAP file has beside them.
+//! The protobuf descriptors of Foxglove's messages, which an MCAP file contains in addition to the messages.
 //!
-//! Source of names and numbers: foxglove/schemas, `schemas/proto/foxglove`. All fields are there, since a viewer may
-//! look for those that episodes leave empty; of an image not the identifier and the lineage.
+//! Source of names and numbers: foxglove/schemas, `schemas/proto/foxglove`. All fields are included, because a viewer
+//! may look for fields that episodes leave empty. The exceptions are the identifier and the lineage of an image.
 
 use prost::Message as _;
 use prost_types::field_descriptor_proto::{Label, Type};

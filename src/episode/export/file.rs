@@ -18,7 +18,7 @@ const ENDING: &str = ".mcap";
 /// Ending of the name that a file has while it is written: `a-1.mcap.RANDOM.tmp` becomes `a-1.mcap`.
 const TEMPORARY: &str = ".tmp";
 
-/// The place of the MCAP file beside a record: `a-1.mcap` beside `a-1.jsonl`.
+/// Path of the MCAP file of a record: `a-1.mcap` for `a-1.jsonl`.
 pub fn mcap_of(record: &Path) -> PathBuf {
     record.with_extension("mcap")
 }
@@ -26,18 +26,18 @@ pub fn mcap_of(record: &Path) -> PathBuf {
 /// Exports a record to a file, as [`write_whole`] does.
 ///
 /// # Errors
-/// The record cannot be read or has no frame, or the file cannot be written: then nothing is left of it.
+/// The record cannot be read or has no frame, or the file cannot be written: no file is left then.
 pub fn export_file(record: &Path, mcap: &Path) -> Result<Exported, ExportError> {
     let episode = EpisodeFile::read(record)?;
     let rig = EpisodeFile::rig(record)?;
     write_whole(mcap, |out| export(&episode, rig.as_ref(), out))
 }
 
-/// Lets `write` write a file, and gives it its name when it is whole and on disk. Until then it has a name of its own,
-/// so that two exports to one place do not meet: the last one stays.
+/// Lets `write` write a file under a temporary name, and renames it when it is complete and on disk. Temporary names
+/// are unique, so that two exports to one path do not conflict: the last one stays.
 ///
 /// # Errors
-/// The file cannot be created, `write` fails, or the file cannot be renamed: then nothing is left of it.
+/// The file cannot be created, `write` fails, or the file cannot be renamed: no file is left then.
 pub fn write_whole<T>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, ExportError>,
@@ -78,11 +78,12 @@ fn name_whole(temporary: NamedTempFile, dir: &Path, path: &Path) -> io::Result<(
     Ok(())
 }
 
-/// Removes the temporary files that killed exports left in a directory: those that nothing was written to for
-/// [`limits::LEFTOVER_AGE`] before `now`. A directory that does not exist has none. Returns how many were removed.
+/// Removes the temporary files of killed exports from a directory: files that were not written to for
+/// [`limits::LEFTOVER_AGE`] before `now`. The directory need not exist. Returns how many were removed.
 ///
 /// # Errors
-/// The directory cannot be read, or a file cannot be removed: the first one, and the others are removed.
+/// The directory cannot be read, or a file cannot be removed: returns the first error, and still removes the other
+/// files.
 pub fn remove_leftovers(dir: &Path, now: SystemTime) -> io::Result<usize> {
     let entries = match fs::read_dir(dir) {
         Ok(entries) => entries,

@@ -2,18 +2,18 @@
 //!
 //! | topic | message |
 //! |---|---|
-//! | `/tf` | `foxglove.FrameTransforms`: world to rig at each step, rig to each camera at the begin |
+//! | `/tf` | `foxglove.FrameTransforms`: world to rig at each step, rig to each camera at the start |
 //! | `/camera/N/image` | `foxglove.CompressedImage`: JPEG, if the caller renders the images |
-//! | `/camera/N/calibration` | `foxglove.CameraCalibration`; `/wildcity/episode` says how far it is off the lens |
-//! | `/actors` | `foxglove.SceneUpdate`: a box for each actor, and the ego's |
+//! | `/camera/N/calibration` | `foxglove.CameraCalibration`; `/wildcity/episode` has its deviation from the lens |
+//! | `/actors` | `foxglove.SceneUpdate`: a box for each actor and for the ego |
 //! | `/map` | `foxglove.SceneUpdate`: the outlines of the lanes |
 //! | `/ego/odometry` | `foxglove.Odometry`: pose, velocity, yaw rate |
-//! | `/ego/path`, `/route` | `foxglove.PosesInFrame` in the world: all that was driven, and the recorded drive |
+//! | `/ego/path`, `/route` | `foxglove.PosesInFrame` in the world: the driven path, and the recorded drive |
 //! | `/plan` | `foxglove.PosesInFrame` in the rig: the agent's trajectory, when it was decided |
 //! | `/log` | `foxglove.Log`: events |
 //! | `/wildcity/episode`, `step`, `event`, `result` | JSON: the lines of the record |
 //!
-//! Times are those of the episode plus 1,000 s, since MCAP has no times below 0 and a warm-up has.
+//! Times are those of the episode plus 1,000 s, because a warm-up has negative times and MCAP does not allow them.
 
 mod calibration;
 mod container;

@@ -1,5 +1,6 @@
-//! A writer that stores its first error and reports success to the crate `mcap`, which panics when its writer is dropped
-//! after some errors, such as of a full disk. [`McapFile`](super::container::McapFile) returns the stored error.
+//! A writer that stores its first error and reports success to the crate `mcap`, which panics when its writer is
+//! dropped after some errors, for example if the disk is full. [`McapFile`](super::container::McapFile) returns the
+//! stored error.
 
 use std::cell::Cell;
 use std::io::{self, Seek, SeekFrom, Write};
@@ -10,7 +11,7 @@ pub(super) type Failure = Rc<Cell<Option<io::Error>>>;
 
 pub(super) struct Output<W> {
     inner: W,
-    /// Where the next byte goes.
+    /// Position of the next byte.
     position: u64,
     has_failed: bool,
     failure: Failure,

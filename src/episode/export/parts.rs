@@ -21,7 +21,7 @@ pub(super) fn motions(frames: &[&Frame], dt_us: i64) -> Vec<Option<EgoSample>> {
     ego_samples(&poses, dt_us as f64 * 1e-6).into_iter().map(Some).collect()
 }
 
-/// The ego at a time; without velocities if they are not known.
+/// The ego at a time; without velocities if they are unknown.
 pub(super) fn odometry(
     time_us: i64,
     world_from_rig: &Pose,
@@ -66,8 +66,8 @@ pub(super) fn event_text(episode: &EpisodeFile, event: &Event) -> (i32, String) 
     }
 }
 
-/// The command without what `/plan` has: of a trajectory, the times of its poses are left. Poses as text would be two
-/// thirds of a file.
+/// The command without the values that `/plan` has: a trajectory keeps only the times of its poses. Poses as text would
+/// be two thirds of a file.
 pub(super) fn command_of(frame: &Frame) -> Option<Value> {
     let Some(poses) = frame.plan() else { return frame.command.clone() };
     let times_us: Vec<i64> = poses.iter().map(|pose| pose.time_us).collect();

@@ -31,7 +31,7 @@ pub enum ExportError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
     /// The file cannot be written.
@@ -51,7 +51,7 @@ pub enum ExportError {
     Empty,
 }
 
-/// What an export wrote.
+/// Result of an export.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exported {
     /// Messages.
@@ -92,14 +92,14 @@ pub struct EpisodeExport<'a, W: Write + Seek> {
     events: Peekable<Iter<'a, EventLine>>,
     /// The actors at each step.
     actors: BTreeMap<u64, &'a ActorsLine>,
-    /// Those that have a box now.
+    /// Actors that have a box now.
     shown: BTreeSet<u16>,
     end_us: i64,
     calibration_error_px: f64,
 }
 
 impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
-    /// Begins a file, with what does not change: the header, the rig, the route and the map.
+    /// Starts a file with the constant parts: the header, the rig, the route and the map.
     ///
     /// # Errors
     /// The file cannot be written, or the episode has no frame.
@@ -120,7 +120,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             episode,
             frames: frames.iter().copied().zip(motions).collect::<Vec<_>>().into_iter().peekable(),
             events: episode.events.iter().peekable(),
-            // Where a session went back, and in a warm-up, the last line of a step holds.
+            // If a session returned to an earlier state, and in a warm-up, a step has several lines: use the last one.
             actors: episode.actors.iter().map(|line| (line.step, line)).collect(),
             shown: BTreeSet::new(),
             end_us,
@@ -136,7 +136,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         Ok(export)
     }
 
-    /// Adds an image, behind all that happened before it.
+    /// Adds an image, after all messages of earlier times.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -152,7 +152,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         self.file.proto(&topic, "foxglove.CompressedImage", image.time_us, &message)
     }
 
-    /// Writes what is left, and the index.
+    /// Writes the remaining messages, and the index.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -174,7 +174,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
             }
             self.step(frame, motion)?;
             self.boxes(frame)?;
-            // A plan is in the frame of the rig at the begin of its step.
+            // A plan is in the frame of the rig at the start of its step.
             if let Some(poses) = self.frames.peek().and_then(|(next, _)| plan_of(next)) {
                 self.poses("/plan", "rig", frame.time_us, poses)?;
             }
@@ -246,7 +246,7 @@ impl<'a, W: Write + Seek> EpisodeExport<'a, W> {
         self.poses("/route", "world", time_us, poses.collect())
     }
 
-    /// The outlines of the lanes, at the height of the route's begin: a map in a record is flat.
+    /// The outlines of the lanes, at the height of the start of the route: a map in a record is flat.
     fn map(&mut self, scenario: &ScenarioLine, time_us: i64) -> Result<(), ExportError> {
         if scenario.lanes.is_empty() {
             return Ok(());

@@ -18,8 +18,8 @@ pub use psnr::PsnrPreview;
 
 use psnr::ProposedChange;
 
-/// What the preview compares: the base with the replaced cells. None if there is no base, or if it
-/// cannot be compared.
+/// The comparison of a preview: the base with the replaced cells. `None` if there is no base, or if it cannot be
+/// compared.
 ///
 /// # Errors
 /// A comparison was asked for, and the push has too many Gaussians for one; or its profile cannot be

@@ -6,6 +6,6 @@
 pub struct TokensError {
     /// The location in the file, as `tokens[2].hash`.
     pub location: String,
-    /// What is wrong, and what is expected.
+    /// The error, and the expected form.
     pub reason: String,
 }

@@ -118,7 +118,7 @@ impl Tokens {
 mod tests {
     use super::*;
 
-    /// A reader of the documentation must replace what is said there of a token.
+    /// A reader of the documentation must replace the token in the example.
     #[test]
     fn the_examples_of_the_documentation_are_no_tokens() {
         let page = include_str!("../../../docs/operators.md");

@@ -1,4 +1,4 @@
-//! What a client may do: roles, twins, and what a token may have at once.
+//! Rights of a client: roles, twins, and the limits of a token.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -7,7 +7,7 @@ use serde::Deserialize;
 
 use crate::fault::Fault;
 
-/// What the holder of a token may do.
+/// Rights of the holder of a token.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
     /// Read the metrics, and nothing else.
@@ -20,7 +20,7 @@ pub enum Role {
     Admin,
 }
 
-/// What a client may do.
+/// Rights of a client.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Grant {
     /// Name of the token; empty on a server without tokens.
@@ -31,7 +31,7 @@ pub(crate) struct Grant {
     pub(crate) limits: TokenLimits,
 }
 
-/// What a token may have at once; without a value, as much as the server allows to all.
+/// Limits of a token; without a value, the limit of the server for all tokens applies.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(crate) struct TokenLimits {
@@ -52,7 +52,7 @@ impl Grant {
         Arc::new(Self { name: String::new(), role: Role::Admin, twins: None, limits })
     }
 
-    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`] that of
+    /// Requires a role, or one that includes it: [`Role::Admin`] includes all, and [`Role::Push`] includes
     /// [`Role::Drive`].
     ///
     /// # Errors
@@ -69,7 +69,7 @@ impl Grant {
     /// Requires any role but [`Role::Metrics`].
     ///
     /// # Errors
-    /// [`Fault::Forbidden`] if the token may read metrics alone.
+    /// [`Fault::Forbidden`] if the token may only read metrics.
     pub(crate) fn require_more_than_metrics(&self) -> Result<(), Fault> {
         if self.role != Role::Metrics {
             return Ok(());
@@ -92,7 +92,7 @@ impl Grant {
         })
     }
 
-    /// Requires access to all twins: for changes of what all twins share.
+    /// Requires access to all twins: for changes of data that all twins share.
     ///
     /// # Errors
     /// [`Fault::Forbidden`] if the token is limited to some twins.

@@ -46,7 +46,7 @@ impl Tokens {
         self.tokens.iter().filter(|token| token.grant.require(Role::Push).is_ok()).count()
     }
 
-    /// Bytes that the uploads of a token may take, by name, for tokens with a limit of their own.
+    /// Bytes that the uploads of a token may use, by name, for tokens with a limit of their own.
     pub(crate) fn upload_bytes(&self) -> BTreeMap<String, u64> {
         let limited = |token: &Token| {
             let bytes = token.grant.limits.upload_bytes?;
@@ -55,15 +55,15 @@ impl Tokens {
         self.tokens.iter().filter_map(limited).collect()
     }
 
-    /// What the token in the value of an `Authorization` header allows.
+    /// The rights of the token in the value of an `Authorization` header.
     ///
     /// # Errors
-    /// [`Fault::Unauthorized`]: there is no token, or the server does not know it.
+    /// [`Fault::Unauthorized`]: there is no token, or it is unknown.
     pub(crate) fn grant(&self, authorization: Option<&[u8]>) -> Result<Arc<Grant>, Fault> {
         let token = authorization.and_then(bearer).ok_or(Fault::Unauthorized)?;
         let of_token = blake3::hash(token);
         let of_sha256 = blake3::hash(&Sha256::digest(token));
-        // Compares with all tokens even after a match: the time must not depend on which one it is.
+        // Compare with all tokens even after a match: the time must not depend on which token matches.
         let mut matching = None;
         for Token { grant, secret } in &self.tokens {
             let is_equal = match secret {
@@ -88,8 +88,8 @@ impl CurrentTokens {
         self.0.lock().clone()
     }
 
-    /// Reads the file again, if the tokens came from one, and returns its path. Connections that exist keep what
-    /// their token allowed.
+    /// Reads the file again, if the tokens came from one, and returns its path. Existing connections keep the rights of
+    /// their token.
     ///
     /// # Errors
     /// The path, and why the file cannot be used: then the old tokens stay.

@@ -1,10 +1,10 @@
 //! One agent, in lock step: read a request, answer it.
 //!
-//! A connection may have several sessions. They share its numbers, so that they can be resumed together.
+//! A connection may have several sessions. They share its sequence of numbers, so that they can be resumed together.
 //!
 //! | file | requests |
 //! |---|---|
-//! | `mod.rs` | the loop, the numbers, and what is for one session |
+//! | `mod.rs` | the loop, the numbers, and requests for one session |
 //! | `opening.rs` | open, branch, resume |
 //! | `sharing.rs` | share_memory |
 //! | `steps.rs` | step, step_many |
@@ -38,7 +38,7 @@ use crate::sessions::{Answer, AnsweredRequest, SlotGuard};
 use crate::socket::{Disconnect, Incoming, Socket};
 use crate::state::ServerState;
 
-/// Serves a client until the connection ends. An open session is parked then.
+/// Serves a client until the connection ends, and then parks its open sessions.
 pub(crate) async fn serve(
     state: Arc<ServerState>,
     socket: Socket,
@@ -153,7 +153,7 @@ impl Connection {
         }
     }
 
-    /// Carries out one request, or finds the answer that it had.
+    /// Carries out one request, or returns the stored answer of a repeated one.
     async fn handle(&mut self, text: &str) -> Result<Answer, Refusal> {
         let parsed = if text.len() <= limits::INLINE_REQUEST_BYTES {
             convert::parse(text)
@@ -223,7 +223,7 @@ impl Connection {
         Err(Fault::SeqOutOfOrder { field: "seq", seq, expected })
     }
 
-    /// Carries out a request. `named` is the session that it is for, if it names one.
+    /// Carries out a request. `named` is the session that the request names, if any.
     async fn carry_out(
         &mut self,
         seq: u64,

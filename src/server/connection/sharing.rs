@@ -7,7 +7,7 @@ use crate::memory::SharedMemory;
 use crate::sessions::Answer;
 
 impl Connection {
-    /// Makes memory for the client, and tells where it is.
+    /// Creates memory for the client, and returns its location.
     pub(super) fn offer_memory(&mut self, seq: u64) -> Result<Answer, Fault> {
         let unavailable = |reason: &str| {
             let reason = format!("{reason}; connect without it");
@@ -39,7 +39,8 @@ impl Connection {
         Ok(Answer::Text(convert::ok(seq)?.into()))
     }
 
-    /// What is sent for an answer: with shared memory, the place of a binary message that was written there.
+    /// Returns the message to send for an answer: with shared memory, the location of a binary message that was written
+    /// into it.
     pub(super) async fn delivered(&mut self, seq: u64, answer: Answer) -> Result<Answer, Fault> {
         let memory = self.memory.as_mut().filter(|memory| memory.is_open());
         let (Some(memory), false) = (memory, matches!(answer, Answer::Text(_))) else {

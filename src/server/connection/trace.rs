@@ -5,12 +5,12 @@ use tracing::field::Empty;
 
 use crate::convert::Command;
 
-/// The span of a request, from the moment when its text is there until its answer is sent.
+/// The span of a request, from the arrival of its text until its answer is sent.
 pub(super) fn request() -> Span {
     tracing::debug_span!("request", r#type = Empty, seq = Empty, session = Empty)
 }
 
-/// Notes in the current span what the request is.
+/// Records the properties of the request in the current span.
 pub(super) fn note(seq: u64, session: Option<&str>, command: &Command) {
     let span = Span::current();
     span.record("type", name(command)).record("seq", seq);

@@ -90,7 +90,7 @@ fn settings(seq: u64, session: &Session, section: Option<&DriveRequest>) -> Resu
         instances: instances.then_some(true),
         frames: Some(session.frames() as u64),
         trust: Some(session.trust()),
-        actors: session.tells_actors().then_some(true),
+        actors: session.reports_actors().then_some(true),
         period_us: Some(names.iter().enumerate().map(period_us).collect()),
         cameras: Some(names),
         images: BTreeMap::new(),
@@ -294,7 +294,7 @@ fn twin_info(twin: &TwinSummary) -> TwinInfo {
 fn profile(session: &Session) -> Result<serde_json::Map<String, serde_json::Value>, Fault> {
     match serde_json::to_value(session.profile()) {
         Ok(serde_json::Value::Object(mut profile)) => {
-            // What is not set is left out, so that a client can send the profile back.
+            // Leave out fields that are not set, so that a client can send the profile back.
             profile.retain(|_, value| !value.is_null());
             Ok(profile)
         }

@@ -26,7 +26,7 @@ use crate::socket::CloseStatus;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct WireFault {
     pub(super) code: Code,
-    /// The field at fault, if one is.
+    /// The field at fault, if any.
     pub(super) field: Option<String>,
 }
 
@@ -398,7 +398,7 @@ mod tests {
     use super::*;
     use wildcity_scene::RecordFormat;
 
-    /// What a commit can end with, over WebSocket or over HTTP.
+    /// Results of a commit, over WebSocket or over HTTP.
     #[test]
     fn every_error_of_a_commit_has_its_code() {
         let io = |kind: io::ErrorKind| StoreError::Io {

@@ -1,7 +1,8 @@
 //! The answer to `step_many`: observations of several sessions in one message.
 //!
-//! The message has safetensors layout. Each observation is a tensor of bytes, as it would be sent alone, so that nothing
-//! is copied: the header is made here, and the observations follow it on the wire from where they are.
+//! The message has safetensors layout. Each observation is a tensor of bytes, the same bytes as a message with only
+//! this observation. So nothing is copied: this module makes the header, and the observations are sent after it from
+//! their own buffers.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,7 +17,7 @@ use wildcity_session::Observation;
 use super::answer::text;
 use super::fault::{WireFault, wire_fault};
 
-/// What the step of one session gave.
+/// Result of the step of one session.
 pub(crate) struct Stepped {
     pub(crate) session: String,
     pub(crate) result: Result<Arc<Observation>, Fault>,
@@ -59,7 +60,7 @@ pub(crate) fn many(seq: u64, steps: Vec<Stepped>) -> Result<ManyAnswer, Fault> {
 /// A refusal whose field is that of the whole request.
 fn refusal(index: usize, fault: &Fault) -> SessionRefusal {
     let WireFault { code, field } = wire_fault(fault);
-    // A step in a list has no type. What does not fit the state of a session is a fault of the session's name.
+    // A step in a list has no type. A step that does not fit the state of a session is a fault of the field `session`.
     let field = field.map(|field| if field == "type" { "session".to_owned() } else { field });
     let field = field.map(|field| format!("steps[{index}].{field}"));
     SessionRefusal { code, message: fault.to_string(), field }

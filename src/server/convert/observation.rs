@@ -192,7 +192,7 @@ fn metadata(
         history: frame.history.iter().map(past).collect(),
         events: session.traffic().map(events).unwrap_or_default(),
         route: session.traffic().and_then(|traffic| route(traffic, episode)),
-        actors: session.traffic().filter(|_| session.tells_actors()).map(actors),
+        actors: session.traffic().filter(|_| session.reports_actors()).map(actors),
         timings: Timings {
             queue_ms: ms(timings.queue),
             render_ms: ms(timings.render),

@@ -32,7 +32,7 @@ pub(crate) enum Parsed {
     Numbered {
         /// The number.
         seq: u64,
-        /// The session of the connection that it is for, if it names one.
+        /// The session of the connection that it names, if any.
         session: Option<String>,
         /// The command, or why the request is refused.
         command: Result<Command, Fault>,
@@ -41,7 +41,7 @@ pub(crate) enum Parsed {
     Unnumbered(Fault),
 }
 
-/// What a request asks for.
+/// Action of a request.
 #[derive(Debug)]
 pub(crate) enum Command {
     /// Begins the connection.
@@ -58,7 +58,7 @@ pub(crate) enum Command {
     Open {
         /// Its name, if the client chose one.
         name: Option<String>,
-        /// What is opened.
+        /// Options of the session.
         opening: Box<SessionOptions>,
         /// The part of a recorded drive that the answer is to have.
         drive: Option<DriveRequest>,
@@ -80,7 +80,7 @@ pub(crate) enum Command {
         /// `world_from_rig` of each.
         poses: Vec<Pose>,
     },
-    /// Loads what is seen from poses.
+    /// Loads the sections that are visible from poses.
     Prefetch {
         /// `world_from_rig` of each.
         poses: Vec<Pose>,
@@ -222,7 +222,7 @@ fn on(seq: u64, session: Option<String>, command: Result<Command, Fault>) -> Par
     }
 }
 
-/// Steps of several sessions. A list that is not one is refused; a number out of range refuses its own step.
+/// Steps of several sessions. An invalid list is refused as a whole; a number out of range refuses only its own step.
 fn many_command(steps: Vec<message::SessionStep>) -> Result<Command, Fault> {
     let most = limits::CONNECTION_SESSIONS;
     if !(1..=most).contains(&steps.len()) {

@@ -8,7 +8,7 @@ use wildcity_session::{
     Sensors, WheelSpeed,
 };
 
-/// What a session asks of its sensors.
+/// Converts the sensor settings of a request.
 pub(super) fn sensors_of(sensors: message::Sensors) -> Sensors {
     let message::Sensors { cameras, imu, wheel_speed, delay_us } = sensors;
     let axis = |axis: Option<message::AxisNoise>| {
@@ -48,7 +48,7 @@ fn camera_of(camera: message::CameraSensor) -> CameraSensor {
     }
 }
 
-/// The same for an answer, with every value that holds.
+/// Converts the sensor settings for an answer, with all values that apply.
 pub(super) fn sensors_to(sensors: &Sensors) -> message::Sensors {
     let Sensors { cameras, imu, wheel_speed, delay_us } = sensors;
     let axis = |AxisNoise { noise, bias }| Some(message::AxisNoise { noise, bias });
@@ -84,7 +84,7 @@ fn camera_to(camera: CameraSensor) -> message::CameraSensor {
     }
 }
 
-/// What a camera did to an image.
+/// Converts the effects of a camera on an image.
 pub(super) fn image_sensor(sensor: wildcity_session::ImageSensor) -> ImageSensor {
     let wildcity_session::ImageSensor { due_us, taken_us, reasons, stops, clean_hash } = sensor;
     let reason = |reason| match reason {

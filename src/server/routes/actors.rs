@@ -1,4 +1,4 @@
-//! Assets of actors over HTTP: those that are stored, and pushes of new ones.
+//! Assets of actors over HTTP: lists the stored ones, and carries out pushes of new ones.
 
 use std::sync::Arc;
 
@@ -45,8 +45,8 @@ pub(super) async fn show(
     Ok(Json(convert::actor(&actor, grant.allows_all_twins())).into_response())
 }
 
-/// `POST /v1/actors`: makes an asset of uploads, and answers when it is stored: 201, or 200 if it was there already. A
-/// client that goes away before cancels the push.
+/// `POST /v1/actors`: makes an asset of uploads, and answers when it is stored: 201, or 200 if it existed already. A
+/// client that disconnects earlier cancels the push.
 pub(super) async fn push(
     Shared(state): Shared<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -93,7 +93,7 @@ struct OwnedPush {
 /// Logs a push, runs it to its end and records the result.
 ///
 /// # Errors
-/// [`Fault::Audit`]: it did not begin.
+/// [`Fault::Audit`]: the push did not begin.
 async fn run(
     state: Arc<ServerState>,
     push: Arc<Push>,

@@ -10,7 +10,7 @@ use axum::response::{IntoResponse as _, Response};
 use crate::origins::is_local_origin;
 use crate::state::ServerState;
 
-/// How long a browser remembers what a page may do, in seconds.
+/// How long a browser caches the permissions of a page, in seconds.
 const MAX_AGE_S: &str = "600";
 const METHODS: &str = "GET, POST, PATCH, DELETE";
 const REQUEST_HEADERS: &str = "authorization, content-type, upload-offset, content-digest";

@@ -23,9 +23,9 @@ use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse as _, Response};
 use axum::{Json, Router};
 
+use crate::admission::ConnectionSlot;
 use crate::auth::Grant;
 use crate::fault::Fault;
-use crate::newcomers::ConnectionSlot;
 use crate::state::ServerState;
 
 use refusal::Refusal;
@@ -50,7 +50,7 @@ pub(crate) fn router(state: Arc<ServerState>) -> Router {
         .with_state(state)
 }
 
-/// What guards a route.
+/// Access control of a route.
 #[derive(Clone)]
 struct Guard {
     state: Arc<ServerState>,
@@ -86,13 +86,13 @@ async fn authorize(
         grant.require_more_than_metrics()?;
     }
     if let Some(slot) = request.extensions().get::<Arc<ConnectionSlot>>() {
-        slot.become_known()?;
+        slot.mark_authenticated()?;
     }
     request.extensions_mut().insert(grant);
     Ok(next.run(request).await)
 }
 
-/// Refuses a header that is there more than once: which one counts would be a guess.
+/// Refuses a header that occurs more than once, because its values may contradict each other.
 fn check_once(request: &Request, name: HeaderName, header: &'static str) -> Result<(), Fault> {
     match request.headers().get_all(name).iter().count() {
         0 | 1 => Ok(()),

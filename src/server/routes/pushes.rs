@@ -101,10 +101,10 @@ struct OwnedPush {
     _open: Option<Counted>,
 }
 
-/// Logs that a push begins, and starts it. Returns when it is logged. A client that goes away changes nothing.
+/// Logs that a push begins, and starts it. Returns when it is logged. A client that disconnects does not stop it.
 ///
 /// # Errors
-/// [`Fault::Audit`]: it did not begin.
+/// [`Fault::Audit`]: the push did not begin.
 async fn log_and_run(
     state: Arc<ServerState>,
     push: Arc<Push>,
@@ -151,7 +151,7 @@ async fn run(
     state.metrics.push_ended(outcome(ended));
 }
 
-/// Completes when the server stops, unless the push can no longer be cancelled: then its own result is the truth.
+/// Completes when the server stops, unless the push can no longer be cancelled: then its result counts.
 pub(super) async fn stopped_before_commit(state: &ServerState, push: &Push) {
     state.stopped().await;
     if push.cancel().is_err() {

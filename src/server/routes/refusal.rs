@@ -29,7 +29,7 @@ impl IntoResponse for Refusal {
             let bearer = HeaderValue::from_static("Bearer realm=\"wildcity\"");
             response.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
         }
-        // A client whose handshake is refused learns what this server speaks (RFC 6455, section 4.4).
+        // A client whose handshake is refused gets the supported versions (RFC 6455, section 4.4).
         if matches!(*self.0, Fault::NoUpgrade | Fault::Handshake { .. }) {
             let headers = response.headers_mut();
             headers.insert(header::UPGRADE, HeaderValue::from_static("websocket"));

@@ -1,5 +1,5 @@
-//! Every route, with what `/v1/openapi.json` says about it. The router is made from this table, so that it has no route
-//! that the document does not have.
+//! Every route, with its description for `/v1/openapi.json`. The router is made from this table, so that every route is
+//! in the document.
 
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ pub(super) struct Operation {
     pub(super) path: &'static str,
     /// The role that a token needs; none if no token is needed.
     pub(super) role: Option<&'static str>,
-    /// What it does.
+    /// Description of the route.
     pub(super) summary: &'static str,
     /// Status of success, and what is sent then.
     pub(super) success: u16,
@@ -34,7 +34,7 @@ pub(super) struct Operation {
     /// Other answers to requests that the document describes.
     pub(super) others: &'static [Other],
     pub(super) body: Content,
-    /// Parameters beside those of the path.
+    /// Parameters in addition to those of the path.
     pub(super) parameters: &'static [Parameter],
 }
 
@@ -47,10 +47,10 @@ pub(super) enum Method {
     Delete,
 }
 
-/// A status beside that of success. Below 300 the answer has what success has, otherwise it is a refusal.
+/// A status in addition to that of success. Below 300 the body is the same as for success, otherwise it is a refusal.
 pub(super) type Other = (u16, &'static str);
 
-/// What a body is.
+/// Kind of a body.
 #[derive(Clone, Copy)]
 #[cfg_attr(
     not(test),
@@ -68,7 +68,7 @@ pub(super) enum Content {
     Media(&'static str),
 }
 
-/// What a parameter may be.
+/// Kind of a parameter.
 #[derive(Clone, Copy)]
 pub(super) enum Kind {
     /// An integer from 0.

@@ -27,7 +27,7 @@ pub(super) async fn issue(
 /// The ticket in the address of a WebSocket. Requests of other routes cannot have one: a ticket opens one connection.
 ///
 /// # Errors
-/// The request has a ticket, but is no handshake of a WebSocket. The ticket stays good.
+/// The request has a ticket, but is not a handshake of a WebSocket. The ticket stays valid.
 pub(super) fn of<'a>(request: &'a Request, route: &str) -> Result<Option<&'a str>, Fault> {
     let Some(protocol) = websocket::protocol_of(route) else { return Ok(None) };
     let query = request.uri().query().unwrap_or_default();

@@ -114,7 +114,7 @@ pub(super) async fn edit(
     check_twin(&name)?;
     let request = convert::new_edit(name, &body)?;
     let open = state.open_pushes.push(&grant)?;
-    // A client that goes away leaves a whole version, or none.
+    // If the client disconnects, the edit is still completed, so that there is never a part of a version.
     let edited = tokio::spawn(async move {
         let _open = open;
         let target = Target::Twin(request.twin.clone());
@@ -150,8 +150,8 @@ pub(super) async fn rollback(
         let made = rolled_back.as_ref().map(|version| Made::Version(version.number));
         state.audit.end_now(&grant, &change, made);
         let version = rolled_back?;
-        // A push that is still loading its version has pinned the one before; move that pin, so that
-        // the rollback becomes the latest at once.
+        // A push that is still loading its version has pinned the previous one; move this pin, so that the rollback
+        // becomes the latest at once.
         engine.move_latest_pin(&name, version.number);
         tracing::info!(twin = name, version = version.number, "rolled back to {number}");
         Ok::<_, Fault>(version)
@@ -159,7 +159,7 @@ pub(super) async fn rollback(
     Ok(Json(convert::version(&version.await?)).into_response())
 }
 
-/// Refuses what no twin is called, before the audit log repeats it.
+/// Refuses invalid names of twins, so that they do not get into the audit log.
 fn check_twin(name: &str) -> Result<(), Fault> {
     match is_name(name) {
         true => Ok(()),

@@ -86,7 +86,7 @@ pub(super) async fn append(
     let spool = state.spool()?.clone();
     let upload = spool.get(&grant.name, &id)?;
 
-    // What the headers announce must continue the upload.
+    // The announced bytes must continue the upload.
     let start = number(&headers, &UPLOAD_OFFSET)?;
     let length = match headers.contains_key(header::CONTENT_LENGTH) {
         true => number(&headers, &header::CONTENT_LENGTH)?,
@@ -142,7 +142,7 @@ async fn receive(
         let frame = match frame {
             Ok(Some(Ok(frame))) => frame.into_data().ok(),
             Ok(None) => None,
-            // What arrived is kept for the client that continues the upload.
+            // Keep the bytes that have arrived for a client that continues the upload.
             Ok(Some(Err(_))) => {
                 blocking(move || writer.append(&buffer)).await?;
                 return Err(Fault::TimedOut("rest of the upload"));
@@ -212,7 +212,7 @@ fn finish(spool: &Spool, upload: Arc<Upload>, mut writer: Writer) -> Result<Arc<
     if upload.offset() == upload.announced().size
         && let Err(fault) = writer.finish()
     {
-        // What the disk only fails to read is kept: a request without bytes checks it again.
+        // If the disk only failed to read, keep the upload: a request without bytes checks it again.
         if !matches!(fault, Fault::SpoolRead { .. }) {
             spool.remove(&upload);
         }
@@ -241,8 +241,8 @@ fn number(headers: &HeaderMap, name: &HeaderName) -> Result<u64, Fault> {
     })
 }
 
-/// The `sha-256` of `Content-Digest` (RFC 9530, section 2), if there is one. Other algorithms are
-/// ignored, as the standard asks.
+/// The `sha-256` of `Content-Digest` (RFC 9530, section 2), if there is one. Other algorithms are ignored, as the
+/// standard requires.
 fn sha256_of_content(headers: &HeaderMap) -> Result<Option<Vec<u8>>, Fault> {
     let values = headers.get_all(CONTENT_DIGEST).into_iter().flat_map(|value| value.to_str());
     let mut entries = values.flat_map(|value| value.split(','));

@@ -11,11 +11,11 @@ use hyper_util::rt::TokioIo;
 use tokio::sync::OwnedSemaphorePermit;
 use tokio_tungstenite::tungstenite::handshake::derive_accept_key;
 
+use crate::admission::ConnectionSlot;
 use crate::auth::{Grant, Role};
 use crate::connection;
 use crate::convert;
 use crate::fault::Fault;
-use crate::newcomers::ConnectionSlot;
 use crate::socket::Socket;
 use crate::state::ServerState;
 use crate::stream::Stream;
@@ -75,7 +75,7 @@ pub(super) fn protocol_of(route: &str) -> Option<&'static str> {
     }
 }
 
-/// What a WebSocket connection counts among, until it is dropped.
+/// Counters that include a WebSocket connection until it is dropped.
 struct Slots {
     _connection: Arc<ConnectionSlot>,
     _of_server: OwnedSemaphorePermit,
@@ -172,7 +172,7 @@ pub(super) fn check_handshake<'a>(
     }
 }
 
-/// Whether the headers say that a proxy is in between.
+/// Whether the headers show that the request came through a proxy.
 fn is_forwarded(headers: &HeaderMap) -> bool {
     ["forwarded", "x-forwarded-for", "x-real-ip", "via"]
         .iter()

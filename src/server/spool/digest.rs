@@ -31,7 +31,7 @@ impl Digest {
         format!("{algorithm}:{hex}").try_into().ok()
     }
 
-    /// The digest of the content of a file of `size` bytes, with the algorithm of this one.
+    /// The digest of the content of a file of `size` bytes, with the algorithm of this digest.
     ///
     /// # Errors
     /// The file cannot be read, or ends early ([`ErrorKind::UnexpectedEof`]).

@@ -8,15 +8,16 @@
 //! <spool>/<stem>.gone        a removed upload: freeing a large file takes a while
 //! ```
 //!
-//! **The id is the digest**: the same content is the same upload. So an upload needs no state but its
-//! bytes: announcing it again finds it, whatever happened to the server or the client. An incomplete upload
-//! survives a restart, and can be continued. A complete one survives a power cut, too; an incomplete one may lose its
-//! last bytes.
+//! **The id is the digest**: the same content is the same upload. So an upload needs no state except its bytes:
+//! announcing it again finds it, whatever happened to the server or the client. An incomplete upload survives a
+//! restart, and can be continued. A complete upload also survives a power cut; an incomplete one may lose its last
+//! bytes.
 //!
 //! **An upload belongs to the token that announced it.** Another token cannot see, continue, remove or push it, and has
 //! an upload of its own for the same content. The stem of its files is the id, followed by a hash of the token's name.
 //!
-//! **Room is for bytes that came.** An announcement alone takes little room, and for minutes only ([`quota`]).
+//! **Space is counted for bytes that have arrived.** An announcement without bytes takes little space, and only for
+//! minutes ([`quota`]).
 
 mod digest;
 mod quota;
@@ -80,8 +81,8 @@ impl SpoolMedium {
 }
 
 impl Spool {
-    /// Opens a directory for one server, with the uploads that an earlier server left there. `tokens` is the number
-    /// of tokens that may upload, and `own_bytes` the bytes of those with a limit of their own, by name.
+    /// Opens a directory for one server, with the uploads of an earlier server. `tokens` is the number of tokens that
+    /// may upload, and `own_bytes` the limits of tokens that have their own limit, by name.
     pub(crate) fn open(
         medium: SpoolMedium,
         limits: SpoolLimits,
@@ -104,12 +105,12 @@ impl Spool {
         Ok(spool)
     }
 
-    /// The upload of a file by a token, which is begun if it is new. Old uploads are removed to make room for it. One
-    /// that an earlier server left, and that could not be read when this one started, is continued.
+    /// Returns the upload of a file by a token, and begins it if it is new. Old uploads are removed to make space for
+    /// it. An upload of an earlier server that could not be read when this server started is continued.
     ///
     /// # Errors
-    /// The upload is too large, there is no room, the disk fails, or the token has all of that content, of another
-    /// size.
+    /// The upload is too large, there is no space, the disk fails, or the token has a complete upload of the same
+    /// digest with a different size.
     pub(crate) fn begin(&self, owner: &str, announced: Announced) -> Result<Arc<Upload>, Fault> {
         if announced.size > self.limits.upload_bytes {
             let must =
@@ -132,7 +133,7 @@ impl Spool {
                 known.touch();
                 return Ok(known.clone());
             }
-            // The size of complete content is certain. Of incomplete content, either size may be the wrong one.
+            // The size of complete content is certain. For incomplete content, either of the two sizes may be wrong.
             if known.is_complete() || Arc::strong_count(known) > 1 {
                 return Err(Fault::UploadDigest {
                     what: "the size of that content",
@@ -150,10 +151,10 @@ impl Spool {
         Ok(upload)
     }
 
-    /// Makes room for more bytes of an upload, which are about to be written.
+    /// Makes space for more bytes of an upload, before they are written.
     ///
     /// # Errors
-    /// [`Fault::StorageFull`]; what has arrived is kept.
+    /// [`Fault::StorageFull`]; the bytes that have arrived are kept.
     pub(crate) fn make_room(&self, upload: &Upload, more_bytes: u64) -> Result<(), Fault> {
         // Declared before the lock, so that files are deleted after the lock is released.
         let mut removed = Vec::new();
@@ -183,15 +184,15 @@ impl Spool {
         Ok(writer)
     }
 
-    /// Removes an upload, unless it was removed before. The caller has its [`Writer`], so that no one writes to files
-    /// that a newer upload has.
+    /// Removes an upload, unless it was removed before. The caller has its [`Writer`], so that no other connection
+    /// writes to files of a newer upload.
     pub(crate) fn remove(&self, upload: &Upload) {
         let mut uploads = self.uploads.lock();
         if !is_own(&uploads, upload) {
             return;
         }
         uploads.remove(upload.stem());
-        // Under the lock: an upload of the same id may begin right after.
+        // Under the lock, because an upload of the same id may begin right after.
         let removed = upload.set_aside();
         drop(uploads);
         drop(removed);
@@ -227,7 +228,7 @@ impl Spool {
     }
 
     /// Reads the directory. Files of uploads that cannot be continued are removed; files of other names, and files that
-    /// cannot be read now, are left alone.
+    /// cannot be read now, are not changed.
     fn recover(&self) -> io::Result<()> {
         let names = self.medium.disk.list(&self.medium.dir)?;
         let upload_stem = |name: &String| {
@@ -255,7 +256,7 @@ impl Spool {
     /// The upload of these files that an earlier server left, if they are valid.
     fn find(&self, stem: &str) -> io::Result<Option<Arc<Upload>>> {
         let Some(upload) = Upload::found(&self.medium, stem)? else { return Ok(None) };
-        // The process may have ended before it deleted these.
+        // The process may have ended before it deleted these files.
         remove_file(&self.medium, stem, "gone");
         if upload.is_complete() {
             remove_file(&self.medium, stem, "part");
@@ -264,7 +265,7 @@ impl Spool {
     }
 }
 
-/// Whether an upload is the spool's, and not one that was removed: a newer one may have its stem.
+/// Whether an upload is still in the spool: a newer upload may have the stem of a removed one.
 fn is_own(uploads: &Uploads, upload: &Upload) -> bool {
     uploads.get(upload.stem()).is_some_and(|known| std::ptr::eq(&**known, upload))
 }

@@ -1,8 +1,8 @@
-//! The room that uploads take: of all tokens together, and of each.
+//! Limits of the space that uploads use: of all tokens together, and of each.
 //!
-//! An upload takes room for the bytes that have arrived. While it is active, it also has room for a few more, so that
-//! uploads that were accepted seldom meet a full spool. An announcement whose bytes do not come loses this room after
-//! minutes: otherwise a token could keep all others from uploading without sending anything.
+//! An upload uses space for the bytes that have arrived. While it is active, some more space is reserved, so that
+//! accepted uploads seldom fail because the spool is full. If no bytes arrive for minutes, the reservation ends:
+//! otherwise a token could prevent all others from uploading without sending anything.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,11 +19,11 @@ use super::{SpoolUsage, Uploads};
 pub(super) struct Quota {
     all: SpoolUsage,
     token: SpoolUsage,
-    /// Bytes of tokens with a limit of their own, by name.
+    /// Limits in bytes of tokens that have their own limit, by name.
     own_bytes: BTreeMap<String, u64>,
 }
 
-/// What a new state of an upload would take.
+/// The space that an upload is going to use.
 #[derive(Clone, Copy)]
 struct Demand<'a> {
     upload: &'a Upload,
@@ -31,21 +31,22 @@ struct Demand<'a> {
 }
 
 impl Quota {
-    /// The limits of a spool that so many tokens may use, some with a limit of their own in bytes.
+    /// The limits of a spool for `tokens` tokens. `own_bytes` has the limits of tokens that have their own limit, in
+    /// bytes.
     pub(super) fn new(
         limits: SpoolLimits,
         tokens: usize,
         own_bytes: BTreeMap<String, u64>,
     ) -> Self {
         let all = SpoolUsage { uploads: limits.uploads, bytes: limits.bytes };
-        // One token alone may have all.
+        // A single token may use all space.
         let share = if tokens > 1 { limits::TOKEN_SHARE } else { 1 };
         let bytes = limits.token_bytes.unwrap_or(all.bytes / share).min(all.bytes);
         let uploads = all.uploads.div_ceil(share as usize);
         Self { all, token: SpoolUsage { uploads, bytes }, own_bytes }
     }
 
-    /// What the uploads of a token may take.
+    /// Limits of the uploads of a token.
     fn of_token(&self, owner: &str) -> SpoolUsage {
         let own = self.own_bytes.get(owner).copied();
         SpoolUsage { bytes: own.unwrap_or(self.token.bytes).min(self.all.bytes), ..self.token }
@@ -61,7 +62,7 @@ impl Quota {
         upload: &Upload,
         removed: &mut Vec<RemovedFiles>,
     ) -> Result<(), Fault> {
-        // One that can never fit is refused before it is sent.
+        // Refuse an upload that can never fit before it is sent.
         let size = upload.announced().size;
         let most = self.of_token(upload.owner()).bytes;
         if size > most {
@@ -105,7 +106,7 @@ impl Quota {
             if !is_own_full && self.all.fits(all, demand.bytes) {
                 return Ok(());
             }
-            // The token's own uploads go first, and nothing else may go if the token's own quota is full.
+            // Remove the token's own uploads first, and no others if the token's own quota is exceeded.
             let is_removable = |known: &&Arc<Upload>| {
                 is_removable(known, owner) && (!is_own_full || known.owner() == owner)
             };
@@ -132,14 +133,14 @@ impl Quota {
 }
 
 impl SpoolUsage {
-    /// Whether one more upload of so many bytes fits.
+    /// Whether one more upload of `bytes` bytes fits.
     fn fits(self, used: Self, bytes: u64) -> bool {
         let sum = used.bytes.checked_add(bytes);
         used.uploads < self.uploads && sum.is_some_and(|sum| sum <= self.bytes)
     }
 }
 
-/// What uploads take.
+/// Space that uploads use.
 pub(super) fn usage<'a>(uploads: impl Iterator<Item = &'a Arc<Upload>>) -> SpoolUsage {
     uploads.fold(SpoolUsage::default(), |sum, upload| SpoolUsage {
         uploads: sum.uploads + 1,
@@ -155,8 +156,9 @@ fn room_of(upload: &Upload) -> u64 {
     held.saturating_add(reserved).min(upload.announced().size)
 }
 
-/// Whether an upload may be removed to make room for one of a token: nothing uses it, and it is complete or has been
-/// idle for a while. A complete upload of another token must have been idle, too: its push may be about to come.
+/// Whether an upload may be removed to make space for an upload of `owner`. It must not be in use, and must be complete
+/// or have been idle for a while. A complete upload of another token must have been idle as well, because its push may
+/// follow soon.
 fn is_removable(upload: &Arc<Upload>, owner: &str) -> bool {
     if Arc::strong_count(upload) > 1 {
         return false;

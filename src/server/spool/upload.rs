@@ -37,11 +37,11 @@ pub(crate) struct Upload {
     /// When the last byte arrived, or the upload was begun or found, by the clock that never jumps.
     active_us: AtomicI64,
     writing: Arc<AsyncMutex<()>>,
-    /// Asks the connection that writes to release the upload to another one.
+    /// Notifies the connection that writes to release the upload to another one.
     release: Notify,
 }
 
-/// What a client announces of a file before it sends it.
+/// The announcement of a file that a client is going to send.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Announced {
     pub(crate) name: String,
@@ -153,13 +153,13 @@ impl Upload {
         self.file("data")
     }
 
-    /// Completes when another connection wants to write.
+    /// Completes when another connection is going to write.
     pub(crate) fn released(&self) -> tokio::sync::futures::Notified<'_> {
         self.release.notified()
     }
 
-    /// Takes the upload over from the connection that writes it, if there is one: after a network failure
-    /// the client knows long before the server that the old connection is dead.
+    /// Takes the upload over from the connection that writes it, if there is one: after a network failure the client
+    /// detects long before the server that the old connection is dead.
     ///
     /// # Errors
     /// [`Fault::Busy`]: the other connection did not release it in time.
@@ -186,7 +186,8 @@ impl Upload {
     /// Checks the bytes that arrived against the digest, and makes the upload durable. The bytes are durable already.
     ///
     /// # Errors
-    /// [`Fault::SpoolRead`]: the disk fails, and the upload stays as it is. After others, the caller removes it.
+    /// [`Fault::SpoolRead`]: the disk cannot be read now, and the upload is kept. After any other error the caller
+    /// removes the upload.
     fn finish(&self) -> Result<(), Fault> {
         let disk = &*self.medium.disk;
         let part = self.file("part");
@@ -267,7 +268,7 @@ impl Writer {
                 Ok(())
             }
             Err(cause) => {
-                // The first error is the one to report; an error of this clean-up would only hide it.
+                // Report the first error, and not an error of this clean-up.
                 let _ = self.file().and_then(|file| file.truncate(start));
                 Err(write_fault(cause))
             }
@@ -352,7 +353,7 @@ fn log_error(path: &Path, removed: io::Result<()>) {
     }
 }
 
-/// What an upload's announcement says; `None` if there is none, or no whole one.
+/// Reads an upload's announcement; `None` if there is none, or an incomplete one.
 fn announcement(medium: &SpoolMedium, stem: &str) -> io::Result<Option<AnnouncedBy>> {
     let mut text = Vec::new();
     match medium.disk.open(&path(medium, stem, "json")) {

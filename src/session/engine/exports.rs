@@ -1,4 +1,5 @@
-//! MCAP files of episodes that ended, written beside their records by a thread of its own: no request waits for one.
+//! MCAP files of episodes that ended, written next to their records by a separate thread, so that no request waits for
+//! an export.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -40,8 +41,8 @@ struct State {
 }
 
 impl Exports {
-    /// Starts the thread. It first removes from the directory of the records what killed exports left there, and ends
-    /// after the last export when this is dropped.
+    /// Starts the thread. It first removes from the directory of the records the files of exports that were killed, and
+    /// ends after the last export when this is dropped.
     ///
     /// # Errors
     /// [`SessionError::Thread`].
@@ -76,7 +77,8 @@ impl Exports {
         let _ = self.records.send(record);
     }
 
-    /// Waits until an episode is not being exported, or until none is; at most `longest`. Returns whether that is so.
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns
+    /// whether they have ended.
     pub(crate) async fn wait(&self, episode: Option<&str>, longest: Duration) -> bool {
         let is_over = |_: &u64| !self.shared.state.lock().is_waiting(episode);
         let mut ended = self.shared.ended.subscribe();
@@ -112,7 +114,7 @@ impl Shared {
 enum Failure {
     /// Something is wrong.
     Bad(String),
-    /// Nothing was driven.
+    /// The episode has no steps.
     Empty(String),
 }
 

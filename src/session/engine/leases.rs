@@ -1,4 +1,4 @@
-//! Leases of open versions: they keep garbage collection, in any process, from deleting what is in use.
+//! Leases of open versions: they prevent garbage collection, in any process, from deleting data in use.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Weak};
@@ -14,7 +14,7 @@ use crate::limits;
 #[derive(Debug)]
 pub(crate) struct Leases {
     catalog: Catalog,
-    /// What the store's log names as the holder.
+    /// The holder's name in the log of the store.
     holder: String,
     leased: Mutex<BTreeMap<(String, u64), LeasedVersion>>,
 }
@@ -34,8 +34,8 @@ impl Leases {
 
     /// Takes a lease of a version unless there is one already. Blocks.
     ///
-    /// A failure is only logged: on a store without write access, the process that collects garbage must
-    /// know by other means what is in use.
+    /// A failure is only logged: on a store without write access, the process that collects garbage must get the
+    /// versions in use by other means.
     pub(crate) fn take(&self, resident: &Arc<Resident>) {
         let version = &resident.version;
         let name = &version.manifest.twin;

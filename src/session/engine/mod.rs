@@ -1,4 +1,4 @@
-//! What all sessions share: the twins in memory, the render queue, and the budget for answers.
+//! State that all sessions share: the twins in memory, the render queue, and the budget for answers.
 
 pub(crate) mod answer_budget;
 mod exports;
@@ -53,7 +53,7 @@ pub struct EngineSettings {
     pub step_timeout: Duration,
     /// The models that can repair images, by name. Each is loaded when a session asks for it.
     pub repairs: Arc<Models>,
-    /// Whether an episode that ends becomes an MCAP file beside its record.
+    /// Whether an episode that ends is also written as an MCAP file, next to its record.
     pub mcap: bool,
 }
 
@@ -69,9 +69,9 @@ pub struct Engine {
     queue: RenderQueue,
     session_numbers: AtomicU64,
     answer_budget: AnswerBudget,
-    /// MCAP files of episodes that ended; none if no episode becomes one.
+    /// The export of ended episodes as MCAP files; `None` if episodes are not exported.
     exports: Option<Exports>,
-    /// By twin: the version that counts as its latest while a newer one is loaded.
+    /// For each twin, the version that counts as its latest while a newer one is loaded.
     pins: Mutex<BTreeMap<String, u64>>,
 }
 
@@ -147,7 +147,7 @@ impl Engine {
     /// [`limits::LEASE_RENEWAL`].
     ///
     /// # Errors
-    /// The store refuses a renewal. Leases that it granted before hold for [`limits::LEASE`].
+    /// The store refuses a renewal. Leases that it granted before stay valid for [`limits::LEASE`].
     pub async fn renew_leases(&self) -> Result<(), SessionError> {
         let leases = self.leases.clone();
         Ok(run_blocking(move || leases.renew()).await??)
@@ -182,11 +182,11 @@ impl Engine {
         }
     }
 
-    /// Opens a version and loads what some frames of it need, so that sessions at these viewpoints need not
+    /// Opens a version and loads the sections that some frames of it need, so that sessions at these viewpoints do not
     /// wait when they switch to it. `frames` has the viewpoints of each frame.
     ///
-    /// Loads only what fits beside the sections that sessions need now or soon, which go first, and
-    /// returns after [`limits::PRELOAD_TIMEOUT`] even if something is still missing.
+    /// Loads only sections that fit into memory in addition to those that sessions need now or soon, which are loaded
+    /// first, and returns after [`limits::PRELOAD_TIMEOUT`] even if something is still missing.
     ///
     /// # Errors
     /// The version cannot be opened.
@@ -229,7 +229,7 @@ impl Engine {
         self.queue.backend().name()
     }
 
-    /// What pixels depend on beside the backend's name, such as its instruction set.
+    /// Properties of the backend on which pixels depend in addition to its name, such as its instruction set.
     pub(crate) fn backend_detail(&self) -> String {
         self.queue.backend().detail()
     }
@@ -259,17 +259,18 @@ impl Engine {
         Ok(opened.await??)
     }
 
-    /// The asset of a hash, 64 lower-case hex digits, in memory until its last copy is dropped. Reads it unless it is
-    /// in memory already; blocks meanwhile.
+    /// Returns the asset of a hash, 64 lower-case hex digits. It stays in memory until its last copy is dropped. Blocks
+    /// while the asset is read, unless it is in memory already.
     ///
     /// # Errors
-    /// There is none, or it is damaged, or there is no room for it.
+    /// There is no such asset, or it is damaged, or there is too little memory.
     pub fn actor(&self, hash: &str) -> Result<Arc<ResidentActor>, SessionError> {
         Ok(self.cache.actor(hash)?)
     }
 
-    /// An asset that is not in the store, in memory until its last copy is dropped; the one of the same key if there is
-    /// one already. `key` stands for all that it is made from, and is no hash. Its memory counts as that of twins.
+    /// Keeps an asset that is not in the store in memory until its last copy is dropped, or returns the asset of the
+    /// same key if there is one. `key` identifies all inputs that the asset is made from, and is not a hash of the
+    /// store. The memory counts as that of twins.
     ///
     /// # Errors
     /// There is no room for it.
@@ -295,8 +296,8 @@ impl Engine {
         baked.map_err(SessionError::Sky)
     }
 
-    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin it drives, and what it takes beside
-    /// its scene.
+    /// Reserves the memory that the worst frame of a rig needs, wherever in the twin the ego is, and the buffers and
+    /// images that the frame needs in addition to the scene.
     ///
     /// # Errors
     /// Too little memory is left.
@@ -309,8 +310,8 @@ impl Engine {
         Ok(run_blocking(move || resident.reserve_with(extent, &profile, frame)).await??)
     }
 
-    /// What a frame of some views takes beside its scene, if it renders `rendered` bytes of images and its session holds
-    /// `images` bytes of them.
+    /// Buffers and images that a frame of some views needs in addition to its scene. The frame renders `rendered` bytes
+    /// of images, and its session holds `images` bytes of them.
     pub(crate) fn frame_bytes(&self, views: &[View], rendered: u64, images: u64) -> FrameBytes {
         let pixels: u64 = views.iter().map(|view| view.camera.pixels() as u64).sum();
         let is_large = pixels > limits::LARGE_PIXELS;
@@ -328,10 +329,10 @@ impl Engine {
         run_blocking(move || resident.worst_case_bytes_with(extent, &profile)).await
     }
 
-    /// Runs `work` on a render thread in its session's turn. Returns its result and how long it was queued.
+    /// Runs `work` on a render thread when its session is next. Returns its result and how long it was queued.
     ///
     /// # Errors
-    /// [`SessionError::Busy`] if the queue is full, or the frames before it leave it no time;
+    /// [`SessionError::Busy`] if the queue is full, or earlier frames leave it no time;
     /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
     /// result by the deadline. Work that has not
     /// started by then never starts; work that has is finished, and its result is discarded.
@@ -344,7 +345,7 @@ impl Engine {
         self.queue.run(cost, deadline, work).await
     }
 
-    /// A number for a session, which no other one has: its frames share one turn.
+    /// Returns a unique number for a session, by which its frames are scheduled.
     pub(crate) fn new_session_number(&self) -> u64 {
         self.session_numbers.fetch_add(1, Ordering::Relaxed)
     }
@@ -378,8 +379,8 @@ impl Engine {
         self.exports.is_some()
     }
 
-    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns whether
-    /// that is so.
+    /// Waits until the export of `episode` has ended, or all exports if it is `None`; at most `longest`. Returns
+    /// whether they have ended.
     pub async fn wait_for_exports(&self, episode: Option<&str>, longest: Duration) -> bool {
         match &self.exports {
             Some(exports) => exports.wait(episode, longest).await,
@@ -387,7 +388,7 @@ impl Engine {
         }
     }
 
-    /// Why an episode of this engine has no MCAP file; none if that is not known.
+    /// Why an episode of this engine has no MCAP file; `None` if it is unknown.
     pub fn export_failure(&self, episode: &str) -> Option<String> {
         self.exports.as_ref()?.failure(episode)
     }

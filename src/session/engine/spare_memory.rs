@@ -1,5 +1,5 @@
-//! The memory of an answer that is gone, for the next one. New memory is zeroed, which takes 0.1 ms per 3 MB, and the renderer
-//! writes every byte of it again.
+//! Memory of a dropped answer, kept for the next one. New memory is zeroed, which takes 0.1 ms per 3 MB, although the
+//! renderer then overwrites every byte.
 
 use std::fmt;
 
@@ -19,7 +19,7 @@ struct Spare {
 }
 
 impl SpareMemory {
-    /// `count` words of any values: the spare ones if they are enough and not more than twice as many.
+    /// Returns `count` words with any values: the spare ones if they are at least `count` and at most twice as many.
     pub(crate) fn take(&self, count: usize) -> Vec<u64> {
         let mut spare = self.0.lock();
         if !(count..=2 * count).contains(&spare.words.capacity()) {
@@ -32,8 +32,8 @@ impl SpareMemory {
         words
     }
 
-    /// Keeps the words of an answer that is gone. Those that are kept already stay if they are more, unless they did not
-    /// fit since.
+    /// Keeps the words of a dropped answer. Of these and the words that are kept already, the larger block stays,
+    /// unless the kept block was too small or too large for a request since.
     pub(crate) fn recycle(&self, mut words: Vec<u64>) {
         if words.capacity() * size_of::<u64>() <= limits::SPARE_ANSWER_BYTES {
             let mut spare = self.0.lock();
@@ -68,7 +68,7 @@ mod tests {
             was_spare
         };
         assert_eq!([1000, 1000, 500, 1000].map(next), [false, true, true, true]);
-        // Those that do not fit are replaced, also by fewer.
+        // Blocks that do not fit are replaced, even by smaller ones.
         assert_eq!([1001, 1001, 499, 499].map(next), [false, true, false, true]);
         let too_large = limits::SPARE_ANSWER_BYTES / size_of::<u64>() + 1;
         assert_eq!([too_large, too_large, 499].map(next), [false, false, true]);
@@ -80,7 +80,7 @@ mod tests {
         spare.recycle(vec![9; 1000]);
         let [first, second] = [spare.take(1000), spare.take(1000)];
         assert_eq!([&first[..], &second], [[9; 1000], [0; 1000]]);
-        // The larger of two that come back is kept.
+        // The larger of two returned blocks is kept.
         let spare = SpareMemory::default();
         spare.recycle(first);
         spare.recycle(vec![7; 10]);

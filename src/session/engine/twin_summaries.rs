@@ -28,9 +28,9 @@ pub struct TwinSummary {
 /// The twins of a catalog, summarized.
 #[derive(Clone, Debug, Default)]
 pub struct TwinSummaries {
-    /// Those that can be opened, in order of name.
+    /// Twins that can be opened, in order of name.
     pub twins: Vec<Arc<TwinSummary>>,
-    /// Those whose latest version is damaged, in order of name.
+    /// Twins whose latest version is damaged, in order of name.
     pub damaged: Vec<DamagedSummary>,
 }
 
@@ -39,7 +39,7 @@ pub struct TwinSummaries {
 pub struct DamagedSummary {
     /// Name of the twin.
     pub name: String,
-    /// What is wrong.
+    /// The damage.
     pub reason: String,
 }
 
@@ -86,8 +86,8 @@ impl SummaryCache {
             // Looked up after the log is read: a push pins the latest version before it commits.
             let pinned = pinned(&listing.name);
             let number = pinned.unwrap_or(listing.number);
-            // `listing.hash` is that of the latest version, so a pinned version is compared by number
-            // alone: numbers only rise while a version is pinned.
+            // `listing.hash` is that of the latest version, so a pinned version is compared only by number: numbers
+            // only rise while a version is pinned.
             let is_current = |summary: &Arc<TwinSummary>| {
                 summary.number == number && (pinned.is_some() || summary.hash == listing.hash)
             };

@@ -13,7 +13,7 @@ pub struct ObservationBuffer {
     len: usize,
     /// Bytes that are reserved at the front.
     header: usize,
-    /// Where the message begins: what of the reserved bytes is not needed comes before.
+    /// Start of the message. Reserved bytes that the header does not need come before it.
     start: usize,
     share: BudgetShare,
 }
@@ -36,13 +36,13 @@ impl ObservationBuffer {
         Ok(Self { words, len, header, start: header, share })
     }
 
-    /// The message: the header, its length prefix included, and the tensors. Without a header the tensors alone.
+    /// The message: the header, its length prefix included, and the tensors. Without a header only the tensors.
     pub fn bytes(&self) -> &[u8] {
         &bytemuck::cast_slice(&self.words)[self.start..self.len]
     }
 
-    /// Makes the message begin with a header of `bytes`, its length prefix included, and returns them.
-    /// `None` if not so many are reserved.
+    /// Makes the message begin with a header of `bytes`, its length prefix included, and returns them. `None` if fewer
+    /// are reserved.
     pub fn header_mut(&mut self, bytes: usize) -> Option<&mut [u8]> {
         let header = self.header;
         self.start = header.checked_sub(bytes)?;

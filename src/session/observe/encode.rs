@@ -30,9 +30,9 @@ pub(crate) struct EncodedImage {
     pub(crate) file: Vec<u8>,
     /// Its trust, if the session's images come with one.
     pub(crate) trust: Option<Trust>,
-    /// What became of it, if the session asked for repair.
+    /// Result of the repair, if the session asked for repair.
     pub(crate) repair: Option<ImageRepair>,
-    /// What its camera's effects changed, if there are any.
+    /// Changes by the camera's effects, if there are any.
     pub(crate) effects: Option<AppliedEffects>,
     /// The pixels after these effects, of raw images.
     pub(crate) changed: Vec<u8>,
@@ -40,10 +40,10 @@ pub(crate) struct EncodedImage {
     pub(crate) took: Duration,
 }
 
-/// What the effects of a camera changed of an image.
+/// Changes of an image by the effects of its camera.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct AppliedEffects {
-    /// BLAKE3 of the pixels before.
+    /// BLAKE3 of the pixels before the effects.
     pub(crate) clean_hash: blake3::Hash,
     /// Offset of the exposure, in stops; only with a drift.
     pub(crate) stops: Option<f64>,

@@ -27,9 +27,9 @@ pub(crate) struct PastFrame {
     pub(crate) hash: blake3::Hash,
     /// Its trust, if the session's images come with one.
     pub(crate) trust: Option<Trust>,
-    /// What became of it, if the session asked for repair.
+    /// Result of the repair, if the session asked for repair.
     pub(crate) repair: Option<ImageRepair>,
-    /// What the camera's effects did to it, if it has any.
+    /// Effects of the camera on the image, if it has any.
     pub(crate) sensor: Option<ImageSensor>,
     /// As it travels: a JPEG or PNG file, or raw pixels.
     pub(crate) bytes: Vec<u8>,
@@ -64,7 +64,7 @@ impl FrameHistory {
         Self(self.0.iter().filter(|kept| kept.frame.due_us < time_us).cloned().collect())
     }
 
-    /// These frames, and those of another history that this one lacks.
+    /// Adds the frames of another history that this one lacks.
     #[must_use]
     pub(crate) fn or(mut self, other: &Self) -> Self {
         for kept in &other.0 {
@@ -75,8 +75,8 @@ impl FrameHistory {
         self
     }
 
-    /// Drops the frames that no decision at a time, in microseconds, or after it will show. Those that the
-    /// observation of now shows stay: a snapshot of now shows them again.
+    /// Drops the frames that no decision at or after a time, in microseconds, will show. Frames that the present
+    /// observation shows stay, because a snapshot of the present shows them again.
     pub(crate) fn drop_unneeded(&mut self, schedule: &Schedule, time_us: i64) {
         self.0.retain(|kept| schedule.is_shown_from(kept.frame.camera, kept.frame.due_us, time_us));
     }

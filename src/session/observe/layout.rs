@@ -1,5 +1,5 @@
-//! What every observation of a session looks like: its cameras, their encoding and maps, and which frames
-//! of them are rendered when.
+//! Layout of the observations of a session: the cameras, their encoding and maps, and which frames of them are rendered
+//! when.
 
 use std::collections::BTreeMap;
 
@@ -16,14 +16,14 @@ use crate::episode::Episode;
 use crate::error::SessionError;
 use crate::limits;
 use crate::options::PixelMaps;
-use crate::repair::drawn::TOLD;
+use crate::repair::drawn::MAX_REPORTED_REFERENCES;
 use crate::sensors::EpisodeSensors;
 use crate::sensors::delivery::{Delivery, FrameSource};
 use crate::sensors::pixels::PixelEffects;
 use crate::sensors::settings::{CameraSensor, Sensors};
 use crate::viewpoint::viewpoints;
 
-/// The header's length, little-endian, comes before the header.
+/// Bytes of the header's length, little-endian, which comes before the header.
 pub const HEADER_PREFIX_BYTES: usize = 8;
 
 /// Room for the parts of the header that do not repeat: names of at most 64 bytes, hashes of 64, the ego's
@@ -35,17 +35,17 @@ const HEADER_BASE_BYTES: usize = 4096;
 /// of 42 with their keys, below 1,600 bytes.
 const HEADER_IMAGE_BYTES: usize = 3584;
 
-/// Room in the header per image for what is told of its repair: three texts, one of them a hash.
+/// Room in the header per image for the result of its repair: three texts, one of them a hash.
 const REPAIR_IMAGE_BYTES: usize = 256;
 
 /// Room in the header per image for the names of references: each has the names of a drive and of a camera, of 64 bytes,
 /// and a number.
-const REFERENCES_IMAGE_BYTES: usize = TOLD * 160;
+const REFERENCES_IMAGE_BYTES: usize = MAX_REPORTED_REFERENCES * 160;
 
-/// Room in the header per image for what is told of its camera's effects: five reasons, three numbers and a hash.
+/// Room in the header per image for the effects of its camera: five reasons, three numbers and a hash.
 const SENSOR_IMAGE_BYTES: usize = 512;
 
-/// Most images of one answer, whether of several poses or of several times.
+/// Largest number of images of one answer, whether of several poses or of several times.
 const IMAGES: usize = limits::OBSERVE_POSES * Rig::MAX_CAMERAS;
 const _: () = assert!(limits::BUNDLE_FRAMES <= limits::OBSERVE_POSES);
 
@@ -56,7 +56,7 @@ const _: () = assert!(
 );
 const _: () = assert!(Rig::MAX_CAMERAS <= MAX_VIEWS);
 
-/// What every observation of a session looks like.
+/// Layout of the observations of a session.
 #[derive(Debug)]
 pub(crate) struct ObservationLayout {
     cameras: Vec<RigCamera>,
@@ -65,7 +65,7 @@ pub(crate) struct ObservationLayout {
     encoding: Encoding,
     maps: PixelMaps,
     schedule: Schedule,
-    /// Room in the header for what a scenario tells.
+    /// Room in the header for the state of a scenario.
     scenario_bytes: usize,
     /// Room in the header per image.
     image_bytes: usize,
@@ -77,38 +77,38 @@ pub(crate) struct ObservationLayout {
 #[derive(Debug)]
 pub(crate) struct SensorLayout {
     pub(crate) settings: Sensors,
-    /// Those of each camera, by its index.
+    /// Effects of each camera, by its index.
     cameras: Vec<CameraSensor>,
 }
 
-/// What is rendered at once: some cameras of the rig, at one pose and time.
+/// Views that are rendered in one frame: some cameras of the rig, at one pose and time.
 #[derive(Clone, Debug)]
 pub(crate) struct RigCapture {
     /// Where the rig is.
     pub(crate) world_from_rig: Pose,
     /// When the pictures are taken, in microseconds since the episode's start.
     pub(crate) time_us: i64,
-    /// When the frames are due. Only a camera with effects shows a picture of an earlier time.
+    /// When the frames are due. Only a camera with sensor effects shows a picture of an earlier time.
     pub(crate) due_us: i64,
-    /// Whether sensors take them: not for `observe`, which shows the scene.
-    pub(crate) sensed: bool,
+    /// Whether the effects of sensors apply. They do not for `observe`, which shows the scene.
+    pub(crate) has_sensor_effects: bool,
     /// Indices of the cameras; there may be none.
     pub(crate) cameras: Vec<usize>,
-    /// Indices of the cameras, rising, for whose views the levels of detail are chosen: these ones, or more.
+    /// Ascending indices of the cameras for whose views the levels of detail are chosen: at least [`Self::cameras`].
     pub(crate) detail_for: Vec<usize>,
     /// Whether the observation shows the images now. Otherwise they are rendered for the frame history.
     pub(crate) shown: bool,
 }
 
-/// What the effects of an episode's sensors depend on, beside the time.
+/// Seed and start time of the episode, from which the sensor effects are derived.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct EpisodeKey {
+pub(crate) struct EffectSeed {
     pub(crate) seed: u64,
-    /// Where the episode or its warm-up begins, in microseconds.
+    /// Start of the episode or of its warm-up, in microseconds.
     pub(crate) begin_us: i64,
 }
 
-impl EpisodeKey {
+impl EffectSeed {
     pub(crate) fn of(episode: &Episode) -> Self {
         Self { seed: episode.seed(), begin_us: episode.begin_us() }
     }
@@ -117,17 +117,17 @@ impl EpisodeKey {
 /// Bytes that the renderer writes straight into the observation's buffer.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct InPlaceBytes {
-    /// Of the float maps.
+    /// Bytes of the float maps.
     pub(super) floats: usize,
-    /// Of the instances.
+    /// Bytes of the instances.
     pub(super) instances: usize,
-    /// Of raw pixels.
+    /// Bytes of raw pixels.
     pub(super) raw: usize,
 }
 
 /// A frame of the history that an observation shows.
 pub(super) struct EarlierFrame<'a> {
-    /// Age in frames of its camera: 1 is the frame before the newest.
+    /// Age in frames of its camera: 1 is the second newest frame.
     pub(super) back: usize,
     pub(super) frame: &'a PastFrame,
 }
@@ -165,7 +165,7 @@ impl ObservationLayout {
         Ok(layout)
     }
 
-    /// Reserves room in the headers for what is told of repaired images. Comes before [`Self::reserve_header`].
+    /// Reserves room in the headers for the results of repair. Comes before [`Self::reserve_header`].
     pub(crate) fn reserve_repair(&mut self) {
         self.image_bytes += REPAIR_IMAGE_BYTES;
     }
@@ -229,7 +229,7 @@ impl ObservationLayout {
         sensor.filter(|sensor| **sensor != CameraSensor::default())
     }
 
-    /// What an episode keeps for its sensors; `None` without effects.
+    /// State of the sensors of an episode at its start; `None` without effects.
     pub(crate) fn episode_sensors(&self) -> Option<EpisodeSensors> {
         let SensorLayout { settings, cameras } = self.sensors.as_ref()?;
         let reach_us = |(camera, sensor): (usize, &CameraSensor)| {
@@ -239,15 +239,15 @@ impl ObservationLayout {
         Some(EpisodeSensors::at_start(settings, reach_us))
     }
 
-    /// What a camera delivers in an episode when a frame is due, in microseconds.
-    pub(crate) fn delivery(&self, camera: usize, of: EpisodeKey, due_us: i64) -> Delivery {
+    /// The frame that a camera delivers in an episode when a frame is due, in microseconds.
+    pub(crate) fn delivery(&self, camera: usize, of: EffectSeed, due_us: i64) -> Delivery {
         let changed = self.sensor(camera).filter(|sensor| sensor.changes_times());
         let Some(sensor) = changed else {
             return Delivery { stamp_us: due_us, taken_us: due_us, missing: None };
         };
         let name = &self.cameras[camera].name;
         let period_us = self.schedule.period_us(camera);
-        let EpisodeKey { seed, begin_us } = of;
+        let EffectSeed { seed, begin_us } = of;
         FrameSource { sensor, name, seed, period_us, begin_us }.at(due_us)
     }
 
@@ -255,7 +255,7 @@ impl ObservationLayout {
     pub(crate) fn pixel_effects(
         &self,
         camera: usize,
-        of: EpisodeKey,
+        of: EffectSeed,
         taken_us: i64,
     ) -> Option<PixelEffects> {
         let sensor = self.sensor(camera)?;
@@ -285,9 +285,9 @@ impl ObservationLayout {
         &self.schedule
     }
 
-    /// What to render for an observation of the present time of an episode: the frames that this observation
-    /// or a later one contains and that are not in the history. One capture per time; the last one is that of
-    /// the present time, and may have no cameras. Cameras whose picture is of another time have captures of their own.
+    /// Captures to render for an observation of the present time of an episode: the frames that this observation or a
+    /// later one contains and that are not in the history. One capture per time; the last one is that of the present
+    /// time, and may have no cameras. Cameras whose picture is of another time have captures of their own.
     pub(crate) fn captures(&self, episode: &Episode, history: &FrameHistory) -> Vec<RigCapture> {
         self.captures_beside(episode, &|camera, time_us| history.find(camera, time_us).is_some())
     }
@@ -305,7 +305,7 @@ impl ObservationLayout {
         for camera in 0..self.cameras.len() {
             for due_us in self.schedule.due(camera, now_us) {
                 if due_us >= episode.begin_us() && !is_kept(camera, due_us) {
-                    let taken_us = self.delivery(camera, EpisodeKey::of(episode), due_us).taken_us;
+                    let taken_us = self.delivery(camera, EffectSeed::of(episode), due_us).taken_us;
                     cameras_by_time.entry([due_us, taken_us]).or_default().push(camera);
                 }
             }
@@ -314,7 +314,7 @@ impl ObservationLayout {
             world_from_rig: episode.pose_at(time_us),
             time_us,
             due_us,
-            sensed: true,
+            has_sensor_effects: true,
             detail_for: self.detail_for(&cameras),
             cameras,
             shown: due_us == now_us && self.schedule.is_decision(now_us),
@@ -329,7 +329,7 @@ impl ObservationLayout {
             world_from_rig,
             time_us: episode.time_us(),
             due_us: episode.time_us(),
-            sensed: false,
+            has_sensor_effects: false,
             detail_for: cameras.clone(),
             cameras: cameras.clone(),
             shown: true,
@@ -337,9 +337,9 @@ impl ObservationLayout {
         poses.into_iter().map(capture).collect()
     }
 
-    /// The cameras for whose views the levels of detail of a frame are chosen that sensors take. If a camera may deliver
-    /// another picture than the one that is due, these are all of the rig: neither a picture nor the other cameras'
-    /// images then depend on which frames are lost.
+    /// The cameras for whose views the levels of detail of a frame with sensor effects are chosen. If a camera may
+    /// deliver a different picture from the one that is due, these are all cameras of the rig, so that no image depends
+    /// on which frames are lost.
     pub(crate) fn detail_for(&self, cameras: &[usize]) -> Vec<usize> {
         let mut sensors = self.sensors.iter().flat_map(|sensors| &sensors.cameras);
         match sensors.any(CameraSensor::changes_times) {
@@ -359,7 +359,7 @@ impl ObservationLayout {
         episode.views(&self.cameras, &capture.cameras, capture.world_from_rig, capture.time_us)
     }
 
-    /// Checks that the images of so many rigs, which `field` of a request asks for, fit one answer.
+    /// Checks that the images of `rigs` poses of the rig, which `field` of a request asks for, fit one answer.
     pub(super) fn check_size(&self, field: &'static str, rigs: usize) -> Result<(), SessionError> {
         let limit = self.pixel_limit();
         let pixels = self.rig_pixels() * rigs as u64;
@@ -375,8 +375,8 @@ impl ObservationLayout {
         pixels * limits::ANSWER_PIXELS / self.pixel_limit()
     }
 
-    /// Bytes of a session's answers to steps: the one that is made, and the one before it, which is kept for a repeated
-    /// request. What a session shows of earlier times comes on top.
+    /// Bytes of a session's answers to steps: the one that is made, and the previous one, which is kept for a repeated
+    /// request. Frames of earlier times are not counted.
     pub(crate) fn answers_bytes(&self) -> u64 {
         let PixelMaps { depth, opacity, normals, instances } = self.maps;
         let maps = [
@@ -393,8 +393,8 @@ impl ObservationLayout {
         2 * self.rig_pixels() * (maps + colour)
     }
 
-    /// Bytes of the images that no answer holds while a frame is rendered: pixels that are encoded, and maps from which
-    /// trust and normals are computed.
+    /// Bytes of the images outside of the answer while a frame is rendered: pixels that are encoded, and maps from
+    /// which trust and normals are computed.
     pub(crate) fn rendered_bytes(&self, has_trust: bool) -> u64 {
         let PixelMaps { depth, opacity, normals, .. } = self.maps;
         let pixels = if self.encoding == Encoding::Raw { 0 } else { 3 };
@@ -419,7 +419,7 @@ impl ObservationLayout {
         }
     }
 
-    /// Reserves room in the headers for what a scenario with so many actors tells.
+    /// Reserves room in the headers for the state of a scenario with `actors` actors.
     ///
     /// # Errors
     /// The largest header would be longer than clients accept.
@@ -465,8 +465,8 @@ impl ObservationLayout {
         !capture.shown || self.schedule.is_shown_after(camera, capture.due_us, capture.due_us)
     }
 
-    /// The frames of the history that a decision shows beside those of its own time: camera by camera,
-    /// the newest first.
+    /// The frames of the history that a decision shows in addition to those of its own time: by camera, the newest
+    /// first.
     pub(super) fn earlier_frames<'a>(
         &self,
         history: &'a FrameHistory,
@@ -487,7 +487,7 @@ impl ObservationLayout {
         [camera.height_px as usize, camera.width_px as usize]
     }
 
-    /// Shape of a colour tensor: of pixels, or of a file of so many bytes.
+    /// Shape of a colour tensor: of pixels, or of a file of `file_bytes` bytes.
     pub(super) fn colour_shape(&self, camera: usize, file_bytes: usize) -> Vec<usize> {
         let [height, width] = self.size_px(camera);
         match self.encoding {

@@ -15,12 +15,11 @@
 //! `server` writes the header last. Floats come before bytes, so that every float tensor starts at a
 //! multiple of 4.
 //!
-//! **Which frames are rendered** depends on the simulated time alone ([`schedule`]): only those that the
-//! observation of some decision contains. A frame that a later observation contains again is kept in the
-//! [`frame_history`] in the form in which it is sent, as a file or as pixels, and counts against the budget
-//! for answers. A frame that an observation contains and that is not in the history is rendered with that
-//! observation. So a warm-up needs no special case: its poses are in the episode's track at negative times,
-//! and at the first request none of its frames is in the history.
+//! **Which frames are rendered** depends only on the simulated time ([`schedule`]): only those that the observation of
+//! some decision contains. A frame that a later observation contains again is kept in the [`frame_history`] in the form
+//! in which it is sent, as a file or as pixels, and counts against the budget for answers. A frame that an observation
+//! contains and that is not in the history is rendered with that observation. So a warm-up needs no special case: its
+//! poses are in the episode's track at negative times, and at the first request none of its frames is in the history.
 //!
 //! **An overlay is part of the rig**, as PNG in the rig's JSON. So messages, manifests and recordings contain
 //! it without further code, and it is cropped and scaled with its camera. A session's overlays count against

@@ -1,4 +1,4 @@
-//! What an observation consists of, before `server` writes its header.
+//! The parts of an observation, before `server` writes its header.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -25,11 +25,11 @@ pub struct Observation {
     pub history_count: usize,
     /// How long its parts took.
     pub timings: Timings,
-    /// Memory of the twins, and what had to be loaded for this observation.
+    /// Memory of the twins, and the loads for this observation.
     pub residency: ResidencyStats,
 }
 
-/// Memory of the twins, and what had to be loaded for an observation.
+/// Memory of the twins, and the loads for an observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ResidencyStats {
     /// Bytes of Gaussians in memory, of all twins.
@@ -55,9 +55,9 @@ pub struct ImageInfo {
     pub hash: blake3::Hash,
     /// Its trust, if the session's images come with one.
     pub trust: Option<Trust>,
-    /// What became of it, if the session asked for repair.
+    /// Result of the repair, if the session asked for repair.
     pub repair: Option<ImageRepair>,
-    /// What its camera did to it, if the session asked for effects of this camera.
+    /// Effects of its camera on it, if the session asked for effects of this camera.
     pub sensor: Option<ImageSensor>,
 }
 
@@ -66,7 +66,7 @@ pub struct ImageInfo {
 pub struct PastImageInfo {
     /// Index of the camera among [`crate::Session::cameras`].
     pub camera: usize,
-    /// Age in frames of this camera: 1 is the frame before the newest.
+    /// Age in frames of this camera: 1 is the second newest frame.
     pub back: usize,
     /// When it was taken by the camera's clock, in microseconds since the episode's start.
     pub time_us: i64,
@@ -74,16 +74,16 @@ pub struct PastImageInfo {
     pub hash: blake3::Hash,
     /// Its trust, if the session's images come with one.
     pub trust: Option<Trust>,
-    /// What became of it, if the session asked for repair.
+    /// Result of the repair, if the session asked for repair.
     pub repair: Option<ImageRepair>,
-    /// What its camera did to it, if the session asked for effects of this camera.
+    /// Effects of its camera on it, if the session asked for effects of this camera.
     pub sensor: Option<ImageSensor>,
 }
 
 /// One tensor of an [`Observation`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tensor {
-    /// What it holds.
+    /// Kind of its contents.
     pub kind: TensorKind,
     /// Type of its elements.
     pub dtype: DType,
@@ -93,7 +93,7 @@ pub struct Tensor {
     pub bytes: Range<usize>,
 }
 
-/// What a tensor holds; images by their index in [`Observation::images`].
+/// Contents of a tensor; images by their index in [`Observation::images`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TensorKind {
     /// Positions of the ego history, in metres: `[16, 3]`.
@@ -134,7 +134,7 @@ pub enum DType {
 pub struct Timings {
     /// Time in the render queue.
     pub queue: Duration,
-    /// Rendering, including the encoding that ran beside it.
+    /// Rendering, including the encoding that ran at the same time.
     pub render: Duration,
     /// Encoding and hashing, summed over all threads.
     pub encode: Duration,

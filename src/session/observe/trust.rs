@@ -1,11 +1,11 @@
-//! Trust: confidence in an image, from 1 (as recorded) to 0 (nothing is known).
+//! Trust: confidence in an image, from 1 (as recorded) to 0 (no information).
 //!
-//! A twin looks right from the poses where it was recorded. The trust is a product of three factors. Two of
-//! them are one minus a measured share: of pixels that look down at the ground and have low opacity, and of
-//! rays to the ground that leave the twin. The third cannot be measured: from other poses, errors of the
-//! training become visible, and there is no recorded image to compare with. It decays exponentially with the
-//! distance and the rotation from the nearest recorded pose. The rate is a convention of this project;
-//! `tests/session/trust.rs` checks that a twin without training errors loses less than that.
+//! A twin is accurate at the poses where it was recorded. The trust is a product of three factors. Two of them are one
+//! minus a measured share: of pixels that look down at the ground and have low opacity, and of rays to the ground that
+//! leave the twin. The third cannot be measured: from other poses, errors of the training become visible, and there is
+//! no recorded image to compare with. It decays exponentially with the distance and the rotation from the nearest
+//! recorded pose. The rate is a convention of this project; `tests/session/trust.rs` checks that the share of correct
+//! pixels of a twin without training errors decays more slowly.
 //!
 //! It is computed on the render thread that finishes an image, from one in 256 of its pixels, while other
 //! cameras are still rendered. The nearest keyframe is found in an index of boxes of 64 keyframes
@@ -27,8 +27,8 @@ use wildcity_scene::route::BoxIndex;
 /// lane.
 const DECAY_M: f64 = 5.0;
 
-/// Turn from the recorded pose at which the trust is 1/e, in radians. A rig that turns in place looks where
-/// its other cameras have recorded, so this is slow.
+/// Angle from the recorded pose at which the trust is 1/e, in radians. When a rig rotates in place, its cameras look in
+/// directions that its other cameras recorded, so this decay is slow.
 const DECAY_RAD: f64 = 12.0;
 
 /// In the search for the nearest recorded pose, a rotation of one radian counts as this distance, in metres.
@@ -55,7 +55,7 @@ const HOLE_OPACITY: f32 = 0.5;
 /// Confidence in an image, and the values that it is computed from.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Trust {
-    /// 1 where and as it was recorded, 0 where nothing is known.
+    /// 1 at a recorded pose, 0 without any information.
     pub value: f64,
     /// From the rig to the nearest recorded keyframe, in metres.
     pub distance_m: f64,
@@ -63,8 +63,8 @@ pub struct Trust {
     pub angle_rad: f64,
     /// Share of pixels with less than half opacity, of those that look down at the ground.
     pub low_coverage: f64,
-    /// Share of rays that meet no block of the twin within 200 m, of those that look down at the ground. Of an
-    /// image without such rays: 1 if the twin has no block within 200 m, else 0.
+    /// Of the rays that look down at the ground, the share that meets no block of the twin within 200 m. For an image
+    /// without such rays: 1 if the twin has no block within 200 m, else 0.
     pub outside: f64,
 }
 
@@ -77,17 +77,17 @@ pub struct TrainingCoverage {
     heights_m: HashMap<[i64; 2], [f64; 2]>,
 }
 
-/// Distance and turn from a recorded pose.
+/// Distance and angle from a recorded pose.
 struct Deviation {
     distance_m: f64,
     angle_rad: f64,
 }
 
-/// What was found among the sampled pixels that look down at the ground: shares from 0 to 1.
+/// Result for the sampled pixels that look down at the ground: shares from 0 to 1.
 struct GroundShares {
-    /// Of the pixels, those with low opacity.
+    /// Share of the pixels that have low opacity.
     holes: f64,
-    /// Of the rays that were followed, those that left the twin.
+    /// Share of the followed rays that left the twin.
     outside: f64,
 }
 
@@ -126,7 +126,7 @@ impl TrainingCoverage {
         Trust { value, distance_m, angle_rad, low_coverage: holes, outside }
     }
 
-    /// Distance and turn from the nearest keyframe.
+    /// Distance and angle from the nearest keyframe.
     fn deviation(&self, world_from_rig: &Pose) -> Deviation {
         let here_m = world_from_rig.position_m;
         let deviation_from = |index: usize| {

@@ -19,14 +19,14 @@ struct State {
 type Task = Box<dyn FnOnce() + Send>;
 
 impl LatestTask {
-    /// Runs a task soon, in place of one that still waits.
+    /// Runs a task soon, instead of a task that still waits.
     pub(crate) fn submit(&self, task: impl FnOnce() + Send + 'static) {
         let replaced = {
             let mut state = self.0.lock();
             if !state.running {
                 state.running = true;
                 let shared = self.0.clone();
-                // Nothing waits for the thread's end.
+                // The end of the thread is not awaited.
                 drop(tokio::task::spawn_blocking(move || run_all(&shared)));
             }
             state.next.replace(Box::new(task))

@@ -50,7 +50,7 @@ impl RecordedDrive {
 
     /// The point of the drive that is nearest to `point_m`; `None` if the drive has no poses.
     pub(super) fn nearest(&self, point_m: DVec3) -> Option<NearestPoint> {
-        // Of one segment, with the distance along that segment for `station_m`.
+        // Nearest point on one segment; `station_m` is the distance along that segment.
         let on_segment = |index: usize| {
             let from_m = self.poses[index].position_m;
             let to_m = self.poses.get(index + 1).map_or(from_m, |next| next.position_m);
@@ -71,7 +71,7 @@ impl RecordedDrive {
         Some(NearestPoint { station_m, distance_m })
     }
 
-    /// The pose at a distance along the drive, in metres. Beyond its end the drive goes straight on.
+    /// The pose at a distance along the drive, in metres. Beyond its end the drive continues straight.
     pub(super) fn pose_at(&self, station_m: f64) -> Pose {
         let after = self.stations_m.partition_point(|&m| m < station_m);
         let last = self.poses.len() - 1;

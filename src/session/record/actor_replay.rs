@@ -21,7 +21,7 @@ pub(super) struct ActorReplay<'a> {
     count: usize,
     /// The longest exposure of a camera, in microseconds.
     exposure_us: i64,
-    /// What later frames show, each with the number of frames before it.
+    /// Actors of later frames, each with the number of frames before it.
     later: Peekable<Iter<'a, (usize, ActorsLine)>>,
     past: ActorPast,
 }
@@ -50,7 +50,7 @@ impl<'a> ActorReplay<'a> {
         }
     }
 
-    /// What a frame of a time draws of the actors.
+    /// The actors that a frame of a time shows.
     pub(super) fn placed(&self, taken_us: i64, frame: FrameDetail<'_>) -> Vec<PlacedChunk> {
         if self.assets.is_empty() {
             return Vec::new();

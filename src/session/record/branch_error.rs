@@ -9,7 +9,7 @@ pub enum BranchError {
     /// The file cannot be read, or is damaged.
     #[error(transparent)]
     Read(#[from] ReplayError),
-    /// The version of the twin is not the recorded one.
+    /// The version of the twin differs from the recorded one.
     #[error("version {version} of the twin was {recorded}, and is {now} now")]
     Version {
         /// Number of the version.
@@ -32,7 +32,7 @@ pub enum BranchError {
     /// Driving the recorded commands leads elsewhere, or to other frames.
     #[error("{0}")]
     Diverged(String),
-    /// A frame that later observations show again is not rendered as it was then.
+    /// A frame that later observations show again is rendered differently from the record.
     #[error(
         "the image of camera {camera:?} at {time_us} µs is not as recorded (by backend \
          {recorded_by}); this is backend {backend}"

@@ -39,7 +39,7 @@ impl RecordedCommand {
     /// The command.
     ///
     /// # Errors
-    /// A recorded path is none.
+    /// A recorded path is invalid.
     pub(crate) fn command(&self) -> Result<Command, EgoError> {
         Ok(match self {
             Self::Pose(pose) => Command::Pose(*pose),

@@ -1,5 +1,5 @@
-//! Finds the state of a recorded episode after one of its steps: drives its commands again, and lists the frames
-//! that later observations show.
+//! Finds the state of a recorded episode after one of its steps: executes its commands again, and lists the frames that
+//! later observations show.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -47,7 +47,7 @@ pub(crate) struct KeptFrames {
 pub(crate) struct KeptFrame {
     /// Index of the camera.
     pub(crate) camera: usize,
-    /// Of this camera alone.
+    /// Contains only this camera.
     pub(crate) capture: RigCapture,
     /// The recorded hash of the image, in hex.
     pub(crate) hash: String,
@@ -190,7 +190,7 @@ fn frames_taken(
         }
         for (&camera, hash) in cameras.iter().zip(&mut hashes) {
             if layout.is_shown_later(capture, camera) {
-                // With the levels of detail that it had beside the other cameras.
+                // With the levels of detail that were chosen together with the other cameras.
                 let capture = RigCapture { cameras: vec![camera], shown: false, ..capture.clone() };
                 taken.push(KeptFrame { camera, capture, hash: hash.clone() });
             }

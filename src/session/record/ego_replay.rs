@@ -1,4 +1,4 @@
-//! Drives a recorded episode again, command by command, and compares the poses with the recorded ones.
+//! Executes the commands of a recorded episode again, and compares the poses with the recorded ones.
 
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::{Command, Ground};
@@ -7,7 +7,7 @@ use super::format::{EpisodeHeader, FrameRecord, FrameRequest};
 use crate::episode::Episode;
 use crate::error::SessionError;
 
-/// A step at which the command leads to another pose than the recorded one.
+/// A step at which the command leads to a pose that differs from the recorded one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DivergedStep {
     /// Line of the episode's file, from 1.
@@ -40,7 +40,7 @@ impl EgoReplay {
         &self.episode
     }
 
-    /// Drives the step of a frame, if it is one, and compares the poses bit by bit.
+    /// If a frame is a step, executes it, and compares the poses bit by bit.
     ///
     /// # Errors
     /// The ego cannot execute the recorded command.

@@ -9,6 +9,6 @@ use std::path::PathBuf;
 pub struct RecordError {
     /// The file or directory.
     pub path: PathBuf,
-    /// What the operating system says.
+    /// The operating system's error.
     pub cause: io::Error,
 }

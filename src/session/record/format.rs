@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! <episodes>/<session>-<n>.jsonl
-//! {"kind":"episode", ...}  what the images depend on beside the poses
+//! {"kind":"episode", ...}  what the images depend on in addition to the poses
 //! {"kind":"frame", ...}    one per answer with images: request, poses, hashes
 //! {"kind":"version", ...}  the following frames are rendered from another version of the twin
 //! {"kind":"end", ...}      how the episode went; missing if the server was killed
@@ -51,12 +51,12 @@ pub struct EpisodeHeader {
     pub profile_hash: String,
     /// Name of the backend.
     pub backend: String,
-    /// What pixels depend on beside the backend's name: its instruction set.
+    /// Property of the backend on which pixels depend in addition to its name: its instruction set.
     #[serde(default)]
     pub backend_detail: String,
     /// The cameras that were rendered, in the order of the images.
     pub rig: Rig,
-    /// What the observations held beside colour, and how colour was encoded.
+    /// Maps of the observations, and the encoding of colour.
     pub outputs: RecordedOutputs,
     /// Seed of the episode.
     pub seed: u64,
@@ -111,20 +111,20 @@ pub struct RecordedOrigin {
     pub step: u64,
 }
 
-/// What the observations held.
+/// Maps of the observations, and the encoding of colour.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RecordedOutputs {
     /// How colour was encoded.
     pub encoding: Encoding,
-    /// Whether there was depth.
+    /// Whether observations had depth.
     pub depth: bool,
-    /// Whether there was opacity.
+    /// Whether observations had opacity.
     pub opacity: bool,
-    /// Whether there were normals.
+    /// Whether observations had normals.
     #[serde(default)]
     pub normals: bool,
-    /// Whether there were instances; absent if not.
+    /// Whether observations had instances; absent if not.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub instances: bool,
 }
@@ -151,14 +151,14 @@ pub struct FrameRecord {
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub steps: u64,
     /// When the frames at the poses were taken, in microseconds; only for a plan. Otherwise the last one is at
-    /// `time_us`, and those before it are in the warm-up.
+    /// `time_us`, and the earlier ones are in the warm-up.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub times_us: Vec<i64>,
-    /// When the frames at the poses were due, in microseconds; only if a camera delivered others than those that were
-    /// due. `times_us` says when their pictures were taken.
+    /// When the frames at the poses were due, in microseconds; only if a camera delivered a frame that was not due.
+    /// `times_us` says when their pictures were taken.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub due_us: Vec<i64>,
-    /// What the agent noted, as it was sent.
+    /// Notes of the agent, unchanged.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub notes: Option<Value>,
     /// Whether the agent ended the episode with this step.
@@ -167,7 +167,7 @@ pub struct FrameRecord {
     pub frame_hash: String,
     /// BLAKE3 of each image's pixels as sent, in hex: pose by pose, camera by camera.
     pub images: Vec<String>,
-    /// What the repair model did, in the order of `images`; absent if it was used on none of them.
+    /// Results of the repair model, in the order of `images`; absent if it was used on none of them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub repairs: Vec<Option<RecordedImageRepair>>,
 }
@@ -216,7 +216,7 @@ pub(crate) enum Line {
     Scenario(Box<ScenarioLine>),
     /// Before the frame of a step.
     Actors(ActorsLine),
-    /// What happened in a step.
+    /// An event of a step.
     Event(EventLine),
     /// Verdict and scores, before the end.
     Result(EpisodeResult),

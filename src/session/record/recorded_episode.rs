@@ -20,7 +20,7 @@ const _: () =
 /// A recorded episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RecordedEpisode {
-    /// What it was rendered from, and how.
+    /// Inputs and settings of its rendering.
     pub header: EpisodeHeader,
     /// All answers with images, in order; the first is line 2 of the file.
     pub frames: Vec<FrameRecord>,
@@ -28,7 +28,7 @@ pub struct RecordedEpisode {
     pub versions: Vec<(usize, RecordedVersion)>,
     /// The scenario, if there was one.
     pub scenario: Option<Box<ScenarioLine>>,
-    /// The actors, each with the number of frames before it: those of the next frame.
+    /// The actors of the next frame, each with the number of frames before it.
     pub actors: Vec<(usize, ActorsLine)>,
     /// Lines of the file, from 1, at which the frames are.
     pub frame_lines: Vec<usize>,
@@ -126,7 +126,7 @@ impl RecordedEpisode {
     }
 }
 
-/// Checks that the cameras and images of a frame match its poses. Returns what is wrong otherwise.
+/// Checks that the cameras and images of a frame match its poses. Returns what is wrong, if anything.
 fn check_images(frame: &FrameRecord, rig_cameras: usize) -> Result<(), String> {
     let poses = frame.poses.len();
     if !(1..=PLAN_STEPS as u64).contains(&frame.steps) {

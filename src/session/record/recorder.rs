@@ -50,7 +50,7 @@ impl Recorder {
         };
         let recorder = Self { file: Arc::new(file), path: path.into() };
         if let Err(error) = recorder.append(lines) {
-            // The first failure says more than one of removing the file would.
+            // The first error explains more than an error of removing the file would.
             let _ = fs::remove_file(&recorder.path);
             return Err(error);
         }

@@ -1,8 +1,8 @@
-//! The repair of a recorded episode, decided and done again.
+//! Repeats the repair of a recorded episode and its decisions.
 //!
-//! The decisions depend on the trust of the rendered images, which is computed again, and are compared with the
-//! record always. Repaired pixels are compared if the model is at hand, has the recorded hash and repeats its
-//! bytes; otherwise the report says that they were not.
+//! The decisions depend on the trust of the rendered images, which is computed again, and are compared with the record
+//! always. Repaired pixels are compared if the model is available, has the recorded hash and is deterministic;
+//! otherwise the report mentions that they were not compared.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ use super::format::EpisodeHeader;
 use super::repairs::RecordedRepair;
 use super::replay_report::{ProvenanceChange, ReplayError};
 use crate::observe::trust::TrainingCoverage;
-use crate::repair::drawn::{Beside, CameraRays};
+use crate::repair::drawn::{CameraRays, ReferenceInputs};
 use crate::repair::offline::{NeededReferences, OfflineView, ReferenceSupply};
 use crate::repair::references::ReferenceViews;
 use crate::repair::rendered_image::RenderedImage;
@@ -31,7 +31,7 @@ pub(super) struct RepairReplay<'a> {
     /// The recorded model.
     model: Option<Arc<Model>>,
     coverage: TrainingCoverage,
-    /// By camera, after the frames so far.
+    /// Hysteresis state of each camera after the frames so far.
     state: RepairState,
     rays: CameraRays,
     /// The images that the model compares with, of the present version; if it needs some.
@@ -47,11 +47,11 @@ pub(super) struct ImageToRepair<'a> {
     pub(super) rendered: &'a RenderedImage,
     pub(super) view: &'a View,
     pub(super) world_from_rig: &'a Pose,
-    /// The ego is not at the pose: there is no history.
+    /// Whether the frame is of `observe`: the ego is not at its pose, so there is no history.
     pub(super) is_observe: bool,
 }
 
-/// What references are drawn with.
+/// Renderer settings for references.
 #[derive(Clone, Copy)]
 pub(super) struct Drawing<'a> {
     pub(super) resident: &'a Arc<Resident>,
@@ -60,8 +60,8 @@ pub(super) struct Drawing<'a> {
 }
 
 impl<'a> RepairReplay<'a> {
-    /// None if the episode was not repaired. Loads the model if `models` has it; what differs from the recorded
-    /// one is added to `changes`.
+    /// `None` if the episode was not repaired. Loads the model if `models` has it, and adds its differences from the
+    /// recorded model to `changes`.
     ///
     /// # Errors
     /// The model cannot be loaded, or the twin has no recorded drive any more.
@@ -172,7 +172,7 @@ impl<'a> RepairReplay<'a> {
         (0..selected.len()).map(|view| decision.cameras.contains(&view)).collect()
     }
 
-    /// The repaired pixels; none without the recorded model.
+    /// The repaired pixels; `None` without the recorded model.
     ///
     /// # Errors
     /// The model fails, or a reference cannot be read or drawn.
@@ -182,25 +182,25 @@ impl<'a> RepairReplay<'a> {
         drawing: Drawing<'_>,
     ) -> Result<Option<Vec<u8>>, RepairError> {
         let Some(model) = self.model.clone() else { return Ok(None) };
-        let beside = self
-            .beside(&model, image, drawing)
+        let inputs = self
+            .reference_inputs(&model, image, drawing)
             .map_err(|message| RepairError::Input { field: "reference".to_owned(), message })?;
-        let repaired = session_repair::repair(&model, image.mounted, image.rendered, &beside)?;
+        let repaired = session_repair::repair(&model, image.mounted, image.rendered, &inputs)?;
         if !image.is_observe {
-            self.state.references[image.camera] = beside.nearest;
+            self.state.references[image.camera] = inputs.nearest;
         }
         Ok(Some(repaired))
     }
 
-    /// What the model gets beside an image.
-    fn beside(
+    /// References that the model gets in addition to an image.
+    fn reference_inputs(
         &self,
         model: &Model,
         image: &ImageToRepair<'_>,
         Drawing { resident, profile, backend }: Drawing<'_>,
-    ) -> Result<Beside, String> {
+    ) -> Result<ReferenceInputs, String> {
         let ImageToRepair { camera, mounted, rendered, view, world_from_rig, is_observe } = *image;
-        let Some(references) = &self.references else { return Ok(Beside::default()) };
+        let Some(references) = &self.references else { return Ok(ReferenceInputs::default()) };
         let kept = match is_observe {
             true => None,
             false => self.state.references[camera].as_deref(),

@@ -1,4 +1,4 @@
-//! What a record says of the repair of images.
+//! The repair of images in a record.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,11 +26,11 @@ pub struct RecordedRepair {
     pub deterministic: bool,
     /// Which images it repairs.
     pub selection: Selection,
-    /// What happened when it failed.
+    /// Behaviour when it failed.
     pub on_failure: OnFailure,
 }
 
-/// What the model did with an image that was selected.
+/// Result of the model for an image that was selected.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum RecordedImageRepair {

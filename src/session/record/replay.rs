@@ -28,7 +28,7 @@ use crate::repair::rendered_image::RenderedImage;
 use crate::scenario::assets::FrameDetail;
 use crate::viewpoint::viewpoints;
 
-/// What the caller does with each image, before it is compared with the record.
+/// The caller's function for each image, which runs before the image is compared with the record.
 type VisitImage<'a> = dyn FnMut(&ReplayedImage<'_>) -> Result<(), String> + 'a;
 
 impl RecordedEpisode {
@@ -181,7 +181,7 @@ impl<'a> Replay<'a> {
         Ok(())
     }
 
-    /// Drives the step of a frame, if it is one.
+    /// If a frame is a step, executes it.
     fn drive(&mut self, frame: &FrameRecord, index: usize) -> Result<(), ReplayError> {
         let ground = Ground::from_drives(&self.resident.version.manifest.trajectories)
             .and_lanes(self.lanes.as_ref());
@@ -195,7 +195,7 @@ impl<'a> Replay<'a> {
         Ok(())
     }
 
-    /// Compares what a frame says beside poses and images.
+    /// Compares the values of a frame other than poses and images.
     fn check_values(&mut self, frame: &FrameRecord, index: usize) {
         let line = self.frame_lines[index];
         let wrong = values::wrong_in_frame(frame, self.ego.episode(), self.cameras.len(), line);
@@ -405,8 +405,8 @@ fn used(map: &mut [f32]) -> Option<&mut [f32]> {
     (!map.is_empty()).then_some(map)
 }
 
-/// Adds the changes of a version since it was recorded. The profile's hash changes with a build that knows
-/// more fields, even for the same profile.
+/// Adds the changes of a version since it was recorded. The profile's hash changes with a build that has more fields,
+/// even for the same profile.
 fn add_scene_changes(
     changes: &mut Vec<ProvenanceChange>,
     recorded: &RecordedHashes<'_>,

@@ -1,4 +1,4 @@
-//! What a replay finds, and why one can fail.
+//! Results and errors of a replay.
 
 use std::io;
 use std::path::PathBuf;
@@ -18,9 +18,9 @@ use crate::error::SessionError;
 pub struct ReplayReport {
     /// Number of images that were rendered again.
     pub images: u64,
-    /// What differs from when the episode was recorded and may explain differing images.
+    /// Differences from the time of recording, which may explain differing images.
     pub changes: Vec<ProvenanceChange>,
-    /// The first step at which the command leads to another pose than the recorded one.
+    /// The first step at which the command leads to a pose that differs from the recorded one.
     pub diverged: Option<DivergedStep>,
     /// The first image that differs.
     pub difference: Option<ImageDifference>,
@@ -39,7 +39,7 @@ pub struct RepairedImages {
     pub not_compared: u64,
 }
 
-/// A value of the record, beside poses and images, that is not what the replay computes.
+/// A value of the record, other than poses and images, that differs from the computed value.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WrongValue {
     /// Line of the episode's file, from 1.
@@ -116,10 +116,10 @@ pub enum ReplayError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
+        /// The operating system's error.
         cause: io::Error,
     },
-    /// The file is no record.
+    /// The file is not a record.
     #[error(transparent)]
     NoRecord(#[from] ReadError),
     /// A line is damaged, incomplete or out of place.
@@ -129,7 +129,7 @@ pub enum ReplayError {
         path: PathBuf,
         /// The line, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// The error.
         reason: String,
     },
     /// The recorded cameras are invalid.
@@ -138,7 +138,7 @@ pub enum ReplayError {
     /// A version of the twin does not exist or cannot be read.
     #[error(transparent)]
     Twin(#[from] ResidencyError),
-    /// What a frame needs does not fit into memory, or could not be loaded.
+    /// The data of a frame does not fit into memory, or could not be loaded.
     #[error("step {step}: {cause}")]
     Residency {
         /// The step.

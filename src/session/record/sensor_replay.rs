@@ -4,13 +4,13 @@ use super::format::{EpisodeHeader, FrameRecord, FrameRequest, RecordedSettings};
 use super::replay_report::ReplayError;
 use crate::episode::Episode;
 use crate::error::SessionError;
-use crate::observe::layout::{EpisodeKey, ObservationLayout};
+use crate::observe::layout::{EffectSeed, ObservationLayout};
 use crate::options::PixelMaps;
 
 /// The sensors of an episode that is replayed.
 pub(super) struct SensorReplay {
     layout: ObservationLayout,
-    key: EpisodeKey,
+    effect_seed: EffectSeed,
 }
 
 impl SensorReplay {
@@ -31,12 +31,12 @@ impl SensorReplay {
             ObservationLayout::new(cameras, header.outputs.encoding, maps, schedule.clone());
         let mut layout = layout.map_err(wrong)?;
         layout.add_sensors(sensors.clone(), header.dt_us).map_err(wrong)?;
-        let key = EpisodeKey::of(&header.first_state());
-        Ok(Some(Self { layout, key }))
+        let effect_seed = EffectSeed::of(&header.first_state());
+        Ok(Some(Self { layout, effect_seed }))
     }
 
-    /// The first camera of a pose of a frame whose picture, by the settings, was taken at another time or place than the
-    /// recorded ones; with these times, in microseconds.
+    /// The first camera of a pose whose picture, by the settings, was taken at a time or place that differs from the
+    /// recorded one, and the computed times, in microseconds.
     pub(super) fn wrong_delivery(
         &self,
         frame: &FrameRecord,
@@ -53,7 +53,7 @@ impl SensorReplay {
         let mut with_effects =
             selected.iter().filter(|camera| self.layout.sensor(**camera).is_some());
         with_effects.find_map(|&camera| {
-            let taken_us = self.layout.delivery(camera, self.key, due_us).taken_us;
+            let taken_us = self.layout.delivery(camera, self.effect_seed, due_us).taken_us;
             let name = &self.layout.cameras()[camera].name;
             let text = |time_us: i64, end: &str| {
                 format!("{name}, due at {due_us} µs: taken at {time_us} µs{end}")
@@ -79,7 +79,8 @@ impl SensorReplay {
         if frame.request == FrameRequest::Observe {
             return;
         }
-        if let Some(effects) = self.layout.pixel_effects(camera, self.key, frame.taken_us(pose)) {
+        let taken_us = frame.taken_us(pose);
+        if let Some(effects) = self.layout.pixel_effects(camera, self.effect_seed, taken_us) {
             effects.apply(rgb8, self.layout.cameras()[camera].camera.width_px as usize);
         }
     }

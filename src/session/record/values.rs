@@ -1,4 +1,4 @@
-//! Compares what a record says beside poses and images with what a replay computes.
+//! Compares values of a record other than poses and images with those that a replay computes.
 
 use super::format::{FrameRecord, FrameRequest};
 use super::replay_report::WrongValue;
@@ -21,7 +21,7 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
     fn hash_of<'a>(images: impl IntoIterator<Item = &'a String>) -> String {
         let mut hasher = blake3::Hasher::new();
         for image in images {
-            // A hash that is none differs from that of the pixels.
+            // An invalid hash counts as 0, which differs from every hash of pixels.
             let bytes = blake3::Hash::from_hex(image).map_or([0; 32], |hash| *hash.as_bytes());
             hasher.update(&bytes);
         }
@@ -30,8 +30,8 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
     let shown = match frame.request {
         FrameRequest::Observe => hash_of(&frame.images),
         FrameRequest::Reset | FrameRequest::Step | FrameRequest::Restore => {
-            // Those of the poses that are due now, camera by camera; the others are earlier frames of a bundle. Without
-            // effects of sensors it is the last pose.
+            // The images of the poses that are due now, in order of the cameras; the others are earlier frames of a
+            // bundle. Without sensor effects only the last pose is due.
             let mut images = frame.images.iter();
             let mut shown: Vec<(usize, &String)> = Vec::new();
             for pose in 0..frame.poses.len() {
@@ -45,7 +45,8 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
             hash_of(shown.into_iter().map(|(_, image)| image))
         }
     };
-    // Between two decisions nothing is shown, even if a later observation shows what was rendered.
+    // Observations between two decisions show no images, even if a later observation shows images that were rendered
+    // then.
     let nothing = hash_of(&[]);
     let is_known = frame.frame_hash == shown
         || (frame.request != FrameRequest::Observe && frame.frame_hash == nothing);
@@ -55,7 +56,7 @@ fn wrong_frame_hash(frame: &FrameRecord, rig_cameras: usize, line: usize) -> Opt
     unequal(line, "frame_hash", &frame.frame_hash, &shown)
 }
 
-/// The first value of the last line that is not the replayed episode's. Its trust comes with images and is not
+/// The first value of the last line that differs from the replayed episode's. Its trust comes with images and is not
 /// computed again, but the outcome must follow from it.
 pub(super) fn wrong_in_end(
     end: &EpisodeSummary,

@@ -1,4 +1,4 @@
-//! References in memory: recorded images with the depth that the twin has there, and what a view sees of them.
+//! References in memory: recorded images with the twin's depth, and their pixels warped into a view.
 
 use std::sync::{Arc, OnceLock};
 
@@ -20,35 +20,35 @@ use wildcity_twin::store::{Catalog, StoreError, Version};
 use super::references::ReferenceView;
 use super::rendered_image::RenderedImage;
 
-/// Most names of references that are told of an image.
-pub(crate) const TOLD: usize = 8;
+/// Largest number of reference names that an observation reports per image.
+pub(crate) const MAX_REPORTED_REFERENCES: usize = 8;
 
 /// The rays of some cameras, each computed when it is first needed.
 #[derive(Debug, Default)]
 pub(crate) struct CameraRays(Vec<OnceLock<Rays>>);
 
-/// What the model gets beside an image.
+/// References that the model gets in addition to an image.
 #[derive(Debug, Default)]
-pub(crate) struct Beside {
+pub(crate) struct ReferenceInputs {
     /// For the roles `reference_warped` and `reference_valid`.
     pub(crate) warped: Option<(Image, Vec<f32>)>,
     /// For the role `reference`, in the size of the image.
     pub(crate) reference: Option<Image>,
-    /// Name of that one.
+    /// Name of [`Self::reference`].
     pub(crate) nearest: Option<String>,
-    /// The names of those that gave something, the most pixels first.
+    /// The names of the references that contributed pixels, ordered from most to fewest pixels.
     pub(crate) names: Vec<String>,
 }
 
-/// An image that may be repaired, as the search for its references sees it.
-pub(crate) struct Sight<'a> {
+/// A rendered image that may be repaired, for which references are searched and warped.
+pub(crate) struct WarpQuery<'a> {
     pub(crate) camera: &'a RigCamera,
     pub(crate) rays: &'a Rays,
     pub(crate) view: &'a View,
     pub(crate) image: &'a RenderedImage,
 }
 
-impl Beside {
+impl ReferenceInputs {
     /// Adds the image of the role `reference`, in the size of a camera's images.
     pub(crate) fn set_reference(&mut self, name: &str, reference: &Reference, camera: &Camera) {
         let [width, height] = [camera.width_px, camera.height_px].map(|side| side as usize);
@@ -69,8 +69,8 @@ impl CameraRays {
     }
 }
 
-impl Sight<'_> {
-    /// Its depth where it is opaque.
+impl WarpQuery<'_> {
+    /// Depth of the image where it is opaque.
     pub(crate) fn depth_m(&self) -> Vec<f32> {
         opaque_depth(&self.image.depth_m, &self.image.opacity)
     }
@@ -86,7 +86,7 @@ impl Sight<'_> {
         }
     }
 
-    /// Those of some references that overlap with it, in about its resolution.
+    /// Returns the references that overlap with the image, in about its resolution.
     pub(crate) fn overlapping(&self, references: Vec<ReferenceView>) -> Vec<ReferenceView> {
         let depth_m = self.depth_m();
         let target = self.target(&depth_m);
@@ -96,8 +96,12 @@ impl Sight<'_> {
         seen.map(|view| view.exposed_for(self.camera).reduced_for(&self.camera.camera)).collect()
     }
 
-    /// Brings references, with their names, into it.
-    pub(crate) fn warped(&self, references: &[(String, Arc<Reference>)], beside: &mut Beside) {
+    /// Warps references into the image, and adds the result and the names of the references to `inputs`.
+    pub(crate) fn warped(
+        &self,
+        references: &[(String, Arc<Reference>)],
+        inputs: &mut ReferenceInputs,
+    ) {
         let depth_m = self.depth_m();
         let images: Vec<Arc<Reference>> =
             references.iter().map(|(_, reference)| reference.clone()).collect();
@@ -106,20 +110,21 @@ impl Sight<'_> {
             warped.pixels.iter().copied().zip(references.iter().map(|(name, _)| name)).collect();
         used.retain(|(pixels, _)| *pixels > 0);
         used.sort_by(|(a, _), (b, _)| b.cmp(a));
-        let left = TOLD.saturating_sub(beside.names.len());
-        beside.names.extend(used.into_iter().take(left).map(|(_, name)| name.clone()));
-        beside.warped = Some((warped.image, warped.valid));
+        let left = MAX_REPORTED_REFERENCES.saturating_sub(inputs.names.len());
+        inputs.names.extend(used.into_iter().take(left).map(|(_, name)| name.clone()));
+        inputs.warped = Some((warped.image, warped.valid));
     }
 }
 
 /// A recorded image that was read.
 pub(crate) struct ReadImage {
     image: Image,
-    /// Which pixels count; all if there is none.
+    /// Mask of the pixels that count; `None` if all count.
     counts: Option<Vec<bool>>,
 }
 
-/// Reads the recorded image of a reference, in the reference's size and exposure, and its mask; `None` if it has none. Blocks.
+/// Reads the recorded image of a reference, in the reference's size and exposure, and its mask. `None` if the reference
+/// has no recorded image. Blocks.
 ///
 /// # Errors
 /// The image or the mask cannot be read, or is not one of its camera's size.
@@ -180,7 +185,7 @@ fn decoded(
     Ok(image)
 }
 
-/// Draws the depth of a reference, and its pixels if it has no recorded ones.
+/// Renders the depth of a reference, and its pixels if it has no recorded ones.
 pub(crate) fn draw(
     view: &ReferenceView,
     recorded: Option<ReadImage>,
@@ -214,7 +219,7 @@ pub(crate) fn draw(
             *depth_m = 0.0;
         }
     }
-    // What does not count has no depth: it fits to no point.
+    // Pixels that the mask excludes have no depth, so that they match no point.
     for (depth_m, _) in
         depth_m.iter_mut().zip(counts.flatten().iter().flatten()).filter(|(_, counts)| !**counts)
     {

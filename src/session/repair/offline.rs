@@ -1,7 +1,7 @@
-//! The repair of views without a session: the images beside them are read and drawn on the caller's thread.
+//! The repair of views without a session: references are read and rendered on the caller's thread.
 //!
-//! A replay finds its references by this, the report measures by it what a repair gains and costs, and an evaluation
-//! repairs by it. A model gets what a session gives it.
+//! It is used by replays, by the report, which measures benefit and cost of the repair, and by evaluations. A model
+//! gets the same inputs as in a session.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,7 +15,7 @@ use wildcity_scene::rig::RigCamera;
 use wildcity_twin::residency::Resident;
 use wildcity_twin::store::Catalog;
 
-use super::drawn::{self, Beside, Sight};
+use super::drawn::{self, ReferenceInputs, WarpQuery};
 use super::references::{ReferenceSource, ReferenceView, ReferenceViews, without};
 use super::rendered_image::RenderedImage;
 use super::session_repair;
@@ -23,7 +23,7 @@ use crate::error::SessionError;
 use crate::record::format::profile_hash;
 use crate::viewpoint::viewpoints;
 
-/// What references are read and drawn with.
+/// Sources and renderer settings of references.
 #[derive(Clone, Copy)]
 pub(crate) struct ReferenceSupply<'a> {
     pub(crate) resident: &'a Arc<Resident>,
@@ -33,33 +33,33 @@ pub(crate) struct ReferenceSupply<'a> {
     pub(crate) cache: &'a ReferenceCache,
 }
 
-/// Which images beside a view are needed.
+/// References of a view that are needed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct NeededReferences {
-    /// Those that are brought into the view by its depth.
+    /// Images that are warped into the view by its depth.
     pub warped: bool,
     /// The nearest of the same camera.
     pub nearest: bool,
 }
 
-/// Finds the images beside views of a version of a twin.
+/// Finds the references of views of a version of a twin.
 #[derive(Debug)]
 pub struct OfflineReferences {
     resident: Arc<Resident>,
     catalog: Catalog,
-    /// `None` if there is nothing to draw or to read.
+    /// `None` if there is nothing to read or render.
     views: Option<ReferenceViews>,
     left_out: usize,
 }
 
-/// What the images beside views are drawn with, and where they stay.
+/// Renderer settings and cache of references.
 #[derive(Clone, Copy)]
 pub struct OfflineDrawing<'a> {
-    /// How the twin is drawn.
+    /// Render profile of the twin.
     pub profile: &'a RenderProfile,
-    /// What draws it.
+    /// The renderer.
     pub backend: &'a dyn Backend,
-    /// Images that were read and drawn.
+    /// References that were read and rendered.
     pub cache: &'a ReferenceCache,
 }
 
@@ -76,15 +76,15 @@ pub struct OfflineView<'a> {
     pub world_from_rig: &'a Pose,
     /// Its pixels, depth and opacity; normals if a model needs them.
     pub rendered: &'a RenderedImage,
-    /// Name of the nearest image of the same camera in the view before, if there was one.
+    /// Name of the nearest image of the same camera for the previous view, if there was one.
     pub kept: Option<&'a str>,
 }
 
-/// The images beside a view; none without a twin.
+/// The references of a view; none without a twin.
 #[derive(Debug, Default)]
 pub struct ViewReferences {
-    pub(crate) beside: Beside,
-    /// Time to read and draw those that were not in memory.
+    pub(crate) beside: ReferenceInputs,
+    /// Time to read and render references that were not in memory.
     pub read: Duration,
     /// How many those were.
     pub read_count: usize,
@@ -93,7 +93,7 @@ pub struct ViewReferences {
 }
 
 impl NeededReferences {
-    /// Those that a model needs.
+    /// References that a model needs.
     pub fn of(model: &Model) -> Self {
         let nearest = model.needs(InputRole::Reference);
         Self { warped: session_repair::needs_warped(model), nearest }
@@ -106,10 +106,10 @@ impl NeededReferences {
 }
 
 impl ReferenceSupply<'_> {
-    /// The images beside a view. Blocks.
+    /// The references of a view. Blocks.
     ///
     /// # Errors
-    /// A recorded image or the twin cannot be read, or the depth cannot be drawn.
+    /// A recorded image or the twin cannot be read, or the depth cannot be rendered.
     pub(crate) fn beside(
         &self,
         views: &ReferenceViews,
@@ -127,9 +127,9 @@ impl ReferenceSupply<'_> {
             }
         }
         if needed.warped {
-            let sight = Sight { camera, rays, view, image: rendered };
+            let query = WarpQuery { camera, rays, view, image: rendered };
             let started = Instant::now();
-            let overlapping = sight.overlapping(views.around(world_from_rig));
+            let overlapping = query.overlapping(views.around(world_from_rig));
             found.warp = started.elapsed();
             let mut around = Vec::new();
             for view in overlapping {
@@ -137,13 +137,13 @@ impl ReferenceSupply<'_> {
                 around.push((view.name, reference));
             }
             let started = Instant::now();
-            sight.warped(&around, &mut found.beside);
+            query.warped(&around, &mut found.beside);
             found.warp += started.elapsed();
         }
         Ok(found)
     }
 
-    /// A reference: from memory, or read and drawn.
+    /// A reference: from memory, or read and rendered.
     fn timed(
         &self,
         views: &ReferenceViews,
@@ -193,8 +193,9 @@ impl ViewReferences {
 }
 
 impl OfflineReferences {
-    /// Those of a version. If it has no recorded images, it is drawn with some cameras. Recorded images at the poses
-    /// `held_out` are left out: those are compared with, and a model would see its own truth.
+    /// The references of a version. If it has no recorded images, it is rendered with `cameras`. Recorded images at the
+    /// poses `held_out` are left out: results are compared with them, so a model that gets them would get the ground
+    /// truth.
     ///
     /// # Errors
     /// The table of recorded images cannot be read.
@@ -224,7 +225,7 @@ impl OfflineReferences {
         self.left_out
     }
 
-    /// Checks that the images of a model have the size of what it gets.
+    /// Checks that the output images of a model have the size of its input images.
     ///
     /// # Errors
     /// [`SessionError::RepairUnavailable`].
@@ -244,10 +245,11 @@ impl OfflineReferences {
         Ok(())
     }
 
-    /// The images beside a view. Blocks. The first view of a place takes longer, because they are drawn then.
+    /// The references of a view. Blocks. The first view at a place takes longer, because its references are rendered
+    /// then.
     ///
     /// # Errors
-    /// An image or the twin cannot be read, or drawn.
+    /// An image or the twin cannot be read or rendered.
     pub fn beside(
         &self,
         of: &OfflineView<'_>,

@@ -1,12 +1,13 @@
-//! Which recorded images lie beside a view.
+//! Chooses the recorded images that a repair model compares a view with.
 //!
-//! The place of the rig along the nearest drive decides. For a warp these are five places from 8 m behind it to 2 m ahead,
-//! each with all cameras whose images overlap with the view. Those behind count more, since what lies ahead was seen from
-//! there. For the role `reference` it is the nearest image of the same camera that looks in about the same direction.
+//! They are chosen by the rig's station on the nearest drive. For a warp these are the images at five places from 8 m
+//! behind the rig to 2 m ahead, of all cameras whose images overlap with the view. Most of the places are behind the
+//! rig, because the scene ahead of the rig was seen from there. For the role `reference` it is the nearest image of the
+//! same camera that looks in about the same direction.
 //!
-//! A twin with recorded images has them at any stations. For a twin without, the twin itself is drawn every
-//! [`STEP_M`] on its drive, with the session's cameras: nothing new in it, but the twin is right there, and wrong
-//! beside the drive.
+//! Recorded images of a twin may be at any stations. If a twin has none, the twin itself is rendered every [`STEP_M`]
+//! along its drive, with the session's cameras. These images contain nothing new, but the twin is accurate on its
+//! drive, and inaccurate off the trajectory.
 
 use std::sync::Arc;
 
@@ -24,8 +25,8 @@ use wildcity_twin::store::Version;
 /// Places along the drive, from the rig's, in metres.
 const OFFSETS_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
-/// An image is at a place if it is at most so far from it, in metres.
-const WITHIN_M: f64 = 1.5;
+/// Largest distance between an image and a place along the drive for the image to be used there, in metres.
+const MAX_PLACE_DISTANCE_M: f64 = 1.5;
 
 /// Distance between the places where a twin without recorded images is drawn, in metres.
 const STEP_M: f64 = 2.0;
@@ -36,71 +37,73 @@ const REFERENCE_WITHIN_M: f64 = 30.0;
 /// Largest angle between the axes of a camera and of its `reference`: 30°.
 const REFERENCE_RAD: f64 = std::f64::consts::PI / 6.0;
 
-/// A `reference` is kept until another one is so much nearer, in metres: a change would be seen as flicker.
-const KEPT_M: f64 = 0.5;
+/// The `reference` changes only if another image is nearer by at least this distance, in metres, because each change is
+/// visible as flicker.
+const SWITCH_HYSTERESIS_M: f64 = 0.5;
 
-/// A recorded image is one that is held out if it is so near to its pose, in metres, ..
-const SAME_PLACE_M: f64 = 0.05;
+/// A recorded image counts as held out if its position is within this distance of a held-out pose, in metres, and its
+/// optical axis within [`HELD_OUT_AXIS_RAD`].
+const HELD_OUT_POSITION_M: f64 = 0.05;
 
-/// .. and looks in the same direction within this angle, in radians.
-const SAME_DIRECTION_RAD: f64 = 0.02;
+/// Largest angle between the optical axes of a recorded image and of a held-out pose, in radians.
+const HELD_OUT_AXIS_RAD: f64 = 0.02;
 
-/// Most tables of lenses that a version keeps, 2 MB each. A rig has a few cameras.
+/// Largest number of projection tables that a version keeps, 2 MB each. A rig has a few cameras.
 const PROJECTIONS: usize = 64;
 
-/// What a repair model compares images with.
+/// Images that a repair model compares with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ReferenceSource {
     /// Recorded images of the twin.
     Recorded,
-    /// The twin has none: images of the twin itself, drawn on its recorded drive.
+    /// Images of the twin itself, rendered on its recorded drive, because it has no recorded images.
     Rendered,
 }
 
-/// An image beside a view, before it is read or drawn.
+/// A reference of a view, before it is read or rendered.
 #[derive(Clone, Debug)]
 pub(crate) struct ReferenceView {
     /// The drive, the station in metres, and the camera: `log@12.50/front`.
     pub(crate) name: String,
     pub(crate) camera: Camera,
-    /// Of a drawn image; without overlay.
+    /// Appearance of a rendered image; without overlay.
     pub(crate) appearance: Appearance,
     pub(crate) world_from_camera: Pose,
-    /// The recorded image, unless it is drawn.
+    /// The recorded image; `None` if the image is rendered.
     pub(crate) recorded: Option<Arc<RecordedView>>,
     station_m: f64,
 }
 
-/// The images beside the views of a version of a twin.
+/// The references of a version of a twin.
 #[derive(Debug)]
 pub(crate) struct ReferenceViews {
     version: Arc<Version>,
     drives: Vec<Drive>,
-    /// The cameras that the twin is drawn with if it has no recorded images.
+    /// The cameras that the twin is rendered with if it has no recorded images.
     cameras: Vec<RigCamera>,
     source: ReferenceSource,
-    /// Tables of lenses, which take some milliseconds each.
+    /// Projection tables, each of which takes some milliseconds to compute.
     projections: Mutex<Vec<(Camera, Arc<Projection>)>>,
 }
 
 /// A drive with its recorded images.
 #[derive(Debug)]
 struct Drive {
-    /// Among the trajectories of the version.
+    /// Index among the trajectories of the version.
     index: usize,
     length_m: f64,
-    /// By camera, in the order of the table: its images by their stations.
+    /// Name and images of each camera, in the order of the table; the images by station.
     cameras: Vec<(String, Vec<Arc<RecordedView>>)>,
 }
 
-/// A place on a drive.
-struct Place<'a> {
+/// A station on a drive.
+struct DriveStation<'a> {
     drive: &'a Drive,
     station_m: f64,
 }
 
 impl ReferenceView {
-    /// A hash of all that its reference depends on.
+    /// Hash of all values on which its [`Reference`](wildcity_repair::reference::Reference) depends.
     pub(crate) fn key(&self, version_hash: &str, profile_hash: &blake3::Hash) -> ReferenceKey {
         let mut hasher = blake3::Hasher::new();
         hasher.update(version_hash.as_bytes()).update(profile_hash.as_bytes());
@@ -115,7 +118,7 @@ impl ReferenceView {
         *hasher.update(text.as_bytes()).finalize().as_bytes()
     }
 
-    /// The same image with the exposure of a camera, if its own is known.
+    /// Returns this image with the exposure of a camera, if its own exposure is known.
     pub(crate) fn exposed_for(mut self, camera: &RigCamera) -> Self {
         if self.recorded.as_ref().is_some_and(|view| view.exposure_stops.is_some()) {
             self.appearance.exposure = camera.appearance.exposure;
@@ -123,12 +126,13 @@ impl ReferenceView {
         self
     }
 
-    /// The same image for a view of a camera: halved until it has about as many pixels per radian as the view, since an image
-    /// with more is sampled with gaps, and what falls into them changes from view to view. Also less is drawn and kept.
+    /// Returns this image for a view of a camera: halved until it has about as many pixels per radian as the view. From
+    /// an image with more, a view would sample only some pixels, and the next view different ones. A smaller image also
+    /// takes less time and memory.
     pub(crate) fn reduced_for(mut self, camera: &Camera) -> Self {
         let px_per_rad = |camera: &Camera| (camera.pinhole.fx * camera.pinhole.fy).sqrt();
         let ratio = px_per_rad(&self.camera) / px_per_rad(camera);
-        // The nearest power of two: what remains is between 0.7 and 1.4.
+        // The nearest power of two: the remaining ratio is between 0.7 and 1.4.
         let halvings = ratio.log2().round().clamp(0.0, 8.0) as i32;
         if halvings == 0 {
             return self;
@@ -141,13 +145,13 @@ impl ReferenceView {
         self
     }
 
-    /// Its name, size and exposure: what tells it from all others of a version.
+    /// Its name, size and exposure, which identify it among the references of a version.
     pub(crate) fn id(&self) -> String {
         let Self { name, camera, appearance, .. } = self;
         format!("{name} {}x{} {:?}", camera.width_px, camera.height_px, appearance.exposure)
     }
 
-    /// How it is drawn.
+    /// The view that it is rendered with.
     pub(crate) fn view(&self) -> View {
         View::new(self.camera, self.world_from_camera)
     }
@@ -160,8 +164,8 @@ impl ReferenceView {
 }
 
 impl ReferenceViews {
-    /// Those of a version with a table of recorded images, which may be empty: then the twin is drawn with some cameras.
-    /// `None` without a recorded drive.
+    /// The references of a version. `table` has the recorded images; if it is empty, the twin is rendered with
+    /// `cameras`. `None` without a recorded drive.
     pub(crate) fn of(
         version: Arc<Version>,
         table: Vec<RecordedView>,
@@ -218,13 +222,14 @@ impl ReferenceViews {
         }
     }
 
-    /// The images to bring into a view of a rig, place by place, camera by camera.
+    /// The images to warp into a view of a rig, by place and camera.
     pub(crate) fn around(&self, world_from_rig: &Pose) -> Vec<ReferenceView> {
         let Some(place) = self.place(world_from_rig.position_m) else { return Vec::new() };
         let mut around: Vec<ReferenceView> = Vec::new();
         for offset_m in OFFSETS_M {
             let wanted_m = place.station_m + offset_m;
-            let is_near = |view: &ReferenceView| (view.station_m - wanted_m).abs() <= WITHIN_M;
+            let is_near =
+                |view: &ReferenceView| (view.station_m - wanted_m).abs() <= MAX_PLACE_DISTANCE_M;
             for view in self.at(&place, wanted_m).into_iter().filter(is_near) {
                 if around.iter().all(|other| other.name != view.name) {
                     around.push(view);
@@ -235,7 +240,7 @@ impl ReferenceViews {
     }
 
     /// The image for the role `reference`: of the same camera, nearest along the drive among those that look in the
-    /// same direction within 30°. The one that was used before, by its name, stays until another is 0.5 m nearer.
+    /// same direction within 30°. The previous image, whose name is `kept`, stays until another is 0.5 m nearer.
     pub(crate) fn nearest(
         &self,
         camera: &RigCamera,
@@ -253,11 +258,11 @@ impl ReferenceViews {
             self.of_camera(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
         let kept = all.iter().find(|view| Some(&*view.name) == kept);
-        let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < KEPT_M);
+        let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
         Some(kept.unwrap_or(nearest).clone().exposed_for(camera))
     }
 
-    /// How a camera projects.
+    /// The projection of a camera.
     pub(crate) fn projection(&self, camera: &Camera) -> Arc<Projection> {
         let find = |all: &[(Camera, Arc<Projection>)]| {
             all.iter().find(|(own, _)| own == camera).map(|(_, projection)| projection.clone())
@@ -273,17 +278,17 @@ impl ReferenceViews {
         projection
     }
 
-    /// The place of a point: that of the nearest drive, and where along it.
-    fn place(&self, point_m: DVec3) -> Option<Place<'_>> {
+    /// The nearest drive to a point, and the point's station on it.
+    fn place(&self, point_m: DVec3) -> Option<DriveStation<'_>> {
         let trajectories = &self.version.manifest.trajectories;
         let places =
             self.drives.iter().map(|drive| (trajectories[drive.index].nearest(point_m), drive));
         let nearest = places.min_by(|(a, _), (b, _)| a.distance_m.total_cmp(&b.distance_m));
-        nearest.map(|(place, drive)| Place { drive, station_m: place.station_m })
+        nearest.map(|(place, drive)| DriveStation { drive, station_m: place.station_m })
     }
 
     /// For each camera the image nearest to a station, in metres.
-    fn at(&self, place: &Place<'_>, station_m: f64) -> Vec<ReferenceView> {
+    fn at(&self, place: &DriveStation<'_>, station_m: f64) -> Vec<ReferenceView> {
         match self.source {
             ReferenceSource::Recorded => {
                 let nearest = |(_, views): &(String, Vec<Arc<RecordedView>>)| {
@@ -303,8 +308,8 @@ impl ReferenceViews {
         }
     }
 
-    /// The images of a camera around a place.
-    fn of_camera(&self, place: &Place<'_>, camera: &str) -> Vec<ReferenceView> {
+    /// The images of a camera around a station.
+    fn of_camera(&self, place: &DriveStation<'_>, camera: &str) -> Vec<ReferenceView> {
         match self.source {
             ReferenceSource::Recorded => {
                 let of = place.drive.cameras.iter().filter(|(name, _)| name == camera);
@@ -324,7 +329,7 @@ impl ReferenceViews {
         }
     }
 
-    /// The nearest step of a drive at which the twin is drawn; the lower of two equally near ones.
+    /// The nearest step of a drive at which the twin is rendered; the lower one of two at the same distance.
     fn step(&self, drive: &Drive, station_m: f64) -> usize {
         let last = (drive.length_m / STEP_M).floor();
         (station_m / STEP_M - 0.5).ceil().clamp(0.0, last) as usize
@@ -355,8 +360,8 @@ fn is_held_out(view: &RecordedView, held_out: &[Pose]) -> bool {
     let axis = |pose: &Pose| pose.rotation * DVec3::Z;
     let own = &view.world_from_camera;
     held_out.iter().any(|pose| {
-        own.position_m.distance(pose.position_m) <= SAME_PLACE_M
-            && axis(own).angle_between(axis(pose)) <= SAME_DIRECTION_RAD
+        own.position_m.distance(pose.position_m) <= HELD_OUT_POSITION_M
+            && axis(own).angle_between(axis(pose)) <= HELD_OUT_AXIS_RAD
     })
 }
 

@@ -1,11 +1,11 @@
-//! What is rendered of an image that may be repaired.
+//! The pixels and maps of an image that may be repaired.
 
-/// An image as it was rendered, and what the model may need beside it. Maps that it does not need are empty.
+/// An image as it was rendered, and the maps that the model may need. Maps that it does not need are empty.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedImage {
     /// `[height, width, 3]`: sRGB, 8 bits.
     pub rgb8: Vec<u8>,
-    /// `[height, width]`, in metres; 0 where there is none.
+    /// `[height, width]`, in metres; 0 where there is no depth.
     pub depth_m: Vec<f32>,
     /// `[height, width]`, 0 to 1.
     pub opacity: Vec<f32>,

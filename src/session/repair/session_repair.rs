@@ -11,7 +11,7 @@ use wildcity_scene::rig::RigCamera;
 use crate::error::SessionError;
 use crate::options::{OnFailure, RepairOptions};
 
-use super::drawn::{Beside, CameraRays};
+use super::drawn::{CameraRays, ReferenceInputs};
 use super::references::ReferenceViews;
 use super::rendered_image::RenderedImage;
 
@@ -22,11 +22,11 @@ pub struct SessionRepair {
     pub model: Arc<Model>,
     /// Which images.
     pub selection: Selection,
-    /// What happens when the model fails.
+    /// Behaviour when the model fails.
     pub on_failure: OnFailure,
-    /// Whether observations tell the trust, by which the images are selected.
-    pub(crate) tells_trust: bool,
-    /// Of the cameras, for references.
+    /// Whether observations contain the trust, by which the images are selected.
+    pub(crate) reports_trust: bool,
+    /// Rays of the cameras, for references.
     rays: CameraRays,
 }
 
@@ -40,7 +40,7 @@ impl SessionRepair {
         options: &RepairOptions,
         cameras: &[RigCamera],
         deadline: Duration,
-        tells_trust: bool,
+        reports_trust: bool,
     ) -> Result<Self, SessionError> {
         let selection = selection_of(options)?;
         let name = &options.model;
@@ -60,7 +60,7 @@ impl SessionRepair {
             return Err(SessionError::OutOfRange { field: "deadline_ms", must });
         }
         let rays = CameraRays::new(cameras.len());
-        Ok(Self { model, selection, on_failure: options.on_failure, tells_trust, rays })
+        Ok(Self { model, selection, on_failure: options.on_failure, reports_trust, rays })
     }
 
     /// Whether the model needs depth; normals are computed from it.
@@ -68,7 +68,7 @@ impl SessionRepair {
         self.model.needs(InputRole::Depth) || self.needs_normals() || self.needs_warped()
     }
 
-    /// Whether the model needs images brought into the view.
+    /// Whether the model needs images warped into the view.
     pub(crate) fn needs_warped(&self) -> bool {
         needs_warped(&self.model)
     }
@@ -78,7 +78,7 @@ impl SessionRepair {
         self.model.needs(InputRole::Reference)
     }
 
-    /// Whether the model needs images beside the rendered one.
+    /// Whether the model needs images in addition to the rendered one.
     pub(crate) fn needs_images(&self) -> bool {
         self.needs_warped() || self.needs_reference()
     }
@@ -110,13 +110,13 @@ impl SessionRepair {
         &self,
         camera: &RigCamera,
         rendered: &RenderedImage,
-        beside: &Beside,
+        inputs: &ReferenceInputs,
     ) -> Result<Vec<u8>, RepairError> {
-        repair(&self.model, camera, rendered, beside)
+        repair(&self.model, camera, rendered, inputs)
     }
 }
 
-/// Whether a model needs images brought into the view.
+/// Whether a model needs images warped into the view.
 pub(crate) fn needs_warped(model: &Model) -> bool {
     model.needs(InputRole::ReferenceWarped) || model.needs(InputRole::ReferenceValid)
 }
@@ -179,17 +179,17 @@ pub(crate) fn repair(
     model: &Model,
     camera: &RigCamera,
     rendered: &RenderedImage,
-    beside: &Beside,
+    inputs: &ReferenceInputs,
 ) -> Result<Vec<u8>, RepairError> {
-    repair_timed(model, camera, rendered, beside).map(|(repaired, _)| repaired)
+    repair_timed(model, camera, rendered, inputs).map(|(repaired, _)| repaired)
 }
 
-/// The same, and how long the parts of it took.
+/// As [`repair`], and also returns how long its parts took.
 pub(crate) fn repair_timed(
     model: &Model,
     camera: &RigCamera,
     rendered: &RenderedImage,
-    beside: &Beside,
+    inputs: &ReferenceInputs,
 ) -> Result<(Vec<u8>, RepairTimes), RepairError> {
     let RenderedImage { rgb8, depth_m, opacity, normals, trust } = rendered;
     let width = camera.camera.width_px as usize;
@@ -211,9 +211,9 @@ pub(crate) fn repair_timed(
         normals: given(InputRole::Normals, &normals[..]),
         mask: (!mask.is_empty()).then_some(&mask[..]),
         trust: Some(*trust as f32),
-        reference: beside.reference.as_ref(),
-        reference_warped: beside.warped.as_ref().map(|(image, _)| image),
-        reference_valid: beside.warped.as_ref().map(|(_, valid)| &valid[..]),
+        reference: inputs.reference.as_ref(),
+        reference_warped: inputs.warped.as_ref().map(|(image, _)| image),
+        reference_valid: inputs.warped.as_ref().map(|(_, valid)| &valid[..]),
         ..View::new(&image)
     };
     let (repaired, times) = model.repair_timed(&view)?;

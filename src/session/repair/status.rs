@@ -1,28 +1,28 @@
-//! What is told of an image in a session that asked for repair.
+//! Result of the repair of an image in a session that asked for repair.
 
 use serde::{Deserialize, Serialize};
 
 use wildcity_repair::RepairError;
 
-/// What became of an image, in a session that asked for repair.
+/// Result of the repair of an image in a session that asked for repair.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ImageRepair {
-    /// What became of it.
+    /// Whether it was repaired.
     pub status: RepairStatus,
     /// BLAKE3 of the pixels before the repair; the hash of the image unless it was repaired.
     pub rendered_hash: blake3::Hash,
-    /// The images that the model saw beside it, at most 8, those that gave most pixels first.
+    /// References that the model got, at most 8, ordered from most to fewest contributed pixels.
     pub references: Vec<String>,
 }
 
 impl ImageRepair {
-    /// Of an image that was not selected.
+    /// Result for an image that was not selected.
     pub(crate) fn kept(hash: blake3::Hash) -> Self {
         Self { status: RepairStatus::Kept, rendered_hash: hash, references: Vec::new() }
     }
 }
 
-/// What the repair of an episode's images keeps from one observation to the next, by camera.
+/// State of the repair of an episode's images that continues from one observation to the next, by camera.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct RepairState {
     /// Whether the camera is in repair; empty if none is.
@@ -32,7 +32,7 @@ pub(crate) struct RepairState {
 }
 
 impl RepairState {
-    /// The same for so many cameras, or for fewer.
+    /// Resizes the state to one entry per camera.
     #[must_use]
     pub(crate) fn for_cameras(mut self, cameras: usize) -> Self {
         self.is_on.resize(cameras, false);
@@ -41,7 +41,7 @@ impl RepairState {
     }
 }
 
-/// What became of an image.
+/// Whether an image was repaired.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RepairStatus {
     /// It was not selected.

@@ -1,4 +1,4 @@
-//! The assets of an episode's actors, and what of them a frame draws.
+//! The assets of an episode's actors, and the parts of them that a frame draws.
 
 use std::sync::Arc;
 
@@ -9,21 +9,21 @@ use wildcity_sim::scenario::AssetInfo;
 use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
 use wildcity_twin::store::Catalog;
 
-/// The asset of each actor, by its index; `None` for one that is not drawn. Copies share them.
+/// The asset of each actor, by its index; `None` for an actor that is not drawn. Copies share the assets.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ActorAssets(Arc<[Option<Arc<ResidentActor>>]>);
 
-/// What a frame needs to know to choose the levels of detail of its actors.
+/// Data of a frame by which the levels of detail of its actors are chosen.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FrameDetail<'a> {
     pub(crate) viewpoints: &'a [Viewpoint],
     pub(crate) profile: &'a RenderProfile,
 }
 
-/// What a scenario needs to know about an asset, by its hash or its name.
+/// Data of an asset that a scenario needs, by its hash or its name.
 ///
 /// # Errors
-/// There is none, or more than one, or it is damaged.
+/// There is no such asset, or more than one, or it is damaged.
 pub fn asset_info(catalog: &Catalog, name: &str) -> Result<AssetInfo, String> {
     let actor = catalog.find_actor(name).map_err(|error| error.to_string())?;
     let description = actor.description;
@@ -31,7 +31,7 @@ pub fn asset_info(catalog: &Catalog, name: &str) -> Result<AssetInfo, String> {
 }
 
 impl ActorAssets {
-    /// Brings assets into memory, given by their hashes.
+    /// Loads assets into memory, given by their hashes.
     ///
     /// # Errors
     /// One cannot be read, or there is no room for it.
@@ -49,10 +49,10 @@ impl ActorAssets {
         self.0.iter().all(Option::is_none)
     }
 
-    /// What a frame draws of its actors, given the pose of each at the frame's time and at the start of the longest
+    /// The actors that a frame draws, given the pose of each at the frame's time and at the start of the longest
     /// exposure.
     ///
-    /// An actor that was absent then appears during the exposure: it is drawn at rest.
+    /// An actor that was absent at the start of the exposure appears during it, and is drawn at rest.
     pub(crate) fn placed(
         &self,
         poses: &[Option<Pose>],
@@ -87,7 +87,7 @@ pub(crate) struct Placement<'a> {
 }
 
 impl FrameDetail<'_> {
-    /// What a frame draws of some actors: each in the level of detail that the frame needs, with its shadow.
+    /// The actors that a frame draws, each in the level of detail that the frame needs, with its shadow.
     pub(crate) fn placed<'a>(
         &self,
         actors: impl Iterator<Item = Placement<'a>>,

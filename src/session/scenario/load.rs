@@ -1,4 +1,4 @@
-//! Reads scenarios, and what they name, from one directory.
+//! Reads scenarios, and the files that they name, from one directory.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -68,7 +68,7 @@ pub enum ScenarioError {
         field: &'static str,
         /// The name of the file.
         file: String,
-        /// What the operating system says.
+        /// The operating system's message.
         reason: String,
     },
     /// A mistake in a file.
@@ -79,7 +79,7 @@ pub enum ScenarioError {
         /// The place and the mistake.
         cause: FileError,
     },
-    /// Something is not what the scenario was made for.
+    /// A file or a twin differs from the one that the scenario was made for.
     #[error(
         "{field} is {wanted}, and there is {found}: take what the scenario names, correct the hash, or use \
          --latest"
@@ -127,7 +127,7 @@ impl Scenarios {
         let files = entries.map(|entry| entry.path());
         let scenarios = files.filter(|path| path.extension().is_some_and(|name| name == "json"));
         let is_scenario = |path: &PathBuf| {
-            // Tracks and maps are JSON too. A prefix tells them apart without reading them whole.
+            // Tracks and maps are JSON as well. They are distinguished by a prefix, without reading the whole files.
             let mut head = vec![0; 4096];
             let read = File::open(path).and_then(|mut file| file.read(&mut head));
             read.is_ok_and(|count| {

@@ -1,4 +1,4 @@
-//! Scenarios: files by name with the tracks and maps beside them, and the traffic of a session's episodes.
+//! Scenarios: files by name with their tracks and maps, and the traffic of a session's episodes.
 
 pub(crate) mod assets;
 pub(crate) mod load;
@@ -38,7 +38,7 @@ pub(crate) struct SessionScenario {
     scenarios: Scenarios,
     /// With the values of its sweep, without a seed.
     file: ScenarioFile,
-    /// Whether episodes start where the scenario says: the request named no start.
+    /// Whether episodes start where the scenario's ego section says, because the request named no start.
     gives_start: bool,
 }
 
@@ -87,7 +87,7 @@ impl SessionScenario {
         }
     }
 
-    /// Where an episode starts, if the scenario says.
+    /// The start of an episode, if the scenario gives it.
     pub(crate) fn start_of(&self, loaded: &LoadedScenario) -> Option<Start> {
         let start = loaded.scenario.start.as_ref().filter(|_| self.gives_start)?;
         Some(match start {

@@ -16,7 +16,7 @@ impl ActorPast {
         self.0.push_back((time_us, states.into()));
     }
 
-    /// Forgets what no time from `time_us` on needs.
+    /// Drops the states that no time from `time_us` on needs.
     pub(crate) fn drop_before(&mut self, time_us: i64) {
         while self.0.len() > 1 && self.0[1].0 <= time_us {
             self.0.pop_front();
@@ -30,7 +30,8 @@ impl ActorPast {
     }
 
     /// The pose of each actor at a time, by its index; `None` for one that is absent. Between two steps an actor is
-    /// there if it is at both ends. Before the first time and after the last it is where it was then.
+    /// present if it is present at both ends. Before the first time and after the last one, its pose is that at this
+    /// time.
     pub(crate) fn poses_at(&self, time_us: i64) -> Vec<Option<Pose>> {
         let after = self.0.partition_point(|(past_us, _)| *past_us < time_us);
         let Some((to_us, to)) = self.0.get(after).or(self.0.back()) else { return Vec::new() };

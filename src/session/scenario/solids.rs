@@ -13,7 +13,7 @@ use wildcity_twin::store::{Catalog, Version};
 use super::load::ScenarioError;
 use crate::error::SessionError;
 
-/// Distance from the route up to which Gaussians are looked at, in metres. Farther away there is no contact.
+/// Distance from the route up to which Gaussians are tested, in metres. Farther away there is no contact.
 const REACH_M: f64 = 50.0;
 /// Distance between the places of the route from which that is measured, in metres.
 const SPACING_M: f64 = 10.0;

@@ -1,4 +1,4 @@
-//! The traffic of an episode: what a step of the ego does to it, and what the agent learns of it.
+//! The traffic of an episode: its reaction to a step of the ego, and the events that the agent gets.
 
 use std::sync::Arc;
 
@@ -36,8 +36,8 @@ pub struct EpisodeTraffic {
     exposure_us: i64,
     /// How old the pictures may be that sensors show, in microseconds.
     reach_us: i64,
-    /// Reaches back to the last observation, and an exposure and the sensors' reach farther: the frames since then are
-    /// drawn from it.
+    /// States of the actors since the last observation, and before it for the longest exposure and the oldest pictures
+    /// of sensors. Frames of past times are rendered from them.
     past: ActorPast,
 }
 
@@ -46,11 +46,11 @@ pub struct EpisodeTraffic {
 pub struct Event {
     /// When, in microseconds since the episode's start.
     pub time_us: i64,
-    /// What.
+    /// Kind of the event.
     pub kind: EventKind,
 }
 
-/// What happened.
+/// Kind of an event.
 #[derive(Clone, Debug, PartialEq)]
 pub enum EventKind {
     /// The ego began to touch an actor.
@@ -124,8 +124,8 @@ impl EpisodeTraffic {
         }
     }
 
-    /// The same, and contact with these solid Gaussians is looked for: those of the shown version of the twin. Those that
-    /// the ego meets already, at the start or when the version changes, are no contact.
+    /// Also detects contact with these solid Gaussians, which belong to the version of the twin that is shown.
+    /// Gaussians that the ego overlaps already, at the start or when the version changes, are not a new contact.
     pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>, ego: &Ego) -> Self {
         let ego_box = self.loaded.scenario.traffic.ego_box;
         let area_m2 = |solids: &Arc<Solids>| solids.area_m2(&ego.world_from_rig(), &ego_box);
@@ -134,7 +134,7 @@ impl EpisodeTraffic {
         Self { solids, meets_twin, ..self }
     }
 
-    /// The same, and frames show pictures that are up to so many microseconds old.
+    /// Sets how old the pictures of sensors may be, in microseconds.
     pub(crate) fn with_reach(self, reach_us: i64) -> Self {
         Self { reach_us, ..self }
     }
@@ -221,8 +221,8 @@ impl EpisodeTraffic {
         Self { events, ..next }
     }
 
-    /// Moves on along the route, and ends the episode if a rule says so. The first reason stands: a plan goes on to
-    /// its end.
+    /// Advances along the route, and ends the episode if a rule of the scenario applies. The first reason is kept,
+    /// since a plan continues to its end.
     fn end(&mut self, ego: &Ego, has_contact: bool) {
         let world_from_rig = ego.world_from_rig();
         let route = self.loaded.scenario.route.clone();
@@ -274,7 +274,7 @@ impl EpisodeTraffic {
         &self.loaded
     }
 
-    /// What does not change about the actors, by their index.
+    /// Constant properties of the actors, by their index.
     pub fn specs(&self) -> &[ActorSpec] {
         &self.specs
     }
@@ -295,7 +295,7 @@ impl EpisodeTraffic {
         self.world.states_before(time_us)
     }
 
-    /// What a frame of a time since the last observation, or in the warm-up, draws of the actors.
+    /// The actors that a frame shows whose time is since the last observation or in the warm-up.
     pub(crate) fn placed(&self, taken_us: i64, frame: FrameDetail<'_>) -> Vec<PlacedChunk> {
         if self.assets.is_empty() {
             return Vec::new();
@@ -308,7 +308,7 @@ impl EpisodeTraffic {
         self.assets.placed(&poses_at(taken_us), &at_start, frame)
     }
 
-    /// What happened in the last step, by time; at most [`limits::EVENTS`].
+    /// Events of the last step, by time; at most [`limits::EVENTS`].
     pub fn events(&self) -> &[Event] {
         &self.events
     }
@@ -319,7 +319,7 @@ impl EpisodeTraffic {
         names.and_then(|names| names.get(trigger)).map_or("", String::as_str)
     }
 
-    /// The route as the ego sees it, if there is one.
+    /// The route in the frame of the ego, if there is one.
     pub fn route(&self, ego: &Ego) -> Option<RouteView> {
         let (route, progress) = self.route_progress()?;
         let speed_mps = ego.velocity_m_s().length();

@@ -1,4 +1,4 @@
-//! Checks what a session asks of its sensors.
+//! Checks the sensor settings of a session.
 
 use std::ops::RangeInclusive;
 
@@ -40,7 +40,7 @@ impl Sensors {
                 number(&field("noise"), axis.noise, 0.0..=100.0)?;
                 number(&field("bias"), axis.bias, 0.0..=100.0)?;
             }
-            time("sensors.imu.bias_period_us", imu.bias_period_us, limits::WANDER_PERIOD_US)?;
+            time("sensors.imu.bias_period_us", imu.bias_period_us, limits::DRIFT_PERIOD_US)?;
         }
         if let Some(WheelSpeed { noise, scale }) = self.wheel_speed {
             number("sensors.wheel_speed.noise", noise, 0.0..=100.0)?;
@@ -79,7 +79,7 @@ impl CameraSensor {
         }
         if let Some(ExposureDrift { stops, period_us }) = self.exposure {
             number(&at("exposure.stops"), stops, 0.0..=4.0)?;
-            time(&at("exposure.period_us"), period_us, limits::WANDER_PERIOD_US)?;
+            time(&at("exposure.period_us"), period_us, limits::DRIFT_PERIOD_US)?;
         }
         if let Some(LensDirt { spots, radius, opacity }) = self.dirt {
             if !(1..=limits::DIRT_SPOTS).contains(&spots) {

@@ -25,7 +25,7 @@ pub(crate) struct Decisions {
 struct Decision {
     /// When it was made, in microseconds since the episode's start.
     made_us: i64,
-    /// `world_from_rig` then: a trajectory is in that frame.
+    /// `world_from_rig` at that time: a trajectory is in this frame.
     world_from_rig: Pose,
     command: RecordedCommand,
 }
@@ -35,7 +35,7 @@ impl Decisions {
         Self { delay_us, made: VecDeque::new() }
     }
 
-    /// Whether what was read from a file may be.
+    /// Whether the values are in the range that is allowed. They may have been read from a file.
     pub(crate) fn is_in_range(&self) -> bool {
         (0..=BUNDLE_PERIOD_US).contains(&self.delay_us)
     }
@@ -45,9 +45,9 @@ impl Decisions {
         self.delay_us == 0
     }
 
-    /// The egos after each of some steps of `dt_us` from `time_us`, with another decision that is made now and holds
-    /// until the end of these steps and the delay. Before the first decision takes effect a car rolls on, with neither
-    /// acceleration nor curvature, and a teleport stays.
+    /// Returns the ego after each of some steps of `dt_us` from `time_us`. The decision `command` is made at `time_us`,
+    /// and is used until the end of these steps and the latency. Before the first decision takes effect, a car keeps
+    /// its speed on a straight line, and an ego with `teleport` keeps its pose.
     ///
     /// # Errors
     /// The ego cannot execute the command, or a path ends before the next decision can take effect.
@@ -65,7 +65,7 @@ impl Decisions {
                 return Err(EgoError::PathShort { end_us: path.end_us(), step_us: end_us });
             }
         }
-        // A command that this ego does not take is refused now, and not when its time comes.
+        // Refuse a command that this ego does not accept now, and not when it takes effect.
         ego.stepped(command, dt_us, ground)?;
         let world_from_rig = ego.world_from_rig();
         let command = RecordedCommand::of_any(command);

@@ -1,4 +1,4 @@
-//! Which frame a camera delivers when one is due, and which picture that frame shows.
+//! Determines which frame a camera delivers when a frame is due, and which picture it shows.
 
 use wildcity_scene::random::Random;
 
@@ -18,7 +18,7 @@ pub(crate) struct FrameSource<'a> {
     pub(crate) begin_us: i64,
 }
 
-/// What a camera delivers when a frame is due. All times are in microseconds since the episode's start.
+/// The frame that a camera delivers when a frame is due. All times are in microseconds since the episode's start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Delivery {
     /// When the frame was taken that is delivered, by the camera's own clock.
@@ -30,8 +30,8 @@ pub(crate) struct Delivery {
 }
 
 impl FrameSource<'_> {
-    /// What it delivers when the frame of `due_us`, a multiple of the period, is due: of the frames that have arrived,
-    /// the one that was taken last. The first frame of an episode always arrives.
+    /// Returns the frame that is delivered when the frame of `due_us`, a multiple of the period, is due: the most
+    /// recent frame that has arrived. The first frame of an episode always arrives.
     pub(crate) fn at(&self, due_us: i64) -> Delivery {
         let first_us = (self.begin_us + (-self.begin_us).rem_euclid(self.period_us)).min(due_us);
         let earliest_us = first_us.max(due_us - self.sensor.arrival_us(self.period_us));
@@ -60,7 +60,7 @@ impl FrameSource<'_> {
         self.sensor.drop.is_some_and(|chance| self.draw("drop", frame) < chance)
     }
 
-    /// When the picture of a frame was taken: in a frozen interval at the interval's begin.
+    /// When the picture of a frame was taken: in a frozen interval, at the start of the interval.
     fn picture_us(&self, stamp_us: i64) -> i64 {
         let Some(freeze) = self.sensor.freeze else { return stamp_us };
         let interval = stamp_us.div_euclid(freeze.for_us);
@@ -117,7 +117,7 @@ mod tests {
         let is_late = share(&sensor, |_, one| one.missing == Some(SensorReason::Late));
         assert!((is_late - 0.3).abs() < 4.0 * 0.0033, "{is_late}");
         let old = share(&sensor, |due_us, one| due_us - one.stamp_us == 2 * PERIOD_US);
-        // The frame of now and the one before are late: that of two periods ago has arrived in any case.
+        // If the present and the previous frame are late, the frame of two periods ago has arrived in any case.
         assert!((old - 0.09).abs() < 4.0 * 0.002, "{old}");
         assert_eq!(share(&sensor, |due_us, one| due_us - one.stamp_us > 2 * PERIOD_US), 0.0);
     }

@@ -1,4 +1,4 @@
-//! Normal numbers, and numbers that wander.
+//! Gaussian samples, and values that drift slowly.
 
 use std::sync::LazyLock;
 
@@ -38,19 +38,19 @@ pub(crate) fn normal_table() -> &'static [f32] {
     &NORMAL
 }
 
-/// A normal number: mean 0, variance 1.
-pub(crate) fn normal(random: &mut Random) -> f64 {
+/// A sample of the standard normal distribution.
+pub(crate) fn standard_normal(random: &mut Random) -> f64 {
     f64::from(NORMAL[(random.seed() >> 48) as usize])
 }
 
-/// A number that wanders with time: normal with variance 1 at every time, and independent of what it was two periods
-/// ago. Between two multiples of the period it is a cos(π u / 2) + b sin(π u / 2), of the normal numbers a and b drawn
-/// for them and the fraction u of the period: the weights keep the variance.
-pub(crate) fn wandering(seed: u64, name: &str, period_us: i64, time_us: i64) -> f64 {
+/// A value that drifts with time: normally distributed with variance 1 at every time, and independent of its value two
+/// periods ago. At the fraction u of a period it is a cos(π u / 2) + b sin(π u / 2), where a and b are standard normal
+/// samples for the multiples of the period before and after. These weights keep the variance.
+pub(crate) fn drift(seed: u64, name: &str, period_us: i64, time_us: i64) -> f64 {
     let index = time_us.div_euclid(period_us);
     let part = time_us.rem_euclid(period_us) as f64 / period_us as f64;
-    // The index may be negative, in a warm-up: its bits are as good.
-    let drawn = |index: i64| normal(&mut Random::new(seed, name, index as usize));
+    // In a warm-up the index may be negative: its bits then serve as the index of the random generator.
+    let drawn = |index: i64| standard_normal(&mut Random::new(seed, name, index as usize));
     let (sin, cos) = (std::f64::consts::FRAC_PI_2 * part).sin_cos();
     drawn(index) * cos + drawn(index + 1) * sin
 }
@@ -85,9 +85,8 @@ mod tests {
     }
 
     #[test]
-    fn what_wanders_keeps_its_variance_and_forgets() {
-        let of_seed =
-            |time_us: i64| (0..20_000).map(move |seed| wandering(seed, "x", 1000, time_us));
+    fn a_drift_keeps_its_variance_and_forgets() {
+        let of_seed = |time_us: i64| (0..20_000).map(move |seed| drift(seed, "x", 1000, time_us));
         for time_us in [0, 250, 500, 999, -700] {
             let mean = of_seed(time_us).sum::<f64>() / 2e4;
             let variance = of_seed(time_us).map(|x| x * x).sum::<f64>() / 2e4;

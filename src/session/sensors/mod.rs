@@ -1,20 +1,20 @@
 //! Effects of sensors: lost, late and frozen frames, noise, drifting exposure, dirt on the lens, an inertial
-//! measurement unit, the speed of the wheels, and the delay of the planner.
+//! measurement unit, the wheel speed, and the planner latency.
 //!
 //! Every effect is a function of the episode's seed, the sensor's name and a time. There is no running state, so a
-//! branch, a restored snapshot and a replay draw the same numbers, alone or among other sessions. Biases and the
-//! exposure wander all the same: they are [interpolated](draw::wandering) between numbers that are drawn for
-//! multiples of a period. What an episode does keep is in [`EpisodeSensors`]: decisions that wait, and the motion
-//! since the last observation.
+//! branch, a restored snapshot and a replay sample the same values, whatever other sessions do. Biases and the exposure
+//! drift without state: they are [interpolated](draw::drift) between samples for the multiples of a period. The only
+//! state of an episode, [`EpisodeSensors`], has the decisions that have not taken effect, and the motion since the last
+//! observation.
 //!
 //! | module | what it computes |
 //! |---|---|
-//! | `settings`, `check` | what a session asks for, and its limits |
-//! | `draw` | normal and wandering numbers |
-//! | `delivery` | which frame a camera delivers, and which picture it shows |
+//! | `settings`, `check` | the settings of a session, and their limits |
+//! | `draw` | Gaussian samples, and values that drift |
+//! | `delivery` | the frame that a camera delivers, and the picture that it shows |
 //! | `pixels` | noise, exposure and dirt |
-//! | `motion` | specific force, angular velocity, and speed of the wheels |
-//! | `decisions` | which decision holds |
+//! | `motion` | specific force, angular velocity, and wheel speed |
+//! | `decisions` | the decision that is in effect |
 
 mod check;
 pub(crate) mod decisions;
@@ -31,7 +31,7 @@ use self::motion::MotionSample;
 use self::settings::Sensors;
 use crate::limits::SENSOR_REACH_US;
 
-/// What an episode keeps for its sensors.
+/// State of an episode's sensors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct EpisodeSensors {
@@ -54,20 +54,20 @@ impl EpisodeSensors {
         }
     }
 
-    /// Whether what was read from a file may be.
+    /// Whether the values are in the range that is allowed. They may have been read from a file.
     pub(crate) fn is_in_range(&self) -> bool {
         (0..=SENSOR_REACH_US).contains(&self.reach_us) && self.decisions.is_in_range()
     }
 }
 
-/// What a camera with effects did to an image.
+/// Effects of a camera on an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ImageSensor {
     /// When the frame was due, in microseconds since the episode's start.
     pub due_us: i64,
     /// When the picture was taken.
     pub taken_us: i64,
-    /// What was done, in the order of [`SensorReason`].
+    /// The effects, in the order of [`SensorReason`].
     pub reasons: [Option<SensorReason>; 5],
     /// Offset of the exposure, in stops; only with a drift.
     pub stops: Option<f64>,
@@ -75,12 +75,12 @@ pub struct ImageSensor {
     pub clean_hash: Option<blake3::Hash>,
 }
 
-/// What a camera did to an image.
+/// An effect of a camera on an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SensorReason {
-    /// The frame was lost: an earlier one stands in for it.
+    /// The frame was lost, and an earlier one replaces it.
     Dropped,
-    /// The frame has not arrived: an earlier one stands in for it.
+    /// The frame has not arrived, and an earlier one replaces it.
     Late,
     /// The picture stands still.
     Frozen,

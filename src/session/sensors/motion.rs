@@ -1,16 +1,17 @@
-//! What an inertial measurement unit and the wheels measure.
+//! Samples of the inertial measurement unit and of the wheel speed sensor.
 //!
 //! There is a sample for each step, at its end. With the rig's rotation R (world from rig), its acceleration a in world
 //! axes and gravity g = 9.80665 m/s² (ISO 80000-3), at a step of Δt:
 //!
 //! ```text
 //! specific force    f = R⁻¹ (a + g ẑ) + σ n + β(t)      m/s², in the axes of the rig: (0, 0, g) at rest
-//! angular velocity  ω = log(R₀⁻¹ R) / Δt + σ n + β(t)   rad/s, R₀ that of the step before
+//! angular velocity  ω = log(R₀⁻¹ R) / Δt + σ n + β(t)   rad/s, R₀ that of the previous step
 //! speed             v = (1 + s) v_x + σ n               m/s along the rig, at the rear axle
 //! ```
 //!
-//! n are normal and independent, the biases β [wander](super::draw::wandering), and s is drawn once for an episode. The
-//! terms are those of IEEE Std 952 (angle random walk and bias instability), with a bias of a bounded variance.
+//! The samples n are standard normal and independent, the biases β [drift](super::draw::drift), and s is sampled once
+//! per episode. The terms are those of IEEE Std 952 (angle random walk and bias instability), with a bias of a bounded
+//! variance.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -18,7 +19,7 @@ use serde::{Deserialize, Serialize};
 use wildcity_scene::random::Random;
 use wildcity_sim::Ego;
 
-use super::draw::{normal, wandering};
+use super::draw::{drift, standard_normal};
 use super::settings::{AxisNoise, Imu, WheelSpeed};
 
 /// Standard gravity, in m/s².
@@ -39,8 +40,8 @@ pub(crate) struct MotionSample {
 }
 
 impl MotionSample {
-    /// Of the step of `dt_us` that led from one state to another; at the start of an episode there is no step, and both
-    /// are the same.
+    /// The sample of a step of `dt_us` from one state to another. At the start of an episode there is no step, and both
+    /// are equal.
     pub(crate) fn new(from: &Ego, to: &Ego, dt_us: i64, time_us: i64) -> Self {
         let rig_from_world = to.world_from_rig().rotation.inverse();
         let turned =
@@ -55,7 +56,7 @@ impl MotionSample {
         }
     }
 
-    /// What the unit measures: specific force and angular velocity.
+    /// The sample of the unit: specific force and angular velocity.
     pub(crate) fn imu(&self, imu: &Imu, seed: u64) -> [f32; 6] {
         let mut random = Random::new(seed, "imu/noise", self.time_us as usize);
         let mut axis = |index: usize| {
@@ -66,18 +67,18 @@ impl MotionSample {
                 _ => (self.angular_velocity[index - 3], "rpy"),
             };
             let name = format!("imu/bias/{}", &axis[index % 3..index % 3 + 1]);
-            let wandered = wandering(seed, &name, imu.bias_period_us, self.time_us);
-            (ideal + noise * normal(&mut random) + bias * wandered) as f32
+            let drifted = drift(seed, &name, imu.bias_period_us, self.time_us);
+            (ideal + noise * standard_normal(&mut random) + bias * drifted) as f32
         };
         std::array::from_fn(&mut axis)
     }
 
-    /// What the wheels measure.
+    /// The sample of the wheel speed.
     pub(crate) fn wheel_speed(&self, wheels: &WheelSpeed, seed: u64) -> f32 {
-        let scale = normal(&mut Random::new(seed, "wheels/scale", 0));
+        let scale = standard_normal(&mut Random::new(seed, "wheels/scale", 0));
         let mut random = Random::new(seed, "wheels/noise", self.time_us as usize);
         let WheelSpeed { noise, scale: deviation } = wheels;
-        (self.speed * (1.0 + deviation * scale) + noise * normal(&mut random)) as f32
+        (self.speed * (1.0 + deviation * scale) + noise * standard_normal(&mut random)) as f32
     }
 }
 

@@ -20,7 +20,7 @@ use std::sync::LazyLock;
 use wildcity_scene::random::{Random, mix};
 use wildcity_scene::srgb::{linear_from_stored, stored_from_linear};
 
-use super::draw::{normal_table, wandering};
+use super::draw::{drift, normal_table};
 use super::settings::{CameraSensor, ImageNoise, LensDirt};
 
 /// The effects on one image.
@@ -69,9 +69,9 @@ impl PixelEffects {
             return None;
         }
         let aspect = f64::from(height) / f64::from(width);
-        let stops = sensor.exposure.map(|drift| {
+        let stops = sensor.exposure.map(|exposure| {
             let name = format!("{camera}/exposure");
-            drift.stops * wandering(seed, &name, drift.period_us, taken_us)
+            exposure.stops * drift(seed, &name, exposure.period_us, taken_us)
         });
         let key = Random::new(seed, &format!("{camera}/noise"), taken_us as usize).seed();
         Some(Self {
@@ -120,7 +120,7 @@ impl PixelEffects {
         }
     }
 
-    /// Multiplies the light of a row of pixels with what passes the spots.
+    /// Multiplies the light of a row of pixels with the share that passes the spots.
     fn pass_spots(&self, row: usize, passing: &mut [f32]) {
         let width = passing.len() as f32;
         let y = (row as f32 + 0.5) / width;
@@ -236,10 +236,10 @@ mod tests {
 
     #[test]
     fn exposure_multiplies_linear_light() {
-        let drift = ExposureDrift { stops: 1.0, period_us: 1_000_000 };
-        let sensor = CameraSensor { exposure: Some(drift), ..CameraSensor::default() };
+        let exposure = ExposureDrift { stops: 1.0, period_us: 1_000_000 };
+        let sensor = CameraSensor { exposure: Some(exposure), ..CameraSensor::default() };
         for taken_us in [0, 400_000, 7_300_000] {
-            let stops = wandering(9, "front/exposure", 1_000_000, taken_us);
+            let stops = drift(9, "front/exposure", 1_000_000, taken_us);
             let expected = 255.0
                 * stored_from_linear((linear_from_stored(90.0 / 255.0) * stops.exp2()).min(1.0));
             let [value, ..] = applied(&sensor, 9, taken_us, 90)[..] else { panic!("no pixels") };

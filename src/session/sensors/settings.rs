@@ -1,4 +1,4 @@
-//! What a session asks of its sensors.
+//! Sensor settings of a session.
 
 use std::collections::BTreeMap;
 
@@ -62,7 +62,7 @@ pub struct LateFrames {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FrozenFrames {
-    /// Probability of an interval to be one.
+    /// Probability that an interval is frozen.
     pub chance: f64,
     /// Length of the intervals, in microseconds.
     pub for_us: i64,
@@ -84,7 +84,7 @@ pub struct ImageNoise {
 pub struct ExposureDrift {
     /// Standard deviation, in stops.
     pub stops: f64,
-    /// Time between two values that are drawn, in microseconds.
+    /// Time between two sampled values, in microseconds.
     pub period_us: i64,
 }
 
@@ -108,7 +108,7 @@ pub struct Imu {
     pub accelerometer: AxisNoise,
     /// Errors of each axis of the angular velocity, in rad/s.
     pub gyroscope: AxisNoise,
-    /// Time between two biases that are drawn, in microseconds.
+    /// Time between two sampled biases, in microseconds.
     pub bias_period_us: i64,
 }
 
@@ -142,7 +142,7 @@ impl Sensors {
         self.imu.is_some() || self.wheel_speed.is_some()
     }
 
-    /// The same without cameras that have no effect; `None` if nothing is left.
+    /// Removes cameras that have no effect; `None` if nothing is left.
     pub(crate) fn used(mut self) -> Option<Self> {
         self.cameras.retain(|_, camera| *camera != CameraSensor::default());
         (self != Self::default()).then_some(self)
@@ -155,7 +155,7 @@ impl CameraSensor {
         self.noise.is_some() || self.exposure.is_some() || self.dirt.is_some()
     }
 
-    /// Whether it changes which frame is delivered, or what it shows.
+    /// Whether it changes which frame is delivered, or which picture the frame shows.
     pub(crate) fn changes_times(&self) -> bool {
         self.drop.is_some() || self.late.is_some() || self.freeze.is_some()
     }
@@ -166,7 +166,7 @@ impl CameraSensor {
         self.arrival_us(period_us) + frozen_us
     }
 
-    /// How long before a frame is due the one may have been due that stands in for it, in microseconds.
+    /// Largest age, at the time when a frame is due, of the frame that may be delivered in its place, in microseconds.
     pub(crate) fn arrival_us(&self, period_us: i64) -> i64 {
         let dropped_us = self.drop.map_or(0, |_| SENSOR_DROPS * period_us);
         self.late.map_or(0, |late| late.by_us) + dropped_us

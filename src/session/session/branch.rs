@@ -1,5 +1,5 @@
-//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a recorded
-//! episode. A branch that is driven as its original was gives the same bytes.
+//! Snapshots: a session returns to them, and other sessions begin from them, or from a step of a recorded episode. A
+//! branch that gets the same commands as its original gives the same bytes.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use wildcity_scene::rig::overlay_bytes;
 use super::Session;
 use super::open::{frame_bytes, rig_extent, training_coverage};
 use super::recording::traffic_lines;
-use super::requests::Moment;
+use super::requests::SimulationState;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
 use crate::episode::Outcome;
@@ -50,8 +50,8 @@ impl Session {
         }
     }
 
-    /// Returns to a snapshot, and renders it. From here on the session is as it was then: version of the twin,
-    /// ego, time, frames of bundles. Its steps go into a new file.
+    /// Returns to a snapshot, and renders it. This restores the state of the session: version of the twin, ego, time,
+    /// frames of bundles. Later steps are recorded in a new file.
     ///
     /// # Errors
     /// There is no such snapshot; otherwise as [`Session::step`].
@@ -65,8 +65,8 @@ impl Session {
         let layout = &self.settings.layout;
         let earlier = state.frame_history.before(episode.time_us());
         let captures = layout.captures(&episode, &earlier);
-        let moment = Moment { episode: &episode, traffic: state.traffic.as_ref() };
-        let rendered = self.render(version, moment, captures, Some(earlier)).await?;
+        let simulation = SimulationState { episode: &episode, traffic: state.traffic.as_ref() };
+        let rendered = self.render(version, simulation, captures, Some(earlier)).await?;
         let mut bytes = None;
         if !version.is_version_of(&self.version) {
             let resident = version.resident.clone();
@@ -138,10 +138,10 @@ impl Session {
     /// Opens a session in the state that a recorded episode had after one of its steps, with its settings. The
     /// new session has that state as its snapshot `start`.
     ///
-    /// Drives the recorded commands again, and renders the frames that coming bundles show.
+    /// Executes the recorded commands again, and renders the frames that coming bundles show.
     ///
     /// # Errors
-    /// The poses and frames of the record are not those of this build, twin and backend.
+    /// The poses and frames of the record differ from those of this build, twin and backend.
     pub async fn continued(
         engine: Arc<Engine>,
         name: String,
@@ -196,7 +196,7 @@ impl Session {
             deadline,
             drive: None,
             scenario: None,
-            tells_actors: false,
+            reports_actors: false,
             repair: None,
         };
 
@@ -235,8 +235,8 @@ impl Session {
             let version = PinnedVersion::new(version, profile, coverage);
             let history = Some(self.state.frame_history.clone());
             let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
-            let moment = Moment { episode: &episode, traffic: None };
-            let rendered = self.render(&version, moment, captures, history).await?;
+            let simulation = SimulationState { episode: &episode, traffic: None };
+            let rendered = self.render(&version, simulation, captures, history).await?;
             for (frame, now) in frames.iter().zip(&rendered.hashes) {
                 if now.to_hex().as_str() != frame.hash {
                     let camera = self.cameras()[frame.camera].name.clone();

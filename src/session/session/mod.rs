@@ -48,7 +48,7 @@ pub struct Session {
     engine: Arc<Engine>,
     /// The version of the twin, and the memory for the session's worst frame.
     reservation: Reservation,
-    /// Prefetches beside the session.
+    /// Prefetches in the background.
     prefetch_task: LatestTask,
     name: String,
     /// Tells the render queue whose frames are whose.
@@ -62,11 +62,11 @@ pub struct Session {
     /// Number of the current episode's file, and the file once it exists: it begins with the first frame.
     episode_number: u64,
     recorder: Option<Recorder>,
-    /// The session has switched versions, and the episode's file does not say so yet.
+    /// Whether the session has switched versions since the last line of the episode's file.
     version_switched: bool,
     /// The agent's announced path (`prefetch`): poses (`world_from_rig`), in order.
     hint: Vec<Pose>,
-    /// When the last frame was ready, and the time between it and the frame before.
+    /// When the last frame was ready, and the time between it and the previous frame.
     last_frame_at: Instant,
     frame_interval: Duration,
 }
@@ -95,7 +95,7 @@ impl Session {
         self.reservation.bytes()
     }
 
-    /// The same by what it is for.
+    /// The reserved memory by purpose.
     pub fn reservation(&self) -> &Reservation {
         &self.reservation
     }
@@ -137,8 +137,8 @@ impl Session {
 
     /// Whether images come with their trust.
     pub fn trust(&self) -> bool {
-        let is_told = self.settings.repair.as_ref().is_none_or(|repair| repair.tells_trust);
-        self.version.coverage.is_some() && is_told
+        let is_reported = self.settings.repair.as_ref().is_none_or(|repair| repair.reports_trust);
+        self.version.coverage.is_some() && is_reported
     }
 
     /// The repair of its images, if it asked for it.
@@ -146,7 +146,7 @@ impl Session {
         self.settings.repair.as_deref()
     }
 
-    /// Where the images that its repair model compares with come from; `None` if it needs none.
+    /// Source of the images that its repair model compares with; `None` if it needs none.
     pub fn references(&self) -> Option<ReferenceSource> {
         self.version.references.as_ref().map(|references| references.source())
     }
@@ -171,7 +171,7 @@ impl Session {
         self.settings.warm_up_us
     }
 
-    /// How many last frames of each camera an observation holds.
+    /// Number of the most recent frames of each camera that an observation has.
     pub fn frames(&self) -> usize {
         self.settings.layout.schedule().frames()
     }
@@ -196,7 +196,7 @@ impl Session {
         self.settings.dt_us
     }
 
-    /// How long one answer may take.
+    /// Largest time for one answer.
     pub fn deadline(&self) -> Duration {
         self.settings.deadline
     }
@@ -211,9 +211,9 @@ impl Session {
         self.state.traffic.as_ref()
     }
 
-    /// Whether observations tell where the actors are.
-    pub fn tells_actors(&self) -> bool {
-        self.settings.tells_actors
+    /// Whether observations contain the poses of the actors.
+    pub fn reports_actors(&self) -> bool {
+        self.settings.reports_actors
     }
 
     /// Name of the current episode's record; `None` before its first frame.

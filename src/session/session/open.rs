@@ -85,9 +85,9 @@ impl Session {
             Some(asked) => {
                 let models = engine.repairs().clone();
                 let cameras = rig.cameras.clone();
-                let tells_trust = outputs.trust;
+                let reports_trust = outputs.trust;
                 let open =
-                    move || SessionRepair::open(&models, &asked, &cameras, deadline, tells_trust);
+                    move || SessionRepair::open(&models, &asked, &cameras, deadline, reports_trust);
                 Some(Arc::new(run_blocking(open).await??))
             }
         };
@@ -131,7 +131,7 @@ impl Session {
         let episode = start
             .episode(options.seed, options.dynamics, dt_us)
             .with_sensors(layout.episode_sensors());
-        let tells_actors = opened.as_ref().is_some_and(|opened| opened.asked.actors);
+        let reports_actors = opened.as_ref().is_some_and(|opened| opened.asked.actors);
         let (scenario, loaded, solids) = match opened {
             Some(OpenedScenario { scenario, episode, solids, .. }) => {
                 (Some(scenario), Some(episode), solids)
@@ -154,7 +154,7 @@ impl Session {
             deadline,
             drive,
             scenario,
-            tells_actors,
+            reports_actors,
             repair,
         };
 

@@ -1,4 +1,4 @@
-//! Prefetching: loads what the next steps will need while the agent computes.
+//! Prefetching: loads the sections that the next steps need while the agent computes.
 
 use tokio::time::Instant;
 
@@ -37,7 +37,7 @@ impl Session {
         self.prefetch_at(self.forecast().places());
     }
 
-    /// Where the ego may go in the time that loading takes.
+    /// Forecast of where the ego may go in the time that loading takes.
     pub(super) fn forecast(&self) -> EgoForecast<'_> {
         let (shortest, longest) = limits::PREFETCH_AHEAD;
         let ahead = (3 * self.resident().load_p99()).clamp(shortest, longest);
@@ -52,7 +52,7 @@ impl Session {
         }
     }
 
-    /// Loads in the background what is seen from some poses, in place of what was to be prefetched before.
+    /// Loads in the background the sections that are visible from some poses, in place of an earlier prefetch.
     pub(super) fn prefetch_at(&self, places: Vec<(Urgency, Pose)>) {
         let prefetcher = self.reservation.prefetcher().clone();
         let layout = self.settings.layout.clone();

@@ -1,4 +1,4 @@
-//! What a session writes to its episodes' files.
+//! Writes the files of a session's episodes.
 
 use wildcity_episode::{self as episode, ActorsLine, EventLine, scenario_line};
 use wildcity_scene::Rig;
@@ -20,8 +20,8 @@ use crate::scenario::{EpisodeTraffic, Event, EventKind};
 use crate::state::{PinnedVersion, SessionSettings};
 
 impl Session {
-    /// Appends a frame to the episode's file. The first frame of an episode creates the file.
-    /// `traffic` is that after a step; none for a frame that is no step.
+    /// Appends a frame to the episode's file. The first frame of an episode creates the file. `traffic` is that after a
+    /// step; `None` for a frame that is not a step.
     pub(super) async fn record(
         &mut self,
         frame: FrameRecord,
@@ -102,8 +102,8 @@ impl Session {
         })
     }
 
-    /// Creates the file of an episode, with its header and its first frame. `episode` is the state before that
-    /// frame's step.
+    /// Creates the file of an episode, with its header and its first frame. `episode` is the state before the step of
+    /// this frame.
     pub(super) async fn create_file(
         &self,
         pinned: &PinnedVersion,
@@ -184,9 +184,9 @@ impl Session {
     }
 }
 
-/// The lines before the frame of a request: where the actors are at each frame of a warm-up and after each step, and
-/// what happened. Before the first frame of a file also where they were in the steps that its frames show: of a
-/// branch, or if the first request is no reset.
+/// The lines before the frame of a request: the poses of the actors at each frame of a warm-up and after each step, and
+/// the events. Before the first frame of a file also the poses in the earlier steps that its frames show, as in a
+/// branch, or if the first request is not a reset.
 pub(super) fn traffic_lines(
     traffic: &EpisodeTraffic,
     frame: &FrameRecord,
@@ -237,7 +237,7 @@ async fn append(recorder: Recorder, lines: Vec<Line>) -> Result<(), SessionError
     Ok(run_blocking(move || logged(recorder.append(&lines))).await??)
 }
 
-/// Logs a failure: it concerns the operator, and the client may not tell him.
+/// Logs a failure for the operator, because the client may not report it.
 fn logged<T>(recorded: Result<T, RecordError>) -> Result<T, RecordError> {
     recorded.inspect_err(|error| tracing::error!("{error}"))
 }

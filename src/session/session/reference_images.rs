@@ -1,7 +1,7 @@
-//! Reading and drawing the images that a repair model sees beside the rendered ones.
+//! Reads and renders the references of a repair model.
 //!
-//! Each is drawn as a frame of its own, in its turn among the frames of other sessions, and stays in memory for the next
-//! steps and for other sessions: a step along the drive needs new ones every 2 m only.
+//! Each is rendered as a separate frame, scheduled among the frames of other sessions, and stays in memory for the next
+//! steps and for other sessions. Along the drive, new references are needed only every 2 m.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -56,7 +56,7 @@ impl Session {
         Ok(builder)
     }
 
-    /// A reference: from memory, or read and drawn.
+    /// A reference: from memory, or read and rendered.
     async fn reference(
         &self,
         version: &PinnedVersion,

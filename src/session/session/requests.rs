@@ -1,7 +1,7 @@
-//! The requests that are answered with images: step, observe, reset. And close.
+//! The requests that are answered with images (step, observe, reset), and close.
 //!
-//! Each request first renders, then records, and only then changes the session. If it fails or its future
-//! is dropped before that, nothing has happened, and the client can repeat it.
+//! Each request first renders, then records, and only then changes the session. If it fails or its future is dropped
+//! before that, the session is unchanged, and the client can repeat the request.
 
 use serde_json::Value;
 use tokio::time::{Instant, timeout_at};
@@ -34,9 +34,9 @@ use crate::scenario::{EpisodeScenario, EpisodeTraffic};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 
-/// What a frame shows beside the twin: the ego and its past, and the actors.
+/// State that a frame shows in addition to the twin: the ego and its past, and the actors.
 #[derive(Clone, Copy)]
-pub(super) struct Moment<'a> {
+pub(super) struct SimulationState<'a> {
     pub(super) episode: &'a Episode,
     pub(super) traffic: Option<&'a EpisodeTraffic>,
 }
@@ -45,8 +45,8 @@ impl Session {
     /// Moves the ego by one step of `dt_us` and renders.
     ///
     /// # Errors
-    /// The step has not happened then and can be repeated. If the future is dropped, the step may be on
-    /// record but has not happened either.
+    /// The session is then unchanged, and the step can be repeated. If the future is dropped, the step may be on
+    /// record, but the session is unchanged as well.
     pub async fn step(
         &mut self,
         command: impl Into<Command>,
@@ -55,8 +55,8 @@ impl Session {
         self.follow(command.into(), StepOptions { terminate, ..StepOptions::default() }).await
     }
 
-    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of then, and
-    /// those since its start that the observation shows.
+    /// Moves the ego by one or more steps of `dt_us` along a plan, and renders at its end: the frames of that time, and
+    /// the frames since the start of the plan that the observation shows.
     ///
     /// # Errors
     /// As [`Session::step`], and if the notes or the number of steps are out of range.
@@ -81,8 +81,9 @@ impl Session {
 
         let frame_history = self.state.frame_history.clone();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
-        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
+        let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
+        let rendered =
+            self.render(&self.version, simulation, captures, Some(frame_history)).await?;
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = match now.is_delayed() {
@@ -135,8 +136,9 @@ impl Session {
         }
         let episode = self.state.episode.clone();
         let captures = self.settings.layout.captures_at(&episode, poses);
-        let moment = Moment { episode: &episode, traffic: self.state.traffic.as_ref() };
-        let rendered = self.render(&self.version, moment, captures, None).await?;
+        let simulation =
+            SimulationState { episode: &episode, traffic: self.state.traffic.as_ref() };
+        let rendered = self.render(&self.version, simulation, captures, None).await?;
         let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
         self.record(record, None).instrument(debug_span!("record")).await?;
         Ok(rendered.observation)
@@ -154,7 +156,7 @@ impl Session {
         self.reset_with(ResetOptions { seed, start, ..ResetOptions::default() }).await
     }
 
-    /// As [`Session::reset`], with dynamics for this episode alone.
+    /// As [`Session::reset`], with dynamics for only this episode.
     ///
     /// # Errors
     /// As [`Session::reset`], and if the speed is out of range.
@@ -210,8 +212,9 @@ impl Session {
 
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);
-        let moment = Moment { episode: &next, traffic: traffic.as_ref() };
-        let rendered = self.render(&self.version, moment, captures, Some(frame_history)).await?;
+        let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
+        let rendered =
+            self.render(&self.version, simulation, captures, Some(frame_history)).await?;
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let before = traffic.as_ref();
@@ -244,17 +247,17 @@ impl Session {
         self.state.episode.summary(outcome)
     }
 
-    /// Renders captures of a version one after the other, each in its turn among the other sessions' frames.
+    /// Renders captures of a version one after the other, each scheduled among the other sessions' frames.
     ///
     /// With a history, the observation also shows its earlier frames; without one (`observe`), it does not.
     pub(super) async fn render(
         &self,
         version: &PinnedVersion,
-        moment: Moment<'_>,
+        simulation: SimulationState<'_>,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
     ) -> Result<RenderedObservation, SessionError> {
-        let Moment { episode, traffic } = moment;
+        let SimulationState { episode, traffic } = simulation;
         let layout = &self.settings.layout;
         let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(

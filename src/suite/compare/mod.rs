@@ -1,13 +1,13 @@
-//! Two runs, compared: which episodes and scores got worse, and whether that makes the later run a worse one.
+//! Compares two runs: which episodes and scores got worse, and whether the later run counts as worse.
 //!
 //! Episodes are pairs by scenario, values of the sweep and seed. A pair is compared if both were driven in the same
-//! version of the twin and in the same resolved scenario: otherwise a difference says nothing of the driver.
+//! version of the twin and in the same resolved scenario: otherwise a difference says nothing about the driver.
 //!
 //! | module | what it does |
 //! |---|---|
 //! | `pair` | finds the pairs, and what changed in each |
 //! | `scores` | the mean difference of each score over the pairs |
-//! | `rule` | what counts as worse |
+//! | `rule` | when a run counts as worse |
 //! | `text`, `page` | the comparison for people |
 
 mod page;
@@ -32,7 +32,7 @@ pub use scores::{Direction, ScoreChange};
 
 use pair::Key;
 
-/// A run and the run before it, compared. The same two results give the same bytes.
+/// Comparison of a run with a previous run. The same two results give the same bytes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
     /// `wildcity.suite-comparison/1`.
@@ -41,19 +41,19 @@ pub struct Comparison {
     pub worse: bool,
     /// Why it is; empty if it is not.
     pub reasons: Vec<String>,
-    /// What counts as worse.
+    /// Rule by which a run is worse.
     pub rule: Rule,
-    /// Suite and agent of the run before.
+    /// Suite and agent of the previous run.
     pub before: RunName,
     /// Suite and agent of the later run.
     pub after: RunName,
     /// How many pairs changed how.
     pub counts: ChangeCounts,
-    /// Passes of the pairs that the run before has judged.
+    /// Passes of the pairs that the previous run has judged.
     pub pass_rate: PairedRate,
     /// The scores that both runs have.
     pub scores: BTreeMap<String, ScoreChange>,
-    /// Scores that only one run has, or each in another version, in words: they are not compared.
+    /// Scores that are not compared, in words, because only one run has them or their versions differ.
     pub scores_not_compared: Vec<String>,
     /// All episodes of both runs, by name.
     pub episodes: Vec<ComparedEpisode>,
@@ -68,7 +68,7 @@ pub struct RunName {
     pub agent: String,
 }
 
-/// How many episodes changed how; [`Change`] says what each means.
+/// Number of episodes for each [`Change`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[expect(missing_docs, reason = "the names are those of Change")]
 pub struct ChangeCounts {
@@ -83,10 +83,11 @@ pub struct ChangeCounts {
     pub duplicates: u64,
 }
 
-/// How many of the same episodes passed before and pass now. What passed before and has no verdict now does not pass.
+/// Number of the same episodes that passed before, and that pass now. An episode that passed before and has no verdict
+/// now does not pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct PairedRate {
-    /// Pairs that the run before has judged, without duplicates.
+    /// Pairs that the previous run has judged, without duplicates.
     pub pairs: u64,
     /// Of these, passed before.
     pub before: u64,
@@ -97,7 +98,7 @@ pub struct PairedRate {
 /// Why two runs cannot be compared.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CompareError {
-    /// No episode of one run can be held against one of the other.
+    /// No episode of one run can be compared with an episode of the other.
     #[error("the runs cannot be compared: {reason}")]
     NothingToCompare {
         /// Why not.
@@ -130,7 +131,7 @@ pub enum CompareError {
     UnknownScore {
         /// The name.
         name: String,
-        /// The names that there are, with [`PASS_RATE`].
+        /// The existing names, with [`PASS_RATE`].
         known: Vec<String>,
     },
     /// The rule names a score that no pair has.
@@ -155,7 +156,7 @@ impl Comparison {
     /// The format of the file.
     pub const FORMAT: &str = "wildcity.suite-comparison/1";
 
-    /// Compares a run with the run before it.
+    /// Compares a run with a previous run.
     ///
     /// # Errors
     /// [`CompareError`]: no episode can be compared, or the rule names a score that cannot.
@@ -185,7 +186,7 @@ impl Comparison {
         if compared.is_empty() {
             return Err(CompareError::NothingToCompare { reason: why_nothing(&episodes) });
         }
-        // Hold them against the rule.
+        // Apply the rule.
         let pass_rate = PairedRate::of(&compared);
         let scores = scores::changes(&compared);
         let rule = rule.resolved(&scores.keys().map(String::as_str).collect::<Vec<_>>())?;
@@ -205,10 +206,10 @@ impl Comparison {
         })
     }
 
-    /// Checks, before anything is driven, that a run of these cases can be compared with a run before.
+    /// Checks, before anything is driven, that a run of these cases can be compared with a previous run.
     ///
     /// # Errors
-    /// [`CompareError`], as of [`Comparison::new`].
+    /// As for [`Comparison::new`].
     pub fn check(before: &SuiteResult, cases: &[Case], rule: &Rule) -> Result<(), CompareError> {
         let dt_us = cases.first().and_then(|case| case.options.dt_us);
         check_steps(before.dt_us, dt_us)?;
@@ -288,7 +289,7 @@ fn check_steps(before_us: Option<i64>, after_us: Option<i64>) -> Result<(), Comp
     }
 }
 
-/// Refuses verdicts of two versions: a flip could be one of the rules.
+/// Refuses verdicts of two versions, because a difference could be caused by the rules.
 fn check_verdicts(before: &SuiteResult, after: &SuiteResult) -> Result<(), CompareError> {
     let versions = |run: &SuiteResult| -> Vec<String> {
         let names = scores::names(run).into_iter();

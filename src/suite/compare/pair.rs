@@ -11,7 +11,7 @@ use crate::result::SuiteResult;
 
 use super::CompareError;
 
-/// What became of an episode.
+/// Change of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Change {
@@ -23,7 +23,7 @@ pub enum Change {
     Same,
     /// Had no verdict before, or failed before and has none now.
     Unknown,
-    /// The twin or the scenario is another one: says nothing of the driver.
+    /// The twin or the scenario differs, so that the episodes say nothing about the driver.
     Changed,
     /// Was not driven now.
     OnlyBefore,
@@ -43,7 +43,7 @@ pub struct ComparedEpisode {
     /// The values of the sweep.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub values: BTreeMap<String, Value>,
-    /// What became of it.
+    /// Its change.
     pub change: Change,
     /// How it ended before.
     pub before: Option<Side>,
@@ -52,7 +52,7 @@ pub struct ComparedEpisode {
     /// Why the two are not compared.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub differs: Option<String>,
-    /// Whether another pair was driven alike in both runs: this one is in no rate and no mean.
+    /// Whether another pair was driven in the same way in both runs: then this pair is in no rate and no mean.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub duplicate: bool,
     /// The scores that differ: before and now.
@@ -67,11 +67,11 @@ pub struct Side {
     pub status: Status,
     /// The names of its faults, by time.
     pub faults: Vec<String>,
-    /// Where its status comes from, in words.
+    /// Reason of its status, in words.
     pub why: Vec<String>,
 }
 
-/// What makes two episodes a pair.
+/// Identity of an episode, by which two episodes are a pair.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Key {
     scenario: String,
@@ -137,7 +137,7 @@ impl<'a> Pair<'a> {
         self.after.or(self.before).map(|entry| &*entry.name)
     }
 
-    /// Both episodes, if one can be held against the other.
+    /// Both episodes, if they can be compared.
     pub(super) fn comparable(&self) -> Option<(&'a EpisodeEntry, &'a EpisodeEntry)> {
         let both = self.before.zip(self.after);
         both.filter(|(before, after)| differs(before, after).is_none())
@@ -169,7 +169,7 @@ impl<'a> Pair<'a> {
     }
 }
 
-/// Why an episode cannot be held against that of the same scenario and seed before.
+/// Why an episode cannot be compared with the previous one of the same scenario and seed.
 fn differs(before: &EpisodeEntry, after: &EpisodeEntry) -> Option<String> {
     let short = |hash: &str| hash.chars().take(8).collect::<String>();
     let [before_version, after_version] = [before, after].map(|entry| short(&entry.version_hash));
@@ -186,7 +186,7 @@ fn differs(before: &EpisodeEntry, after: &EpisodeEntry) -> Option<String> {
 fn change(before: Status, after: Status) -> Change {
     match (before, after) {
         (Status::Passed, Status::Passed) | (Status::Failed, Status::Failed) => Change::Same,
-        // Nothing shows that it still passes.
+        // It is not known whether it still passes.
         (Status::Passed, _) => Change::Worse,
         (Status::Failed, Status::Passed) => Change::Better,
         _ => Change::Unknown,
@@ -219,7 +219,7 @@ impl Side {
         Self { status: entry.status, faults, why }
     }
 
-    /// The status and where it comes from.
+    /// The status and its reason.
     pub(super) fn text(&self) -> String {
         match self.why.is_empty() {
             true => self.status.name().to_owned(),
@@ -229,7 +229,7 @@ impl Side {
 }
 
 impl ComparedEpisode {
-    /// What became of it, in words.
+    /// The change, in words.
     pub(super) fn text(&self) -> String {
         match (&self.before, &self.after, &self.differs) {
             (Some(_), Some(_), Some(differs)) => differs.clone(),

@@ -1,4 +1,4 @@
-//! What makes a run worse than the one before.
+//! The rule by which a run is worse than the previous one.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -14,13 +14,13 @@ pub const PASS_RATE: &str = "pass_rate";
 /// Sums of the same values differ by less, whatever their order.
 const ROUNDING: f64 = 1e-9;
 
-/// Most episodes that a reason names.
+/// Largest number of episodes that a reason names.
 const NAMED: usize = 5;
 
-/// What makes a run worse: by itself, any episode that passed before and does not pass now.
+/// When a run is worse: by default, if any episode passed before and does not pass now.
 ///
-/// A tolerance of [`PASS_RATE`] replaces that by the pass rate over all pairs, for drivers that do not drive alike
-/// twice. A tolerance of a score adds that score, of which otherwise none counts.
+/// A tolerance of [`PASS_RATE`] replaces this by the pass rate over all pairs, for drivers that are not deterministic.
+/// A tolerance of a score adds this score; by default, scores do not count.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Rule {
     /// By how much each may be worse on average, in its own unit.
@@ -43,7 +43,7 @@ impl FromStr for Tolerance {
         let expected = "expected NAME=AMOUNT, for example pass_rate=0.05";
         let (name, amount) = text.split_once('=').ok_or(expected)?;
         let amount: f64 =
-            amount.parse().map_err(|_| format!("{amount:?} is no number; {expected}"))?;
+            amount.parse().map_err(|_| format!("{amount:?} is not a number; {expected}"))?;
         match name.is_empty() || !amount.is_finite() || amount < 0.0 {
             true => Err(format!("an amount is 0 or more; {expected}")),
             false => Ok(Self { name: name.to_owned(), amount }),
@@ -59,7 +59,7 @@ impl FromIterator<Tolerance> for Rule {
 }
 
 impl Rule {
-    /// The rule with the full names of its scores, of those that are known.
+    /// The rule with the full names of its scores, which must be among `known`.
     pub(super) fn resolved(&self, known: &[&str]) -> Result<Self, CompareError> {
         let full = |name: &str| {
             let found = known.iter().find(|full| **full == name || base(full) == name);
@@ -84,7 +84,7 @@ impl Rule {
         match self.worse_by.get(PASS_RATE) {
             None => reasons.extend(lost_passes(episodes)),
             Some(&most) => {
-                // One division: 10 of 10 and 9 of 10 differ by what "0.1" says.
+                // Use one division, so that 10 of 10 and 9 of 10 differ by exactly the value of "0.1".
                 let lost = rate.before as f64 - rate.after as f64;
                 let fall = lost / rate.pairs.max(1) as f64;
                 if fall > most {
@@ -102,7 +102,7 @@ impl Rule {
         Ok(reasons)
     }
 
-    /// What a run that is not worse has kept.
+    /// The criteria that a run that is not worse has met.
     pub(super) fn kept(&self, rate: PairedRate) -> String {
         let mut kept = vec![match self.worse_by.get(PASS_RATE) {
             None => "every episode that passed before passes now".to_owned(),

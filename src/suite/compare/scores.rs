@@ -10,7 +10,7 @@ use wildcity_score::{lower_is_better, range_of};
 use crate::entry::EpisodeEntry;
 use crate::result::SuiteResult;
 
-/// What became of a score.
+/// Change of a score.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ScoreChange {
     /// Pairs with a value before and now, without duplicates.
@@ -21,12 +21,12 @@ pub struct ScoreChange {
     pub after: Option<f64>,
     /// Mean of the differences, now less before.
     pub difference: Option<f64>,
-    /// The ends of its 95 % interval: Student's t over the pairs, within what the range of the score allows; null below
+    /// The ends of its 95 % interval: Student's t over the pairs, within the range of the score; null for fewer than
     /// three pairs.
     pub interval: Option<[f64; 2]>,
-    /// Whether a lower value is a better one.
+    /// Whether lower values are better.
     pub lower_is_better: bool,
-    /// What the interval says.
+    /// Conclusion from the interval.
     pub direction: Direction,
     /// Pairs with a value before and none now.
     pub only_before: u64,
@@ -34,7 +34,7 @@ pub struct ScoreChange {
     pub only_after: u64,
 }
 
-/// What the interval of a mean difference says.
+/// Conclusion from the interval of a mean difference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
@@ -77,7 +77,7 @@ pub(super) fn not_compared([before, after]: &[BTreeSet<&str>; 2]) -> Vec<String>
     texts
 }
 
-/// What became of each score that some pair has.
+/// The change of each score that some pair has.
 pub(super) fn changes(pairs: &[(&EpisodeEntry, &EpisodeEntry)]) -> BTreeMap<String, ScoreChange> {
     let of_pair = |(before, after): &(&EpisodeEntry, &EpisodeEntry)| {
         let both = before.scores.keys().filter(|name| after.scores.contains_key(*name));

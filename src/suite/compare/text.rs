@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use super::scores::Direction;
 use super::{Change, Comparison, ScoreChange};
 
-/// The comparison: what changed first, then the scores. What decides is not in it: [`Comparison::conclusion`] says that.
+/// The comparison: what changed first, then the scores. The decision is not in it, but in [`Comparison::conclusion`].
 pub(super) fn text(comparison: &Comparison) -> String {
     let mut text = String::new();
     let mut row = |label: &str, rest: &str| {
@@ -86,13 +86,13 @@ fn scores(text: &mut String, comparison: &Comparison) {
     }
 }
 
-/// Whether some pair has another value, or has one in one run alone.
+/// Whether some pair has different values, or a value in only one run.
 pub(super) fn has_changed(score: &ScoreChange) -> bool {
     let is_same = score.pairs == 0 || score.direction == Direction::Same;
     score.only_before + score.only_after > 0 || !is_same
 }
 
-/// Whether there are values, all as before.
+/// Whether there are values, all unchanged.
 pub(super) fn is_alike(score: &ScoreChange) -> bool {
     score.pairs > 0 && !has_changed(score)
 }
@@ -104,7 +104,7 @@ pub(super) fn interval(score: &ScoreChange) -> String {
     }
 }
 
-/// What the interval says, and how many pairs have a value in one run alone.
+/// The conclusion from the interval, and the number of pairs that have a value in only one run.
 pub(super) fn notes(score: &ScoreChange) -> String {
     let mut notes = vec![score.direction.name().to_owned()];
     if score.lower_is_better {

@@ -28,7 +28,7 @@ use super::support::{Painter, Seen, pose, rig};
 /// WebSocket connections at once.
 const CONNECTIONS: usize = 32;
 
-/// Connections of an agent after which it must have ended: each of its cuts costs one, and so may a takeover.
+/// Largest number of connections of an agent: each of its cuts takes one, and so may a takeover.
 const MOST_CONNECTIONS: usize = 40;
 
 /// Names of sessions are used once: the episodes of all histories are in one directory.
@@ -48,11 +48,11 @@ enum Request {
     Reset,
 }
 
-/// What happens to one connection.
+/// Fault of one connection.
 #[derive(Clone, Copy, Debug)]
 struct ConnectionFaults {
     cut: Cut,
-    /// Whether the server hears nothing of the cut.
+    /// Whether the server is not notified of the cut.
     is_unclosed: bool,
     /// Whether each request is sent twice.
     repeats: bool,
@@ -192,7 +192,7 @@ impl ConnectionFaults {
         let is_unclosed = random.once_in(4);
         let buffer_bytes = [17, 300, 64 << 10][random.below(3) as usize];
         let repeats = random.once_in(4);
-        // The server waits for a client that does not read what it is sent: a simulation would wait, too.
+        // The server waits for a client that does not read, and the simulation would wait as well.
         let buffer_bytes = if is_unclosed || repeats { 64 << 10 } else { buffer_bytes };
         Self { cut, is_unclosed, repeats, buffer_bytes, waits: random.once_in(4) }
     }
@@ -253,7 +253,7 @@ impl Agent {
         Err(format!("not at the end after {MOST_CONNECTIONS} connections"))
     }
 
-    /// Drives on over one connection.
+    /// Continues to drive over one connection.
     async fn drive_link(
         &self,
         link: &mut Link,
@@ -398,7 +398,7 @@ impl Network {
 }
 
 impl Link {
-    /// Sends a request so many times. Each is answered, with the same bytes.
+    /// Sends a request several times. Each is answered, with the same bytes.
     async fn exchange(
         &mut self,
         seq: u64,
@@ -433,13 +433,13 @@ impl Link {
         serde_json::from_slice(&answer.into_data()).map_err(|_| Lost)
     }
 
-    /// As [`Link::ask`], for a request after which the numbers go on elsewhere.
+    /// As [`Link::ask`], for a request after which the numbers continue from a different value.
     async fn ask_once(&mut self, seq: u64, request: Value) -> Result<Value, Lost> {
         let answer = self.exchange(seq, request, 1).await?;
         serde_json::from_slice(&answer.into_data()).map_err(|_| Lost)
     }
 
-    /// An observation, or what is said in its place.
+    /// An observation, or the answer in its place.
     async fn observe(&mut self, seq: u64, request: Value) -> Result<Result<Seen, String>, Lost> {
         Ok(match self.exchange(seq, request, self.times()).await? {
             Message::Binary(bytes) => Ok(Seen::decode(bytes)),

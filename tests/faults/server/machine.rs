@@ -39,7 +39,7 @@ pub(super) const CLIENT_TIMEOUT: Duration = Duration::from_secs(20);
 /// Memory for twins: enough for the only one.
 const RESIDENT_BYTES: u64 = 64 << 20;
 
-/// What the servers of many histories share.
+/// Parts that the servers of many histories share.
 pub(super) struct Machine {
     pub(super) runtime: Runtime,
     engine: Arc<Engine>,

@@ -32,10 +32,10 @@ use parking_lot::Mutex;
 use disk::Plant;
 use machine::Machine;
 
-/// Histories of uploads in the gate.
+/// Histories of uploads in CI.
 const UPLOAD_HISTORIES: u64 = 3_500;
 
-/// Histories of connections in the gate.
+/// Histories of connections in CI.
 const CONNECTION_HISTORIES: u64 = 1_000;
 
 /// Histories after which the progress is printed.
@@ -44,9 +44,9 @@ const HISTORIES_TO_TELL: u64 = 10_000;
 /// Histories within which a planted fault must be found.
 const HISTORIES_TO_FIND: u64 = 1_000;
 
-/// What happens in one simulation.
+/// The events of one simulation.
 trait History: Clone + Display {
-    /// What may be wrong with the program, on purpose.
+    /// A deliberate mistake in the program.
     type Plant: Copy + Debug + Sync;
 
     /// The history of a seed.
@@ -58,7 +58,7 @@ trait History: Clone + Display {
     /// Says which promise is broken.
     fn run(&self, machine: &Machine, plant: Option<Self::Plant>) -> Result<(), String>;
 
-    /// The histories that have one thing less.
+    /// Histories with one operation or fault less.
     fn shorter(&self) -> Vec<Self>;
 }
 
@@ -109,7 +109,7 @@ fn run<H: History>(first: u64, histories: u64, plant: Option<H::Plant>) -> Optio
     failed.into_inner().map(|(seed, said)| shrunk(H::of(seed), said, plant))
 }
 
-/// The shortest failing history that leaving out parts of this one leads to. One that fails only if threads run in a
+/// Shortens a failing history by leaving out parts while it still fails. A history that fails only if threads run in a
 /// certain order is not shortened.
 fn shrunk<H: History>(mut history: H, mut said: String, plant: Option<H::Plant>) -> Failure<H> {
     let machine = Machine::new();
@@ -161,7 +161,7 @@ fn run_one<H: History>(machine: &Machine, seed: u64) {
     }
 }
 
-/// The simulation finds what it is made for.
+/// The simulation detects the mistakes that it is made for.
 #[test]
 fn planted_faults_are_found() {
     for plant in [Plant::UnsyncedFiles, Plant::AnnouncedCounted] {

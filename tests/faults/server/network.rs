@@ -10,9 +10,9 @@ use tokio::io::{AsyncRead, AsyncWrite, DuplexStream, ReadBuf};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Cut {
     Never,
-    /// After so many bytes to the server.
+    /// After this number of bytes to the server.
     Sent(u64),
-    /// After so many bytes from the server.
+    /// After this number of bytes from the server.
     Received(u64),
 }
 
@@ -27,13 +27,13 @@ impl CutStream {
         Self { stream, cut }
     }
 
-    /// The end that no client uses any more. Until it is dropped, the server hears nothing of the cut.
+    /// The end that no client uses any more. Until it is dropped, the server is not notified of the cut.
     pub(super) fn into_unclosed(self) -> DuplexStream {
         self.stream
     }
 }
 
-/// How many of so many bytes pass before the cut.
+/// Number of the next `bytes` bytes that pass before the cut.
 fn passing(left: Option<u64>, bytes: usize) -> usize {
     left.map_or(bytes, |left| usize::try_from(left).unwrap_or(bytes).min(bytes))
 }

@@ -1,5 +1,5 @@
-//! A damaged asset beside good ones: the good ones are listed, pushed and driven among; the damaged one is named with the
-//! reason. And what clients are told has no path of the server.
+//! A damaged asset among good ones: the good ones are listed, pushed and used in sessions; the damaged one is listed
+//! with the reason. Messages to clients contain no path of the server.
 
 use std::process::Command;
 
@@ -94,7 +94,7 @@ async fn the_others_are_listed_pushed_and_driven_among() {
             drives(&mut agent, asset).await;
         }
     }
-    // A folder of assets that is none, and the digits of what was in it.
+    // An asset folder that cannot be listed, and the first digits of the hashes in it.
     let folder = path.parent().unwrap();
     std::fs::remove_dir_all(folder).unwrap();
     std::os::unix::fs::symlink(folder, folder).unwrap();

@@ -1,4 +1,4 @@
-//! What is pushed is what `wildcity actor import` makes, and sessions drive among it.
+//! A pushed asset equals that of `wildcity actor import`, and sessions can use it.
 
 use std::sync::Arc;
 
@@ -43,7 +43,7 @@ async fn a_pushed_asset_is_that_of_an_import() {
         json!({ "gaussians": 3_000, "error_m": 0.0, "bytes": wanted.levels[0].bytes })
     );
 
-    // Once more it is there already. Other options make another asset.
+    // The second push finds the asset of the first one. Other options make a different asset.
     let again = post(&server, "/v1/actors", &asked).await;
     assert_eq!((again.status, &again.body), (200, &made.body));
     asked["record"] = "q24".into();
@@ -107,7 +107,7 @@ async fn a_pushed_vehicle_is_that_of_an_import() {
     assert_eq!(made.hash, wanted.hash);
     assert!(made.gaussians >= 20_000 && made.box_.width_m > 4.5, "{made:?}");
 
-    // A vehicle that names its texture, in a folder beside it.
+    // A vehicle that names its texture, in a folder next to it.
     let texture = "Textures/colormap-car.png";
     let van = crate::data::real("vehicles/kenney_carkit/van.glb").unwrap();
     let paint = van.parent().unwrap().join(texture);
@@ -120,7 +120,7 @@ async fn a_pushed_vehicle_is_that_of_an_import() {
     assert_eq!(client.push_actor(&asked).await.unwrap().hash, wanted.hash);
 }
 
-/// The image of an ego at rest, with an actor 6 m ahead that is drawn from an asset, or from none.
+/// The image of an ego at rest, with an actor 6 m ahead that is drawn from an asset, or without one.
 async fn image_with(server: &TestServer, asset: Option<&str>) -> Vec<u8> {
     let mut actor = json!({ "name": "ahead", "stand": { "xyz": [6, 0, 0] } });
     match asset {

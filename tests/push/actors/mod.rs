@@ -51,7 +51,7 @@ pub(super) async fn upload_ply(client: &HttpClient, name: &str, gaussians: &Gaus
     upload(client, &write(dir.path(), name, gaussians)).await
 }
 
-/// What `wildcity actor import` stores of a file.
+/// The asset that `wildcity actor import` stores for a file.
 pub(super) fn imported(
     path: &Path,
     name: &str,
@@ -70,7 +70,7 @@ pub(super) fn imported(
     Catalog::open(dir.path()).unwrap().put_actor(&asset, record).unwrap()
 }
 
-/// Asserts that no asset is there, and no part of one.
+/// Asserts that there is no asset, and no part of one.
 pub(super) async fn nothing_is_stored(server: &TestServer) {
     assert_eq!(get(server, "/v1/actors").await.body, json!({ "actors": [] }));
     let objects = server.twins.path().join(".actors/objects");

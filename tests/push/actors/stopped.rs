@@ -43,7 +43,7 @@ async fn a_client_that_goes_away_leaves_nothing() {
     nothing_is_stored(&server).await;
     let text = std::fs::read_to_string(&audit).unwrap();
     assert!(text.lines().last().unwrap().contains("the push was cancelled"), "{text}");
-    // Sent again, it is made; by then the threads of the first are done, and have stored nothing.
+    // The repeated push makes the asset; the threads of the first push have ended by then, and have stored nothing.
     let made = client.push_actor(&actor_of("large", &[&id])).await.unwrap();
     let listed = client.actors().await.unwrap().actors;
     assert_eq!((listed.len(), &listed[0].hash), (1, &made.hash));
@@ -65,7 +65,7 @@ async fn a_server_that_stops_leaves_nothing_half_made() {
         Err(HttpError::NoAnswer { .. }) => {}
         other => panic!("{other:?}"),
     }
-    // The threads go on for a moment.
+    // The threads run for a moment longer.
     tokio::time::sleep(Duration::from_secs(3)).await;
     let catalog = Catalog::open(twins.path()).unwrap();
     assert_eq!(catalog.actors().unwrap(), ActorList::default());

@@ -1,17 +1,17 @@
 //! The order of frames: start-time fair queueing of the sessions, weighted by cost.
 //!
-//! Source: Goyal, Vin and Cheng, *Start-time fair queueing*, SIGCOMM 1996. Each frame has a start tag: the later of
-//! the queue's virtual time and the finish tag of its session's frame before. Its finish tag is its cost later. The
-//! frame with the smallest finish tag is next, and the virtual time becomes its start tag. So each session gets the same
-//! number of pixels, a small frame passes the large ones that wait, and no frame is passed for ever: the tags
-//! of later frames grow with the virtual time.
+//! Source: Goyal, Vin and Cheng, *Start-time fair queueing*, SIGCOMM 1996. Each frame has a start tag: the later of the
+//! queue's virtual time and the finish tag of its session's previous frame. Its finish tag is the start tag plus its
+//! cost. The frame with the smallest finish tag is next, and the virtual time becomes its start tag. So each session
+//! gets the same number of pixels, a small frame passes the large ones that wait, and no frame is passed for ever: the
+//! tags of later frames grow with the virtual time.
 
 use std::collections::BTreeMap;
 
-/// What a frame takes of the renderer.
+/// Cost of a frame for the renderer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FrameCost {
-    /// Whose frame it is: frames of one session share one turn.
+    /// Number of the frame's session.
     pub session: u64,
     /// Pixels of all its images.
     pub pixels: u64,
@@ -56,7 +56,7 @@ impl<T> FairQueue<T> {
         self.waiting.insert((finish, self.arrivals), Waiting { cost, start, item });
     }
 
-    /// Takes the next frame of at most so many pixels.
+    /// Takes the next frame that has at most `most_pixels` pixels.
     pub(super) fn pop(&mut self, most_pixels: u64) -> Option<(FrameCost, T)> {
         let fits = |waiting: &Waiting<T>| waiting.cost.pixels <= most_pixels;
         let (&tag, _) = self.waiting.iter().find(|(_, waiting)| fits(waiting))?;
@@ -68,7 +68,7 @@ impl<T> FairQueue<T> {
         Some((cost, item))
     }
 
-    /// Pixels of the frames that wait and have more than so many.
+    /// Pixels of all waiting frames that have more than `pixels` pixels.
     pub(super) fn pixels_above(&self, pixels: u64) -> u64 {
         let costs = self.waiting.values().map(|waiting| waiting.cost.pixels);
         costs.filter(|&own| own > pixels).sum()

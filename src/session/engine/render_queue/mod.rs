@@ -1,15 +1,15 @@
 //! The queue of frames in front of the render threads.
 //!
-//! There are as many render threads as the backend keeps frames in flight. The cpu backend renders one,
-//! on all cores: two at once would take as long together and hold twice the memory. A GPU renders one
-//! frame while the one before is encoded. The sessions take turns ([`fair`]).
+//! There are as many render threads as the backend keeps frames in flight. The cpu backend renders one, on all cores:
+//! two at once would take as long together and hold twice the memory. A GPU renders one frame while the previous one is
+//! encoded. Frames of the sessions are scheduled fairly ([`fair`]).
 //!
 //! **A frame of seconds does not keep the others waiting.** While a large frame is rendered, another thread renders
 //! the small ones, if the backend can do both at once: the operating system shares the cores among them.
 //!
-//! **A frame that cannot be ready in time is not begun.** The time that large frames take per pixel is measured. One that
-//! cannot be done before its deadline is refused when it comes, or when its turn comes: otherwise a server with too
-//! many large frames would discard most of what it renders.
+//! **A frame that cannot be ready in time is not started.** The time that large frames take per pixel is measured. A
+//! frame that cannot be done before its deadline is refused when it arrives, or when it is next: otherwise a server
+//! with too many large frames would discard most of its frames.
 
 mod fair;
 mod scratch;
@@ -40,8 +40,8 @@ struct Job {
     work: Box<dyn FnOnce(&mut Scratch) + Send>,
 }
 
-/// The queue. On drop it waits for its render threads. Otherwise the last of them might drop the backend while the process
-/// exits, and NVIDIA's driver crashes then.
+/// The queue. On drop it waits for its render threads. Otherwise the last of them might drop the backend while the
+/// process exits, and NVIDIA's driver crashes then.
 pub(crate) struct RenderQueue {
     shared: Arc<Shared>,
 }
@@ -49,7 +49,7 @@ pub(crate) struct RenderQueue {
 struct Shared {
     backend: Arc<dyn Backend>,
     state: Mutex<State>,
-    /// Signalled when a frame comes, when a large one is begun, and when the queue is dropped.
+    /// Signalled when a frame arrives, when a large frame is started, and when the queue is dropped.
     changed: Condvar,
 }
 
@@ -59,7 +59,7 @@ struct State {
     is_closed: bool,
     /// Pixels of the large frames that are being rendered.
     rendering: u64,
-    /// Nanoseconds that a large frame takes per pixel: a moving average; 0 before the first one.
+    /// Nanoseconds that a large frame takes per pixel: a moving average; 0 before the first large frame.
     ns_per_pixel: f64,
     /// Whether there is a thread for small frames.
     has_side_thread: bool,
@@ -71,7 +71,7 @@ struct State {
 enum Lane {
     /// All of them.
     Main,
-    /// Small ones, while a large one is rendered.
+    /// Renders small frames while a large one is rendered.
     Side,
 }
 
@@ -105,7 +105,7 @@ impl RenderQueue {
     /// Runs `work` on a render thread. Returns its result and how long it was queued.
     ///
     /// # Errors
-    /// [`SessionError::Busy`] if the queue is full, or the frames before it leave it no time;
+    /// [`SessionError::Busy`] if the queue is full, or earlier frames leave it no time;
     /// [`SessionError::Crashed`] if `work` panicked; and [`SessionError::DeadlineExceeded`] if there is no
     /// result by the deadline. Work that has not started by then never starts; work that has is finished, and
     /// its result is discarded.
@@ -191,8 +191,8 @@ impl Shared {
                 return Err(SessionError::Busy { what: "pixels queued" });
             }
         }
-        // A backend that renders one frame at a time has no use for the thread, and one without large
-        // frames never gets it.
+        // The thread is only useful if the backend can render two frames at once, and only needed once there is a
+        // large frame.
         let needs_side_thread =
             state.rendering > 0 && !state.has_side_thread && self.backend.renders_beside();
         state.queue.push(cost, job);
@@ -250,7 +250,7 @@ impl Shared {
 }
 
 impl State {
-    /// The expected time to render so many pixels of large frames.
+    /// Expected time to render `pixels` pixels of large frames.
     fn time_for(&self, pixels: u64) -> Duration {
         Duration::from_secs_f64(pixels as f64 * self.ns_per_pixel * 1e-9)
     }
@@ -348,7 +348,7 @@ mod tests {
         FrameCost { session, pixels: 2 * limits::LARGE_PIXELS }
     }
 
-    /// Twelve sessions with large frames of 100 ms beside one with small frames of 1 ms.
+    /// Twelve sessions with large frames of 100 ms, and one with small frames of 1 ms.
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn small_frames_do_not_wait_for_large_ones() {
         let queue = RenderQueue::start(Arc::new(IdleBackend { frames_in_flight: 1 })).unwrap();

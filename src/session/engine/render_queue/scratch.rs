@@ -19,7 +19,7 @@ pub struct Scratch {
 }
 
 impl Scratch {
-    /// Frees what is more than [`limits::SCRATCH_BYTES`] in all: first what the fewest frames need.
+    /// Frees buffers beyond [`limits::SCRATCH_BYTES`] in all: first those that the fewest frames need.
     pub(crate) fn free_excess(&mut self) {
         let Self { images, opacity, depth_m, normals } = self;
         let mut left = limits::SCRATCH_BYTES;
@@ -35,7 +35,7 @@ impl Scratch {
 pub(crate) struct Buffers<T>(Vec<Vec<T>>);
 
 impl<T: Copy + Default> Buffers<T> {
-    /// A buffer for each view, with so many values per pixel.
+    /// A buffer for each view, with a number of values per pixel.
     pub(crate) fn of_views(
         &mut self,
         views: &[View],

@@ -19,25 +19,25 @@ use crate::sensors::delivery::Delivery;
 use crate::sensors::settings::CameraSensor;
 use crate::sensors::{ImageSensor, SensorReason};
 
-/// A finished observation, and what it leaves for its record and for later observations.
+/// A finished observation, and the data of it that its record and later observations need.
 pub(crate) struct RenderedObservation {
     pub(crate) observation: Observation,
     /// The history after this observation; empty if it was built without one.
     pub(crate) frame_history: FrameHistory,
-    /// What was rendered, in order.
+    /// The rendered captures, in order.
     pub(crate) captures: Vec<RigCapture>,
     /// The hash of each rendered image.
     pub(crate) hashes: Vec<blake3::Hash>,
-    /// What became of each rendered image; empty unless the session asked for repair.
+    /// Result of the repair of each rendered image; empty unless the session asked for repair.
     pub(crate) repairs: Vec<ImageRepair>,
-    /// What the repair keeps after this observation. None without repair, and for poses that the ego is not at.
+    /// State of the repair after this observation. `None` without repair, and for poses that the ego is not at.
     pub(crate) repair_state: Option<RepairState>,
     trusts: Vec<Option<Trust>>,
 }
 
 impl RenderedObservation {
-    /// The trusts of the rendered images, those that only later observations show included. None if the
-    /// session's images come without.
+    /// The trusts of the rendered images, including images that only later observations show. Empty if the session's
+    /// images come without trust.
     pub(crate) fn trusts(&self) -> impl Iterator<Item = f64> {
         self.trusts.iter().flatten().map(|trust| trust.value)
     }
@@ -107,23 +107,23 @@ impl ObservationBuilder {
                 encoded += 1;
             }
             // A step has one pose, even if a camera shows a picture that was taken from another.
-            pose += usize::from(capture.shown && !capture.sensed);
+            pose += usize::from(capture.shown && !capture.has_sensor_effects);
         }
         shown
     }
 
-    /// When an image was taken by its camera's clock, in microseconds, and what the camera did to it.
+    /// When an image was taken by its camera's clock, in microseconds, and the effects of the camera on it.
     fn delivered(
         &self,
         capture: &RigCapture,
         camera: usize,
         encoded: usize,
     ) -> (i64, Option<ImageSensor>) {
-        if !capture.sensed || self.layout.sensor(camera).is_none() {
+        if !capture.has_sensor_effects || self.layout.sensor(camera).is_none() {
             return (capture.time_us, None);
         }
         let Delivery { stamp_us, taken_us, missing } =
-            self.layout.delivery(camera, self.key, capture.due_us);
+            self.layout.delivery(camera, self.effect_seed, capture.due_us);
         let has_effects = |sensor: &CameraSensor| {
             [
                 missing,
@@ -202,8 +202,8 @@ impl ObservationBuilder {
         tensors
     }
 
-    /// Moves the images that later observations show into the history, appends those of earlier times that
-    /// this one shows, and drops from the history what no later one shows.
+    /// Moves the images that later observations show into the history, appends images of earlier times that this one
+    /// shows, and drops images from the history that no later one shows.
     fn append_earlier_frames(
         &mut self,
         history: &mut FrameHistory,

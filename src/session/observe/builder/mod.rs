@@ -13,7 +13,7 @@ use wildcity_render::{Backend, Frame, FrameStats, Target};
 
 use super::buffer::ObservationBuffer;
 use super::encode::{AppliedEffects, EncodedImage, Encoding, encode, hashed};
-use super::layout::{EpisodeKey, InPlaceBytes, ObservationLayout, RigCapture};
+use super::layout::{EffectSeed, InPlaceBytes, ObservationLayout, RigCapture};
 use super::observation::{ResidencyStats, Timings};
 use super::trust::TrainingCoverage;
 use crate::engine::answer_budget::AnswerBudget;
@@ -31,14 +31,14 @@ use self::repair::{Finished, ObservationRepair, RenderedCapture};
 pub(crate) struct ObservationBuilder {
     layout: Arc<ObservationLayout>,
     budget: AnswerBudget,
-    /// Where the twin was recorded, if images come with their trust or may be repaired.
+    /// Poses where the twin was recorded, if images come with their trust or may be repaired.
     coverage: Option<Arc<TrainingCoverage>>,
     /// Set if images may be repaired.
     repair: Option<ObservationRepair>,
     buffer: ObservationBuffer,
     history_count: usize,
-    /// What the effects of the sensors depend on.
-    key: EpisodeKey,
+    /// Seed and start time from which the sensor effects are derived.
+    effect_seed: EffectSeed,
     /// Number of samples of the inertial measurement unit and of the wheels; `None` without.
     motion_samples: [Option<usize>; 2],
     /// Where the next shown image's floats go, in bytes from the buffer's start.
@@ -48,7 +48,7 @@ pub(crate) struct ObservationBuilder {
     /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
     raw_at: usize,
     captures: Vec<RigCapture>,
-    /// The images of all captures so far, camera by camera.
+    /// The images of all captures so far, in order of the cameras.
     encoded: Vec<EncodedImage>,
     timings: Timings,
     residency: ResidencyStats,
@@ -68,7 +68,7 @@ impl ObservationBuilder {
         let EgoHistory { xyz_m, rotation, count } = episode.history();
         let history: [&[u8]; 2] = [bytemuck::bytes_of(&xyz_m), bytemuck::bytes_of(&rotation)];
         let mut history = history.concat();
-        let motion_samples = match captures.iter().any(|capture| capture.sensed) {
+        let motion_samples = match captures.iter().any(|capture| capture.has_sensor_effects) {
             true => add_motion(&mut history, &layout, episode),
             false => [None; 2],
         };
@@ -95,7 +95,7 @@ impl ObservationBuilder {
             repair: None,
             buffer,
             history_count: count,
-            key: EpisodeKey::of(episode),
+            effect_seed: EffectSeed::of(episode),
             motion_samples,
             floats_at,
             instances_at,
@@ -107,7 +107,7 @@ impl ObservationBuilder {
         })
     }
 
-    /// The same with images that may be repaired.
+    /// Enables the repair of images.
     #[must_use]
     pub(crate) fn with_repair(self, repair: Option<ObservationRepair>) -> Self {
         Self { repair, ..self }
@@ -125,17 +125,17 @@ impl ObservationBuilder {
         let coverage = self.coverage.clone();
 
         let pixels: u64 = frame.views.iter().map(|view| view.camera.pixels() as u64).sum();
-        let gate = match &mut self.repair {
-            Some(repair) => Some(repair.gate(&self.budget, capture, pixels)?),
+        let filter = match &mut self.repair {
+            Some(repair) => Some(repair.candidate_filter(&self.budget, capture, pixels)?),
             None => None,
         };
-        let tells_trust = gate.as_ref().is_none_or(|gate| gate.session.tells_trust);
+        let reports_trust = filter.as_ref().is_none_or(|filter| filter.session.reports_trust);
 
         // Maps that the observation does not hold, but that are needed: trust is computed from opacity,
         // normals are computed from depth, and a repair model may need each of them.
         let PixelMaps { depth, opacity, normals, .. } = layout.maps();
         let model_needs = |needs: fn(&SessionRepair) -> bool| {
-            gate.as_ref().is_some_and(|gate| needs(&gate.session))
+            filter.as_ref().is_some_and(|filter| needs(&filter.session))
         };
         let needs_opacity = coverage.is_some() && !(opacity && capture.shown);
         let uses_depth = (normals && capture.shown) || model_needs(SessionRepair::needs_depth);
@@ -145,9 +145,9 @@ impl ObservationBuilder {
         let extra_values =
             u64::from(needs_opacity) + u64::from(needs_depth) + 3 * u64::from(needs_normals);
         // Noise and the like are computed on copies.
-        let key = self.key;
-        let effects = |camera: &usize| match capture.sensed {
-            true => layout.pixel_effects(*camera, key, capture.time_us),
+        let effect_seed = self.effect_seed;
+        let effects = |camera: &usize| match capture.has_sensor_effects {
+            true => layout.pixel_effects(*camera, effect_seed, capture.time_us),
             false => None,
         };
         let effects: Vec<Option<PixelEffects>> = capture.cameras.iter().map(effects).collect();
@@ -156,7 +156,7 @@ impl ObservationBuilder {
         let _share = self.budget.reserve(4 * pixels * extra_values + copied)?;
 
         // Where the renderer writes.
-        let raw_at = match gate.is_some() || has_effects {
+        let raw_at = match filter.is_some() || has_effects {
             true => self.raw_places(capture),
             false => Vec::new(),
         };
@@ -191,8 +191,8 @@ impl ObservationBuilder {
                 let opacity = target.opacity.as_deref().unwrap_or_default();
                 coverage.trust(&capture.world_from_rig, &frame.views[index], opacity)
             });
-            let repair = gate.as_ref().zip(trust);
-            let repair = repair.map(|(gate, trust)| gate.finished(index, trust.value, target));
+            let repair = filter.as_ref().zip(trust);
+            let repair = repair.map(|(filter, trust)| filter.finished(index, trust.value, target));
             let mut image = match &repair {
                 Some(Finished { candidate: Some(_), .. }) => Ok(hashed(pixels)),
                 _ => {
@@ -201,7 +201,7 @@ impl ObservationBuilder {
                 }
             };
             if let Ok(image) = &mut image {
-                image.trust = trust.filter(|_| tells_trust);
+                image.trust = trust.filter(|_| reports_trust);
                 let rendered_hash = image.effects.map_or(image.hash, |effects| effects.clean_hash);
                 image.repair = repair.is_some().then(|| ImageRepair::kept(rendered_hash));
             }
@@ -230,10 +230,10 @@ impl ObservationBuilder {
             self.timings.encode += image.took;
             self.encoded.push(image);
         }
-        if let (Some(repair), Some(gate)) = (&mut self.repair, &gate) {
+        if let (Some(repair), Some(filter)) = (&mut self.repair, &filter) {
             let rendered =
                 RenderedCapture { finished: repairs, views: frame.views, raw_at: &raw_at, first };
-            repair.decide(capture, gate, rendered);
+            repair.decide(capture, filter, rendered);
         }
         Ok(())
     }
@@ -255,8 +255,8 @@ impl ObservationBuilder {
         capture.cameras.iter().map(place).collect()
     }
 
-    /// Where the renderer writes a capture's images: into the buffer what the observation holds as
-    /// rendered, and into `images` what is encoded first.
+    /// Targets of a capture's images: the buffer for maps and pixels that the observation contains as rendered, and
+    /// `images` for pixels that are encoded first.
     fn targets<'a>(
         &'a mut self,
         capture: &RigCapture,
@@ -335,11 +335,11 @@ impl ObservationBuilder {
     }
 }
 
-/// What a render thread leaves of a view: the image, and what the selection needs if there is one.
+/// Result of a render thread for a view: the image, and the data that the selection needs if there is one.
 type FinishedView = (Result<EncodedImage, String>, Option<Finished>);
 
-/// The hash and the file of a camera's image after the effects on its pixels; of raw pixels a copy if there are
-/// effects, and another if a later observation shows them.
+/// The hash and the file of a camera's image after the effects on its pixels; for raw pixels a copy if there are
+/// effects, and another copy if a later observation shows them.
 fn encoded(
     layout: &ObservationLayout,
     camera: usize,
@@ -372,8 +372,8 @@ fn encoded(
     Ok(image)
 }
 
-/// Appends the samples of an episode's motion as the sensors measure it: those of the inertial measurement unit, then
-/// those of the wheels. Returns how many each has; `None` without.
+/// Appends the samples of the motion sensors of an episode: first of the inertial measurement unit, then of the wheels.
+/// Returns the number of samples of each; `None` if the session does not have the sensor.
 fn add_motion(
     bytes: &mut Vec<u8>,
     layout: &ObservationLayout,
@@ -400,13 +400,13 @@ fn split_off_front<'a>(rest: &mut &'a mut [u8], bytes: usize) -> &'a mut [u8] {
     front
 }
 
-/// The same bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's
-/// room, the ego history and the maps before them are multiples of 4 bytes.
+/// The bytes as floats. They are aligned: the buffer's address is a multiple of 8, and the header's room, the ego
+/// history and the maps before them are multiples of 4 bytes.
 fn as_floats(bytes: &mut [u8]) -> &mut [f32] {
     bytemuck::cast_slice_mut(bytes)
 }
 
-/// The same bytes as instances. They are aligned: all bytes before them are of floats, and of other instances.
+/// The bytes as instances. They are aligned: all bytes before them are of floats, and of other instances.
 fn as_ids(bytes: &mut [u8]) -> &mut [u16] {
     bytemuck::cast_slice_mut(bytes)
 }

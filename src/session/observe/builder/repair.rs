@@ -3,7 +3,7 @@
 //! The renderer's callback encodes an image at once unless it may be repaired. Such a candidate is copied
 //! instead. When all views of its pose are rendered, so that the trust of each is known, the selection decides,
 //! and the candidates are repaired and encoded outside of the render queue: frames of other sessions are
-//! rendered meanwhile, and a model that hangs delays its own session alone.
+//! rendered meanwhile, and a model that hangs delays only its own session.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -19,20 +19,20 @@ use crate::engine::answer_budget::{AnswerBudget, BudgetShare};
 use crate::error::SessionError;
 use crate::observe::layout::RigCapture;
 use crate::options::OnFailure;
-use crate::repair::drawn::{Beside, Sight};
+use crate::repair::drawn::{ReferenceInputs, WarpQuery};
 use crate::repair::references::{ReferenceView, ReferenceViews};
 use crate::repair::rendered_image::RenderedImage;
 use crate::repair::session_repair::SessionRepair;
 use crate::repair::status::{ImageRepair, RepairFailure, RepairState, RepairStatus};
 
-/// What the repair of an observation's images needs.
+/// State and data of the repair of an observation's images.
 pub(crate) struct ObservationRepair {
     pub(super) session: Arc<SessionRepair>,
-    /// By camera: after the captures so far.
+    /// Hysteresis state of each camera after the captures so far.
     state: RepairState,
-    /// Whether that goes from one capture to the next. Not for poses that the ego is not at.
+    /// Whether the state is kept from one capture to the next. False for `observe`, whose poses are not the ego's.
     has_history: bool,
-    /// Of the last capture.
+    /// Candidates of the last capture.
     candidates: Vec<Candidate>,
     /// The memory of the candidates.
     share: Option<BudgetShare>,
@@ -43,7 +43,7 @@ pub(crate) struct ObservationRepair {
 /// An image that may be repaired.
 struct Candidate {
     camera: usize,
-    /// Among the encoded images.
+    /// Index among the encoded images.
     index: usize,
     /// Whether the selection chose it.
     is_chosen: bool,
@@ -52,27 +52,27 @@ struct Candidate {
     raw_at: Option<usize>,
     view: View,
     world_from_rig: Pose,
-    /// The references that are brought into it, in order.
+    /// The references that are warped into it, in order.
     around: Vec<ReferenceView>,
     /// The reference of the same camera.
     nearest: Option<ReferenceView>,
 }
 
-/// A capture that is rendered.
+/// The images of a rendered capture.
 pub(super) struct RenderedCapture<'a> {
-    /// View by view.
+    /// In the order of the views.
     pub(super) finished: Vec<Finished>,
     pub(super) views: &'a [View],
     /// Where the pixels of each view are in the buffer.
     pub(super) raw_at: &'a [Option<usize>],
-    /// Where its images begin among the encoded ones.
+    /// Index of its first image among the encoded ones.
     pub(super) first: usize,
 }
 
-/// Which images of a capture may be repaired: shared by the threads that finish its views.
-pub(super) struct Gate {
+/// Decides, for each view of a capture, whether it is a repair candidate. Shared by the threads that finish the views.
+pub(super) struct CandidateFilter {
     pub(super) session: Arc<SessionRepair>,
-    /// By view of the capture.
+    /// For each view of the capture, whether the repair of its camera is on.
     was_on: Vec<bool>,
 }
 
@@ -84,7 +84,7 @@ pub(super) struct Finished {
 }
 
 impl ObservationRepair {
-    /// `state` is that after the observation before; none for poses that the ego is not at.
+    /// `state` is the state after the previous observation; `None` for poses that the ego is not at.
     pub(crate) fn new(
         session: Arc<SessionRepair>,
         cameras: usize,
@@ -96,18 +96,18 @@ impl ObservationRepair {
         Self { session, state, has_history, candidates: Vec::new(), share: None, references }
     }
 
-    /// The state now; none for poses that the ego is not at.
+    /// The state after all captures; `None` for poses that the ego is not at.
     pub(super) fn into_state(self) -> Option<RepairState> {
         self.has_history.then_some(self.state)
     }
 
-    /// The gate of a capture. Reserves memory for its candidates.
-    pub(super) fn gate(
+    /// Returns the filter of a capture, and reserves memory for its candidates.
+    pub(super) fn candidate_filter(
         &mut self,
         budget: &AnswerBudget,
         capture: &RigCapture,
         pixels: u64,
-    ) -> Result<Gate, SessionError> {
+    ) -> Result<CandidateFilter, SessionError> {
         let depth = u64::from(self.session.needs_depth());
         let normals = u64::from(self.session.needs_normals());
         // Two more copies of the depth, and the references in the view.
@@ -115,19 +115,19 @@ impl ObservationRepair {
         let values = 1 + depth + 3 * normals + 4 * warped;
         self.share = Some(budget.reserve(pixels * (3 + 4 * values))?);
         let was_on = capture.cameras.iter().map(|&camera| self.state.is_on[camera]).collect();
-        Ok(Gate { session: self.session.clone(), was_on })
+        Ok(CandidateFilter { session: self.session.clone(), was_on })
     }
 
     /// Decides which images of a capture are repaired.
     pub(super) fn decide(
         &mut self,
         capture: &RigCapture,
-        gate: &Gate,
+        filter: &CandidateFilter,
         rendered: RenderedCapture<'_>,
     ) {
         let RenderedCapture { finished, views, raw_at, first } = rendered;
         let trusts: Vec<f64> = finished.iter().map(|image| image.trust).collect();
-        let decision = gate.session.selection.decide(&gate.was_on, &trusts);
+        let decision = filter.session.selection.decide(&filter.was_on, &trusts);
         for (view, Finished { candidate, .. }) in finished.into_iter().enumerate() {
             let camera = capture.cameras[view];
             if self.has_history {
@@ -153,19 +153,19 @@ impl ObservationRepair {
 }
 
 impl Candidate {
-    /// What the model gets beside the image.
-    fn beside(
+    /// References that the model gets in addition to the image.
+    fn reference_inputs(
         &self,
         session: &SessionRepair,
         camera: &RigCamera,
         references: &HashMap<String, Arc<Reference>>,
-    ) -> Beside {
-        let mut beside = Beside::default();
+    ) -> ReferenceInputs {
+        let mut inputs = ReferenceInputs::default();
         if session.needs_reference()
             && let Some(nearest) = &self.nearest
             && let Some(reference) = references.get(&nearest.id())
         {
-            beside.set_reference(&nearest.name, reference, &camera.camera);
+            inputs.set_reference(&nearest.name, reference, &camera.camera);
         }
         if session.needs_warped() {
             let named = |view: &ReferenceView| {
@@ -174,15 +174,15 @@ impl Candidate {
             let around: Vec<(String, Arc<Reference>)> =
                 self.around.iter().filter_map(named).collect();
             let rays = session.rays(self.camera, camera);
-            let sight = Sight { camera, rays, view: &self.view, image: &self.image };
-            sight.warped(&around, &mut beside);
+            let query = WarpQuery { camera, rays, view: &self.view, image: &self.image };
+            query.warped(&around, &mut inputs);
         }
-        beside
+        inputs
     }
 }
 
-impl Gate {
-    /// What the selection needs of a finished view.
+impl CandidateFilter {
+    /// Returns the data of a finished view that the selection needs.
     pub(super) fn finished(&self, view: usize, trust: f64, target: &Target<'_>) -> Finished {
         if !self.session.selection.is_candidate(self.was_on[view], trust) {
             return Finished { trust, candidate: None };
@@ -227,8 +227,8 @@ impl ObservationBuilder {
             if session.needs_warped() {
                 let Candidate { view, image, .. } = &*candidate;
                 let rays = session.rays(candidate.camera, camera);
-                let sight = Sight { camera, rays, view, image };
-                candidate.around = sight.overlapping(views.around(world_from_rig));
+                let query = WarpQuery { camera, rays, view, image };
+                candidate.around = query.overlapping(views.around(world_from_rig));
                 candidate.around.iter().for_each(&mut want);
             }
             if session.needs_reference() {
@@ -274,15 +274,15 @@ impl ObservationBuilder {
             let mut pixels = image.rgb8.clone();
             if is_chosen {
                 let started = Instant::now();
-                let beside = candidate.beside(&session, mounted, &references);
-                let repaired = session.repair(mounted, image, &beside);
+                let inputs = candidate.reference_inputs(&session, mounted, &references);
+                let repaired = session.repair(mounted, image, &inputs);
                 self.timings.repair += started.elapsed();
                 match repaired {
                     Ok(repaired) => {
                         status = RepairStatus::Repaired;
-                        names = beside.names;
+                        names = inputs.names;
                         pixels = repaired;
-                        repair.state.references[camera] = beside.nearest;
+                        repair.state.references[camera] = inputs.nearest;
                     }
                     Err(cause) if session.on_failure == OnFailure::Error => {
                         let camera = mounted.name.clone();
@@ -295,10 +295,10 @@ impl ObservationBuilder {
                     }
                 }
             }
-            let effects = capture
-                .as_ref()
-                .filter(|capture| capture.sensed)
-                .and_then(|capture| self.layout.pixel_effects(camera, self.key, capture.time_us));
+            let effects =
+                capture.as_ref().filter(|capture| capture.has_sensor_effects).and_then(|capture| {
+                    self.layout.pixel_effects(camera, self.effect_seed, capture.time_us)
+                });
             let is_later =
                 capture.as_ref().is_some_and(|capture| self.layout.is_shown_later(capture, camera));
             let done = encoded(&self.layout, camera, &pixels, is_later, effects.as_ref())

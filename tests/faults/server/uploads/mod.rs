@@ -49,7 +49,7 @@ enum Operation {
     Delete(Name),
     /// Deletes and continues another token's upload.
     Foreign(Name),
-    /// Removes what is too old.
+    /// Removes uploads that are too old.
     Expire,
     /// Changes the time of day.
     Jump {
@@ -63,7 +63,7 @@ enum Operation {
     Stop(Fault),
 }
 
-/// An operation, and what fails meanwhile.
+/// An operation, and the faults during it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Step {
     seed: u64,
@@ -151,7 +151,7 @@ impl Step {
         };
         let faults = [Fault::Kill, Fault::PowerCut, Fault::PowerCut, Fault::Full];
         let fault = faults[random.below(4) as usize];
-        // Of two requests at once, it is not known which one meets a fault.
+        // With two simultaneous requests, it is unknown which one meets a fault.
         let is_sure = !matches!(operation, Operation::AppendTwice { .. });
         let fault = (is_sure && random.once_in(3)).then(|| (random.below(WRITES), fault));
         let faults = [ReadFault::Error, ReadFault::Short, ReadFault::Flip, ReadFault::Slow];

@@ -1,4 +1,4 @@
-//! The machine of a history of uploads, and what its clients were promised.
+//! The machine of a history of uploads, and the promises to its clients.
 
 mod promises;
 
@@ -34,13 +34,13 @@ const LIMITS: SpoolLimits = SpoolLimits {
 /// Uploads of one token, at most: its share of [`LIMITS`].
 const OWN_UPLOADS: usize = 3;
 
-/// What is this close to a time-out may be on either side of it: a slow read takes a minute.
+/// Times this close to a time-out may be on either side of it, because a slow read takes a minute.
 const SLACK_US: i64 = 70_000_000;
 
-/// What is known of an upload.
+/// Known state of an upload.
 #[derive(Clone, Copy, Debug)]
 struct Known {
-    /// Bytes that the server has said that it has.
+    /// Bytes that the server has acknowledged.
     held: u64,
     is_complete: bool,
     /// When its files were last written, and when it was last announced or written, by the time of day.
@@ -50,7 +50,7 @@ struct Known {
     active_us: i64,
 }
 
-/// The machine, and what its clients were promised.
+/// The machine, and the promises to its clients.
 pub(super) struct World<'a> {
     machine: &'a Machine,
     clock: Arc<SimClock>,
@@ -61,12 +61,12 @@ pub(super) struct World<'a> {
     has_leftovers: bool,
 }
 
-/// What may have become of the uploads at an operation.
+/// Allowed changes of uploads by an operation.
 #[derive(Default)]
 struct Allowed {
-    /// Those that may be gone.
+    /// Uploads that may be gone.
     gone: BTreeSet<Name>,
-    /// Those that may have more bytes than before, or be new: up to so many.
+    /// Uploads that may be new or larger, with the largest number of bytes.
     grown: BTreeMap<Name, u64>,
 }
 
@@ -76,7 +76,7 @@ struct Answer {
     body: Value,
 }
 
-/// The promise that is broken, if one is.
+/// The broken promise, if any.
 pub(super) type Promise = Result<(), String>;
 
 /// How an operation ended.
@@ -242,7 +242,7 @@ impl<'a> World<'a> {
         Ok(Some(Answer { status, body: serde_json::from_str(body).unwrap_or_default() }))
     }
 
-    /// What others may lose because an upload needs room; `None` if there is enough.
+    /// Uploads that may be removed because another one needs space; `None` if there is enough.
     fn pressure(&self, name: Name) -> Option<BTreeSet<Name>> {
         let others = || self.known.keys().filter(|other| **other != name);
         let own = || others().filter(|other| other.owner == name.owner);
@@ -292,7 +292,7 @@ impl<'a> World<'a> {
         }
     }
 
-    /// Compares the offset in an answer with what is known.
+    /// Compares the offset in an answer with the known state.
     fn expect_offset(&self, name: Name, body: &Value) -> Promise {
         let held = self.known.get(&name).map_or(0, |known| known.held);
         if body["offset"].as_u64() == Some(held) {
@@ -328,7 +328,7 @@ impl<'a> World<'a> {
         }
     }
 
-    /// Takes over that an upload has bytes up to `end`, as an answer says.
+    /// Records that an upload has bytes up to `end`, according to an answer.
     fn appended(&mut self, name: Name, end: u64, body: &Value) -> Outcome {
         let now_us = self.clock.now_us();
         let active_us = self.clock.monotonic_us();
@@ -346,7 +346,7 @@ impl<'a> World<'a> {
         Ok(self.expect_offset(name, body)?)
     }
 
-    /// At most one of two parts for one offset is taken. The other is refused for its offset, or because the later
+    /// At most one of two parts for one offset is accepted. The other is refused for its offset, or because the later
     /// connection replaced it.
     async fn append_twice(
         &mut self,

@@ -1,4 +1,4 @@
-//! Compares what the server has with what its clients were promised, now and after a restart.
+//! Compares the uploads of the server with the promises to its clients, now and after a restart.
 
 use std::path::PathBuf;
 
@@ -11,7 +11,7 @@ use super::super::{Name, OWNERS, Operation, SIZES, Step};
 use super::{Allowed, Failure, Known, Outcome, Promise, World, id, open};
 
 impl World<'_> {
-    /// Compares what the server has with what it promised, and takes it over.
+    /// Compares the uploads of the server with its promises, and updates the known state.
     pub(super) fn compare(&mut self, allowed: &Allowed) -> Promise {
         let spool = self.server.state.spool().map_err(|fault| fault.to_string())?;
         let now_us = self.clock.now_us();
@@ -91,7 +91,7 @@ impl World<'_> {
         };
         self.disk = self.disk.restarted(&mut Random::new(step.seed));
         if step.seed.is_multiple_of(4) {
-            // A process that cannot read some of the uploads leaves them to the next one.
+            // A process that cannot read some of the uploads keeps them for the next one.
             let bad = [ReadFault::Error, ReadFault::Short][step.seed as usize / 4 % 2];
             let after = 3 + step.seed / 8 % 6;
             self.disk.set_bad_reads(Some(BadReads { after, fault: bad, times: 1 }));
@@ -105,7 +105,7 @@ impl World<'_> {
         let mut gone = allowed.gone.clone();
         let mut grown = allowed.grown.clone();
         if fault == Fault::PowerCut {
-            // What was removed may be there again.
+            // A removed upload may exist again.
             let names = (0..OWNERS.len() * SIZES.len())
                 .map(|index| Name { owner: index % OWNERS.len(), file: index / OWNERS.len() });
             grown.extend(names.map(|name| (name, SIZES[name.file])));
@@ -121,7 +121,7 @@ impl World<'_> {
         self.compare(&Allowed { gone, grown })
     }
 
-    /// Checks that the spool goes on working, and that nothing is left that counts.
+    /// Checks that the spool still works, and that no upload is left that uses its quota.
     pub(in super::super) async fn finish(mut self) -> Promise {
         let kill =
             Step { seed: 1, operation: Operation::Stop(Fault::Kill), fault: None, bad_reads: None };

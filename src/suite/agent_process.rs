@@ -1,4 +1,4 @@
-//! Agents that are commands: each is started for one episode, dials the server, and drives.
+//! External agents: a process is started for each episode, connects to the server, and drives.
 
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -14,13 +14,13 @@ use crate::limits;
 use crate::stderr::Tail;
 use crate::technical::Technical;
 
-/// A command that is started.
-pub(crate) struct Dialled<'a> {
+/// An agent's process, and the episode that it is started for.
+pub(crate) struct AgentProcess<'a> {
     /// Its name in results.
     pub(crate) name: &'a str,
     /// The command line, for the shell.
     pub(crate) command: &'a str,
-    /// Where it dials.
+    /// URL of the server that it connects to.
     pub(crate) url: &'a str,
     /// The session that it opens.
     pub(crate) session: &'a str,
@@ -31,9 +31,10 @@ pub(crate) struct Dialled<'a> {
 /// Why an episode was not driven to its end.
 #[derive(Debug)]
 pub(crate) enum NotDriven {
-    /// The shell finds no such command, or cannot run it: no other episode can be driven either. What the shell says.
+    /// The shell finds no such command, or cannot run it, so that no other episode can be driven either. Holds the
+    /// shell's message.
     NoCommand(String),
-    /// Something failed; it may go well another time.
+    /// A failure that may not occur in another attempt.
     Technical(Technical),
 }
 
@@ -45,23 +46,23 @@ impl From<Technical> for NotDriven {
 
 /// Starts the command and waits for it and for the end of its record.
 ///
-/// The command finds in its environment `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as JSON, which it sends
+/// The environment of the command has `WILDCITY_URL`, `WILDCITY_OPEN` (the fields of `open` as JSON, which it sends
 /// with outputs of its own), `WILDCITY_SEED` (for `reset`) and `WILDCITY_STEPS` (after which it terminates).
 pub(crate) async fn drive(
-    dialled: &Dialled<'_>,
+    process: &AgentProcess<'_>,
     case: &Case,
     record: &Path,
 ) -> Result<(), NotDriven> {
-    let mut running = Running(start(dialled, case).map_err(|error| {
+    let mut running = Running(start(process, case).map_err(|error| {
         Technical::new("agent_lost", format!("the shell cannot be started: {error}"))
     })?);
     let tail = Tail::of(running.0.stderr.take());
-    let status = wait(&mut running.0, dialled.timeout).await;
+    let status = wait(&mut running.0, process.timeout).await;
     drop(running);
     let stderr = tail.text().await;
     let said = |technical: Technical| Technical { stderr: stderr.clone(), ..technical };
     let status = status.map_err(said)?;
-    let Some(drove) = ended(dialled, status, record.exists()) else {
+    let Some(drove) = interpret_exit(process, status, record.exists()) else {
         let reason = if stderr.is_empty() { status.to_string() } else { stderr };
         return Err(NotDriven::NoCommand(reason));
     };
@@ -69,10 +70,10 @@ pub(crate) async fn drive(
     Ok(wait_for_end(record).await.map_err(said)?)
 }
 
-/// What the end of a command says; `None` if it never was one. `has_driven` says whether it has reset its session: a
-/// record begins with that.
-fn ended(
-    dialled: &Dialled<'_>,
+/// Interprets the exit status of an agent's process. `None` if the shell did not find the command or could not run it.
+/// `has_driven`: whether a record exists, that is, whether the agent has reset its session.
+fn interpret_exit(
+    process: &AgentProcess<'_>,
     status: ExitStatus,
     has_driven: bool,
 ) -> Option<Result<(), Technical>> {
@@ -85,7 +86,7 @@ fn ended(
         Some(limits::TIMEOUT_STATUS) => "agent_timeout",
         _ => "agent_error",
     };
-    let name = dialled.name;
+    let name = process.name;
     let message = match has_driven {
         true => format!("{name:?} ended with {status}"),
         false => format!(
@@ -96,24 +97,24 @@ fn ended(
     Some(Err(Technical::new(kind, message)))
 }
 
-/// A process that does not outlive the run, which may end early.
+/// A process that is killed when this is dropped, since the run may end early.
 struct Running(Child);
 
 impl Drop for Running {
     fn drop(&mut self) {
-        // It may have ended; then there is nothing to kill.
+        // The process may have ended already; then these calls fail.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-fn start(dialled: &Dialled<'_>, case: &Case) -> std::io::Result<Child> {
+fn start(process: &AgentProcess<'_>, case: &Case) -> std::io::Result<Child> {
     Command::new("sh")
         .arg("-c")
-        .arg(dialled.command)
-        .env("WILDCITY_URL", dialled.url)
-        .env("WILDCITY_OPEN", open_json(dialled.session, case).to_string())
-        .env("WILDCITY_SESSION", dialled.session)
+        .arg(process.command)
+        .env("WILDCITY_URL", process.url)
+        .env("WILDCITY_OPEN", open_json(process.session, case).to_string())
+        .env("WILDCITY_SESSION", process.session)
         .env("WILDCITY_TWIN", &case.options.twin)
         .env("WILDCITY_SEED", case.seed.to_string())
         .env("WILDCITY_STEPS", case.steps.to_string())
@@ -137,7 +138,7 @@ fn open_json(session: &str, case: &Case) -> serde_json::Value {
     })
 }
 
-/// Waits for a process without blocking others, until its time is over.
+/// Waits for a process until its time is over, without blocking the thread.
 async fn wait(child: &mut Child, timeout: Duration) -> Result<ExitStatus, Technical> {
     let lost = |error: std::io::Error| Technical::new("agent_lost", error.to_string());
     let end = Instant::now() + timeout;
