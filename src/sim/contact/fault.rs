@@ -25,7 +25,7 @@ pub enum CollisionType {
     ActiveLateral,
 }
 
-/// What the fault depends on, at the contact.
+/// The state at the contact, on which the fault depends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FaultInput {
     /// The ego's box.

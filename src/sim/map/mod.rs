@@ -5,7 +5,8 @@
 //! | `file` | `wildcity.map/1` |
 //! | `strips` | areas beside recorded drives, for twins without a map |
 //! | `surface` | the road under lanes |
-//! | `geojson`, `opendrive` | import |
+//!
+//! `wildcity_convert` reads OpenDRIVE and GeoJSON.
 
 mod file;
 mod strips;
