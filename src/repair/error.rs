@@ -55,7 +55,7 @@ pub enum RepairError {
          libonnxruntime.so from version 1.18 on (pip install onnxruntime has one, in onnxruntime/capi)"
     )]
     RuntimeUnnamed,
-    /// The runtime library is not there, or is something else.
+    /// The runtime library does not exist, or is not an ONNX runtime.
     #[error("--onnxruntime {}: {message}", path.display())]
     Runtime {
         /// The library as named.
@@ -129,9 +129,9 @@ pub enum RepairError {
     NotFinite {
         /// The name of the output.
         output: String,
-        /// How many values are not finite.
+        /// Number of values that are not finite.
         count: usize,
-        /// How many values there are.
+        /// Number of all values.
         of: usize,
     },
     /// A run took too long and was stopped; the model is usable again.
@@ -145,7 +145,7 @@ pub enum RepairError {
     /// The model ran too long too often, or did not stop. It is not used again.
     #[error("the model is withdrawn: {reason}; load it again")]
     Withdrawn {
-        /// What happened.
+        /// The reason.
         reason: String,
     },
     /// The runtime failed.
@@ -157,7 +157,7 @@ pub enum RepairError {
     /// The model cannot be cut into tiles.
     #[error("size.fit: tiles are refused: {message}; use \"resize\" or \"pad\"")]
     Tiles {
-        /// What the probe showed.
+        /// The result of the probe.
         message: String,
     },
 }

@@ -67,8 +67,8 @@ impl RepairSampling {
         cameras.iter().map(scaled).collect()
     }
 
-    /// The poses of all stations. Every other station is for selection. Two stations have their offsets to the left, the
-    /// next two to the right, and so on. All stations are at least one frame from the start.
+    /// The poses of all stations. Every other station is for selection. Two stations have their offsets to the left,
+    /// the next two to the right, and so on. All stations are at least one frame from the start.
     pub(super) fn stations(&self, drive: &Trajectory, cameras: &[RigCamera]) -> Vec<RepairStation> {
         let speed_m_per_us = mean_speed_m_per_us(drive);
         let length_m = drive.length_m();
