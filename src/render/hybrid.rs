@@ -65,7 +65,7 @@ fn render_split(
     Ok(stats)
 }
 
-/// How close the images of the gpu backend are to those of the cpu backend, by the number of stages that run
+/// PSNR of the images of the gpu backend against those of the cpu backend, by the number of stages that run
 /// on the cpu.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bisection {
@@ -143,7 +143,7 @@ impl Images {
         let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
         let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
         let rounded = psnr_db_u8(rgb8);
-        // A NaN counts as wrong, whatever the other is.
+        // A NaN counts as wrong, whatever the other value is.
         if linear < rounded || linear.is_nan() { linear } else { rounded }
     }
 }

@@ -1,4 +1,4 @@
-//! The axes of Gaussians, and coordinates of their centres in f64: what both projections begin with.
+//! The axes of Gaussians, and coordinates of their centres in f64: the first step of both projections.
 
 use fearless_simd::{f32x16, f64x8, prelude::*};
 
