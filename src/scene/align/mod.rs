@@ -77,7 +77,7 @@ impl Alignment {
         Self { new_from_old, ..Self::IDENTITY }
     }
 
-    /// The same axes with another unit.
+    /// These axes with a different unit.
     ///
     /// # Errors
     /// [`AlignmentError::Scale`].
@@ -88,7 +88,7 @@ impl Alignment {
         Ok(Self { metres_per_unit, ..self })
     }
 
-    /// Checks that an alignment, for example one after another, can be stored and read again.
+    /// Checks that an alignment, for example a product of two, can be stored and read again.
     ///
     /// # Errors
     /// [`AlignmentError::Scale`], [`AlignmentError::Pose`].
