@@ -2,8 +2,8 @@
 //!
 //! A twin's world is flat: x east, y north, z up, in metres. An anchor defines this flat world. With a WGS84 origin
 //! it is the tangent plane at the origin (ENU): a point is `X0 + E (x, y, z)` in earth-centred coordinates, which is
-//! exact at any distance, and "up" is that of the origin. With a UTM zone, x and y are differences of easting and northing: grid
-//! metres, 0.04 % shorter than metres on the ground in the zone's middle, and north is the grid's.
+//! exact at any distance, and "up" is that of the origin. With a UTM zone, x and y are differences of easting and
+//! northing: grid metres, 0.04 % shorter than metres on the ground in the zone's middle, and north is the grid's.
 //!
 //! Tests compare both with values from PROJ.
 

@@ -162,7 +162,12 @@ impl Mirror {
 
     /// Allocates consecutive lines: of an existing page, of a new page, or after evicting chunks that this
     /// frame does not draw. `needed` is the number of lines that the frame still has to allocate.
-    fn allocate(&mut self, device: &Device, lines: u32, needed: u64) -> Result<ClusterLocation, Full> {
+    fn allocate(
+        &mut self,
+        device: &Device,
+        lines: u32,
+        needed: u64,
+    ) -> Result<ClusterLocation, Full> {
         loop {
             let found = self.pages.iter_mut().enumerate().find_map(|(index, page)| {
                 Some(ClusterLocation { page: index, lines: page.as_mut()?.free.allocate(lines)? })
