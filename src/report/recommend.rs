@@ -3,8 +3,8 @@
 //! **A setting is selected at every other station and verified at the rest.** Its worst selection point must
 //! be better than the goal by a margin: the standard deviation of the worse half of the points, at least 1 dB
 //! or a tenth of the time. Of eight values of a normal distribution the worst lies 1.4 deviations from the
-//! mean on average; so the goal lies 2.4 deviations away, where one point of 120 falls. A margin of 1 dB
-//! alone selected a setting with 36 dB at two points of a capture that had 34.4 dB at two others.
+//! mean on average; so the goal lies 2.4 deviations away, where one point of 120 falls. With a margin of
+//! only 1 dB, a setting was selected that had 36 dB at two points of a capture and 34.4 dB at two others.
 //!
 //! A setting that misses the goal at the verification points is not recommended, and no profile is written:
 //! a setting that is good by chance is worse than none. Records and image sizes are measured but not

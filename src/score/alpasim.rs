@@ -20,7 +20,7 @@ pub const WRONG_LANE: &str = "alpasim.wrong_lane@3032e0c";
 
 /// Progress at which the score saturates.
 const FULL_PROGRESS: f64 = 0.8;
-/// A recording that is shorter than this is too short to measure progress, in metres.
+/// Progress is not measured along a recording that is shorter than this, in metres.
 const SHORT_RECORDING_M: f64 = 5.0;
 /// The episode is cut where the ego is farther than this from the recorded drive, in metres.
 const CUT_M: f64 = 4.0;

@@ -2,8 +2,8 @@
 //!
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/plan_deviation.py`, `minADE.py`,
 //! `open_loop_collision.py`, and `src/wizard/configs/base_config.yaml` for the parameters. Distances are between
-//! centres of the ego's box, without height. The part of the episode after a collision, off the road or 4 m off
-//! the recording is cut, as in the scene score.
+//! centres of the ego's box, without height. As in the scene score, the episode is cut after a collision, or where the
+//! ego is off the road or 4 m off the recording.
 //!
 //! AlpaSim raises an error if it interpolates a plan beyond its end; here such times are left out. Its minimum over
 //! sampled plans is the value of the one plan that an agent sends.

@@ -119,8 +119,8 @@ fn is_in_seam(lanes: &[&Lane], point_m: DVec2) -> bool {
 
 /// Whether the centre of the ego is in a lane of another direction; `None` if the lanes have no direction.
 ///
-/// Headings from -π to π are subtracted without wrapping: where a lane leads west, an ego that follows it is in the wrong
-/// lane as soon as one of the two is beyond ±π.
+/// Headings from -π to π are subtracted without wrapping: where a lane leads west, an ego that follows it is in the
+/// wrong lane as soon as one of the two is beyond ±π.
 pub fn is_in_wrong_lane(map: &LaneMap, center_m: DVec2, yaw_rad: f64) -> Option<bool> {
     let ego_rad = turn_rad(0.0, yaw_rad);
     let mut directed =

@@ -222,7 +222,7 @@ pub fn hd_score(pdms: &[f64], completions: &[f64]) -> f64 {
     mean * completions.iter().fold(0.0, |most: f64, &rc| most.max(rc)).min(1.0)
 }
 
-/// The score of an episode: never a value, because a record has no Gaussians and no plans 0.5 s apart.
+/// The score of an episode. It never has a value, because a record has no Gaussians and no plans 0.5 s apart.
 pub fn hd(_record: &DriveRecord) -> Score {
     let missing = "needs the twin's Gaussians, its ground, and a plan for each decision";
     Score::new(NAME, Err(Missing::new(missing)), [])

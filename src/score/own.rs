@@ -18,7 +18,7 @@ pub const NAME: &str = "wildcity.verdict@1";
 
 /// Default for the progress that is required to pass.
 pub const LEAST_PROGRESS: f64 = 0.8;
-/// A recording that moves less is too short to measure progress, in metres.
+/// Progress is not measured along a recording that moves less than this, in metres.
 const LEAST_WAY_M: f64 = 2.0;
 
 /// The result.

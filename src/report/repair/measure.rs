@@ -366,7 +366,7 @@ impl<'a> RepairMeasurement<'a> {
     }
 }
 
-/// Overlays the warped recorded images on a rendered image where they cover it. Returns the share that they cover, too.
+/// Overlays the warped recorded images on a rendered image. Returns the image, and the share that they cover.
 fn overlay_warped(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>, f64) {
     let mut rgb8 = rendered.rgb8.clone();
     let Some((warped, valid)) = beside.warped() else { return (rgb8, 0.0) };

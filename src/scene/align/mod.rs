@@ -134,7 +134,7 @@ impl Alignment {
         self.new_from_old.rotation_matrix().transpose()
     }
 
-    /// This alignment after another one.
+    /// The alignment that applies `first` and then this one.
     pub fn after(&self, first: &Self) -> Self {
         // s2 (T2 (s1 (T1 p))) = s1 s2 (T2' (T1 p)), where T2' moves by 1 / s1 of what T2 moves.
         let mut second = self.new_from_old;

@@ -11,7 +11,7 @@ use crate::record::{EgoSample, Track};
 const DIRECTION_WINDOW: usize = 11;
 /// Distances against the traffic in that window that cost half of the score and all of it, in metres.
 const DIRECTION_LIMITS_M: [f64; 2] = [2.0, 6.0];
-/// A reference that is not longer than this is too short to measure progress, in metres.
+/// Progress is not measured against a reference that is not longer than this, in metres.
 const SHORT_REFERENCE_M: f64 = 5.0;
 /// Samples ahead that are tested for the time to collision: 0, 0.3, 0.6 and 0.9 s.
 const AHEAD: [usize; 4] = [0, 3, 6, 9];

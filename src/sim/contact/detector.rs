@@ -78,9 +78,8 @@ impl Detector {
     /// The contacts that begin in a sub-step, in the order of the actors. `lanes` is where the ego's corners lie at
     /// its end, if there is a map.
     ///
-    /// Within a sub-step, centres move on straight lines and the headings are those at its end. So every
-    /// sub-step is decided by itself, and a finer recording of the same motion gives the same decisions at the same
-    /// sub-steps.
+    /// Within a sub-step, centres move on straight lines and the headings are those at its end. So every sub-step is
+    /// decided by itself, and a finer recording of the same motion gives the same decisions at the same sub-steps.
     pub fn advance(
         &mut self,
         sub_step: &SubStep<'_>,

@@ -3,7 +3,7 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `file` | `wildcity.map/1` |
-//! | `strips` | areas beside recorded drives, for twins without a map |
+//! | `strips` | areas along recorded drives, for twins without a map |
 //! | `surface` | the road under lanes |
 //!
 //! `wildcity_convert` reads OpenDRIVE and GeoJSON.

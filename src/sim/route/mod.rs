@@ -51,7 +51,7 @@ pub struct RouteProgress {
     pub station_m: f64,
     /// Distance from the route, in metres.
     pub off_m: f64,
-    /// The largest station so far, in metres.
+    /// The largest station that the ego has reached, in metres.
     pub farthest_m: f64,
     /// Where the episode began, in metres.
     pub begin_m: f64,

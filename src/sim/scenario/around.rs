@@ -19,7 +19,7 @@ pub struct Surroundings<'a> {
     pub tracks: Option<&'a TracksFile>,
     /// The map that the scenario names.
     pub map: Option<&'a Map>,
-    /// Looks up an asset by its hash or its name. The error says why there is none.
+    /// Looks up an asset by its hash or its name. The error is the reason if it cannot be used.
     pub asset: &'a dyn Fn(&str) -> Result<AssetInfo, String>,
 }
 

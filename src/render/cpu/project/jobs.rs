@@ -73,7 +73,7 @@ struct NonPinholeView<'a> {
 
 /// Runs `work` with the jobs of a frame: one for each unit that a view may see, in order of (view, global id).
 pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_>]) -> R) -> R {
-    // The data of all chunks of a view or of an actor.
+    // Compute the data that is the same for all chunks of a view or of an actor.
     let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
         frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
     let actor_views = ActorViews::new(frame);

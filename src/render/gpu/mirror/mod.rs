@@ -86,7 +86,7 @@ impl Mirror {
     /// Uploads the chunks of a scene that are not resident yet. Drops those that main memory has dropped.
     ///
     /// # Errors
-    /// [`RenderError::DeviceMemory`] if the scene alone exceeds the limit.
+    /// [`RenderError::DeviceMemory`] if the scene by itself exceeds the limit.
     pub(super) fn make_resident(
         &mut self,
         device: &Device,

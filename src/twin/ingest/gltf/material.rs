@@ -12,7 +12,8 @@
 //!
 //! The base colour is a surface's in white light of strength 1 from all sides; emitted light is added to
 //! reflected light. Textures are decoded from sRGB, and an absent texture is 1. `alpha` covers the objects behind the
-//! surface, so that emitted light is as opaque as the surface. An emissive texture without a factor emits nothing, and is not read.
+//! surface, so that emitted light is as opaque as the surface. An emissive texture without a factor emits nothing, and
+//! is not read.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
