@@ -32,7 +32,7 @@ impl Wall {
     }
 }
 
-/// What fills the ground floor.
+/// The use of the ground floor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum GroundFloor {
     /// Windows, and a door in one bay.
@@ -62,7 +62,7 @@ pub(super) struct Style {
     pub(super) brick: bool,
     /// Balconies in every second bay.
     pub(super) balconies: bool,
-    /// What fills the ground floor.
+    /// The use of the ground floor.
     pub(super) ground_floor: GroundFloor,
     /// Whether the drive passes the house; then its windows have all their parts.
     pub(super) near: bool,

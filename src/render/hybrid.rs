@@ -106,7 +106,7 @@ pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, Rend
 impl Bisection {
     /// The name of the gpu stage that is wrong; `None` if every image is right.
     ///
-    /// Of the images that are wrong it takes the one with the most stages on the cpu: the first stage that
+    /// Among the images that are wrong it takes the one with the most stages on the cpu: the first stage that
     /// the gpu ran for it is the faulty one.
     pub fn wrong(&self) -> Option<&'static str> {
         let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;

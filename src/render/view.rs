@@ -272,7 +272,7 @@ impl View {
         };
         let translation_world_m = last.position_m - first.position_m;
         let rotation = first.rotation.inverse() * last.rotation;
-        // Of the two quaternions of a rotation, the one with the smaller angle.
+        // Take the quaternion of the rotation that has the smaller angle; the other has the opposite sign.
         let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
         let sine = rotation.xyz().length();
         Some(ShutterMotion {

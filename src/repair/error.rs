@@ -12,7 +12,7 @@ pub enum RepairError {
         file: PathBuf,
         /// The path of the field, such as `inputs[0].role`.
         field: String,
-        /// What is wrong, and what is accepted.
+        /// The error, and the accepted values.
         message: String,
     },
     /// There is no model of this name.
@@ -60,7 +60,7 @@ pub enum RepairError {
     Runtime {
         /// The library as named.
         path: PathBuf,
-        /// What is wrong, and what is accepted.
+        /// The error, and the accepted values.
         message: String,
     },
     /// Another runtime library is loaded already; a process has one.
@@ -105,7 +105,7 @@ pub enum RepairError {
     Input {
         /// The role of the input, or `image`.
         field: String,
-        /// What is wrong, and what is accepted.
+        /// The error, and the accepted values.
         message: String,
     },
     /// An output has another shape than the manifest promises.

@@ -132,7 +132,7 @@ pub enum Layout {
 pub struct Input {
     /// Its name in the graph.
     pub name: String,
-    /// What it means.
+    /// Its meaning.
     pub role: InputRole,
     /// Its type in the graph.
     #[serde(default)]
@@ -155,7 +155,7 @@ fn default_range() -> [f32; 2] {
     [0.0, 1.0]
 }
 
-/// What an input means.
+/// Meanings of inputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum InputRole {
@@ -179,7 +179,7 @@ pub enum InputRole {
     Mask,
     /// Shape \[batch, 1\].
     Trust,
-    /// The same value everywhere, such as a time step.
+    /// One value everywhere, such as a time step.
     Constant,
 }
 
@@ -243,7 +243,7 @@ pub enum Unit {
 pub struct Output {
     /// Its name in the graph.
     pub name: String,
-    /// What it means.
+    /// Its meaning.
     pub role: OutputRole,
     /// The values of black and white.
     #[serde(default = "default_range")]
@@ -257,7 +257,7 @@ fn default_scale() -> u32 {
     1
 }
 
-/// What an output means.
+/// Meanings of outputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OutputRole {

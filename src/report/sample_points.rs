@@ -113,7 +113,7 @@ const WINDOW_SHARE: f64 = 0.5;
 const AROUND_SIZE_PX: [u32; 2] = [640, 480];
 /// Focal length of these images, in pixels.
 const AROUND_FOCAL_PX: f64 = 600.0;
-/// How far above the object these cameras stand, seen from its middle.
+/// Elevation of these cameras, seen from the middle of the object.
 const AROUND_ELEVATION_DEG: f64 = 20.0;
 
 /// Cameras on a circle around the middle of a captured object. Each sees all of it. z is up.

@@ -66,13 +66,13 @@ pub enum ImageEncoding {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Family {
-    /// Nothing: the twin as it is served.
+    /// No change: the twin as it is served.
     AsServed,
     /// The backend.
     Backend,
     /// Levels of detail.
     Detail,
-    /// How far blocks are drawn.
+    /// The draw distance.
     #[serde(rename = "reach")]
     DrawDistance,
     /// Record format of the Gaussians.

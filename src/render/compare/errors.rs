@@ -49,7 +49,7 @@ struct Coverage {
 }
 
 impl Coverage {
-    /// Of all `count` new rows over `own` rows.
+    /// The coverage of all `count` new rows over `own` rows.
     fn of_all(count: u32, own: u32) -> Vec<Self> {
         let step = f64::from(own) / f64::from(count);
         let of_one = |i: u32| {

@@ -163,7 +163,7 @@ impl BlockedPixels {
         Self { sums, stride }
     }
 
-    /// The number of the window around a pixel, which lies within the image.
+    /// Number of pixels that do not count in the window around a pixel. The window lies within the image.
     fn around(&self, row: usize, column: usize) -> u32 {
         let top = (row - REACH_PX) * self.stride;
         let bottom = (row + REACH_PX + 1) * self.stride;

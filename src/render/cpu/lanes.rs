@@ -28,7 +28,7 @@ pub(super) struct Vec3x16<S: Simd> {
 }
 
 impl<S: Simd> Vec3x16<S> {
-    /// The same vector in every lane.
+    /// One vector in every lane.
     #[inline(always)]
     pub(super) fn splat(simd: S, v: [f32; 3]) -> Self {
         let [x, y, z] = v;

@@ -61,7 +61,7 @@ pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
 mod tests {
     use super::*;
 
-    /// Of depths that differ in no bit, in few and in all, in lists on both sides of the change of method.
+    /// Sorts depths that differ in no bit, in few and in all, in lists on both sides of the change of method.
     #[test]
     fn keys_are_sorted_by_depth_and_then_by_index() {
         let mut state = 1_u64;

@@ -41,7 +41,7 @@ enum Lens {
 /// Pixels of directions.
 #[derive(Debug)]
 struct Table {
-    /// Of the stereographic plane: `CELLS` / 2 cells in each direction.
+    /// Cells per unit of the stereographic plane, which has `CELLS` / 2 cells in each direction.
     cells_per_unit: f32,
     /// `CELLS + 1` rows of as many positions, in pixels.
     at_px: Vec<[f32; 2]>,

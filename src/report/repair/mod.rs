@@ -27,7 +27,7 @@ pub use stations::{FRAME_M, RepairSampling};
 
 use serde::Serialize;
 
-/// What repair gains and costs on one twin and this machine.
+/// The gain and the cost of repair on one twin and this machine.
 #[derive(Clone, Debug, Serialize)]
 pub struct RepairReport {
     /// The twin, models and images that were measured.

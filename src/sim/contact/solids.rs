@@ -36,7 +36,7 @@ struct Solid {
 
 impl Solids {
     /// The Gaussians among `points` that are solid, each in world axes. The contact threshold is at least twice the
-    /// largest area that the ego's box overlaps along the recorded drives, so that the drives themselves have no contact.
+    /// largest area that the ego's box overlaps along the recorded drives, so that the drives have no contact.
     pub fn new(
         points: impl IntoIterator<Item = SolidPoint>,
         drives: &[Trajectory],

@@ -12,7 +12,7 @@ use crate::traffic::Course;
 /// AlpaSim.
 const POINT_SPACING_M: f64 = 80.0 / 19.0;
 
-/// How far ahead a command looks, in seconds, and the least speed for it, in m/s (NeuroNCAP, `model_api.py`).
+/// Time for which a command looks ahead, in seconds, and the least speed for it, in m/s (NeuroNCAP, `model_api.py`).
 const COMMAND_AHEAD_S: f64 = 3.0;
 const COMMAND_SPEED_MPS: f64 = 2.0;
 

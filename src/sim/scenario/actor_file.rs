@@ -44,7 +44,7 @@ pub struct ActorSection {
     /// Stands.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stand: Option<PoseSection>,
-    /// What it does when a condition holds; for `path` and `idm`, and `spawn` and `remove` for all.
+    /// Conditions and their actions: all actions for `path` and `idm`, only `spawn` and `remove` for the others.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub script: Vec<TriggerSection>,
     /// Random displacement of its starting pose.
@@ -99,7 +99,7 @@ pub struct PathSection {
     pub reverse: Option<bool>,
     /// Where it starts, in metres along the line.
     pub station_m: f64,
-    /// How far to the left of the line it drives, in metres. If absent, 0.
+    /// Its offset to the left of the line, in metres. If absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub offset_m: Option<f64>,
     /// Its speed at the start, in m/s.
@@ -128,7 +128,7 @@ pub struct IdmSection {
     pub reverse: Option<bool>,
     /// Where it starts, in metres along the line.
     pub station_m: f64,
-    /// How far to the left of the line it drives, in metres. If absent, 0.
+    /// Its offset to the left of the line, in metres. If absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub offset_m: Option<f64>,
     /// Its speed at the start, in m/s.
@@ -327,7 +327,7 @@ pub struct JitterSection {
     /// absent, the actor's heading.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub along_rad: Option<f64>,
-    /// What was drawn: only in the resolved scenario of a record.
+    /// The sampled displacement: only in the resolved scenario of a record.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub drawn: Option<JitterDraw>,
 }

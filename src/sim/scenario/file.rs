@@ -43,7 +43,7 @@ pub struct ScenarioFile {
     /// When an episode ends, unless the agent ends it before.
     #[serde(default)]
     pub end: EndSection,
-    /// What an episode must reach.
+    /// The requirements that an episode must meet.
     #[serde(default)]
     pub verdict: VerdictSection,
     /// The seed that jitter was drawn with: only in the resolved scenario of a record.
@@ -270,7 +270,7 @@ pub enum ContactRule {
     Static,
 }
 
-/// What an episode must reach.
+/// The requirements that an episode must meet.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]

@@ -21,7 +21,7 @@ const ACCELERATIONS: u8 = 10;
 const ACCELERATIONS_MPS2: [f64; 2] = [-2.0, 5.0];
 /// Headings at the end relative to the direction towards it, in radians: 30° to either side.
 const HEADINGS_RAD: [f64; 3] = [-std::f64::consts::FRAC_PI_6, 0.0, std::f64::consts::FRAC_PI_6];
-/// What a vehicle can drive: accelerations (m/s²), speeds (m/s), largest yaw rate (rad/s).
+/// Limits of a drivable motion: accelerations (m/s²), speeds (m/s), largest yaw rate (rad/s).
 const DRIVABLE_MPS2: [f64; 2] = [-6.0, 5.0];
 const DRIVABLE_MPS: [f64; 2] = [-2.0, 50.0];
 const DRIVABLE_RADPS: f64 = 8.0;

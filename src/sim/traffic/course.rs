@@ -80,7 +80,7 @@ impl Course {
         Self::from_poses(poses)
     }
 
-    /// The same line in the opposite direction.
+    /// This line in the opposite direction.
     pub fn reversed(&self) -> Self {
         let half_turn = DQuat::from_rotation_z(std::f64::consts::PI);
         let length_m = self.length_m();

@@ -22,7 +22,7 @@ pub struct CourseFollower {
     pub courses: Vec<Arc<Course>>,
     /// Where it starts, in metres along the first course.
     pub station_m: f64,
-    /// How far to the left of the course it drives, in metres.
+    /// Its offset to the left of the course, in metres.
     pub offset_m: f64,
     /// Its speed at the start, in m/s.
     pub speed_mps: f64,

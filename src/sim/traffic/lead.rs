@@ -23,7 +23,7 @@ pub(super) struct LeadCandidate {
     pub(super) yaw_rate_radps: f64,
 }
 
-/// What an actor follows.
+/// The vehicle, or the end of a course, that an actor follows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Lead {
     /// From the actor's front to the lead's rear along the course, in metres; below 0 if they overlap.
@@ -43,7 +43,7 @@ pub(super) struct Corridor {
     pub(super) half_length_m: f64,
     /// Height of the actor, in metres.
     pub(super) height_m: f64,
-    /// How far ahead of the actor's centre to look, in metres.
+    /// Length of the corridor ahead of the actor's centre, in metres.
     pub(super) ahead_m: f64,
 }
 

@@ -50,7 +50,7 @@ pub struct After {
     pub delay_us: i64,
 }
 
-/// What an actor does.
+/// An action of an actor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Action {
     /// Changes its speed.

@@ -38,7 +38,7 @@ pub struct Actor {
     pub spec: ActorSpec,
     /// How it moves.
     pub behaviour: Behaviour,
-    /// What it does when a condition holds.
+    /// Its conditions and the actions that follow.
     pub script: Vec<Trigger>,
     /// Whether it is present from the start; otherwise it waits for [`Action::Spawn`].
     pub present: bool,

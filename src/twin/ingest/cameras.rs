@@ -91,7 +91,7 @@ pub enum CamerasError {
     Pose {
         /// The camera's name.
         name: String,
-        /// What is wrong.
+        /// The error.
         cause: PoseError,
     },
     /// An exposure that no camera has.
@@ -118,7 +118,7 @@ pub enum CamerasError {
     Camera {
         /// The camera's name.
         name: String,
-        /// What is wrong.
+        /// The error.
         cause: CameraError,
     },
 }

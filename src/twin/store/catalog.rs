@@ -63,7 +63,7 @@ pub struct TwinList {
 pub struct DamagedTwin {
     /// The twin's name.
     pub name: String,
-    /// What is wrong.
+    /// The error.
     pub error: StoreError,
 }
 

@@ -114,7 +114,7 @@ pub enum StoreError {
         hash: String,
         /// The name that it states, if that can be read. It may be damaged, too.
         name: Option<String>,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
     /// An asset of another content has the name.
@@ -150,7 +150,7 @@ pub enum StoreError {
         /// The number that was taken.
         number: u64,
     },
-    /// The same cell was put twice into a commit.
+    /// A cell was put twice into a commit.
     #[error(
         "cell {cell:?} of twin {name:?} was put before: put all its Gaussians at once, or only \
          cells that are new"
@@ -241,7 +241,7 @@ pub enum StoreError {
         name: String,
         /// The version.
         number: u64,
-        /// What failed.
+        /// The cause.
         cause: Box<StoreError>,
     },
     /// The answer to the last request of a commit was lost, and the log cannot be read.
@@ -254,7 +254,7 @@ pub enum StoreError {
         name: String,
         /// The version.
         number: u64,
-        /// What failed.
+        /// The cause.
         cause: io::Error,
     },
     /// A URL of twins cannot be used.
@@ -262,7 +262,7 @@ pub enum StoreError {
     Url {
         /// The URL.
         url: String,
-        /// What is wrong with it, or with the credentials.
+        /// The error in it, or in the credentials.
         reason: String,
     },
     /// The Gaussians of a commit cannot be used.

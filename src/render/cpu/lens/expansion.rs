@@ -37,7 +37,7 @@ pub(in crate::cpu) struct Expansion<S: Simd> {
     mu: f32x16<S>,
     /// Rows of the matrix from movements away from the axis and around it to pixels.
     plane: [[f32x16<S>; 2]; 2],
-    /// How far the end of the lens' field is, as a length of (a, b, c).
+    /// Distance to the end of the lens' field, as a length of (a, b, c).
     room: f32x16<S>,
     shutter: Option<ShutterTerms<S>>,
 }
@@ -80,7 +80,7 @@ pub(in crate::cpu) struct Remainder<S: Simd> {
     pub(in crate::cpu) longest: f32x16<S>,
     /// Term of the rolling shutter, in pixels.
     pub(in crate::cpu) shutter_px: f32x16<S>,
-    /// How far the end of the lens' field is, as a length of (a, b, c).
+    /// Distance to the end of the lens' field, as a length of (a, b, c).
     pub(in crate::cpu) room: f32x16<S>,
 }
 

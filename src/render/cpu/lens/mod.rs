@@ -79,7 +79,7 @@ pub(super) struct LensPixels<S: Simd> {
     pub(super) y_px: f32x16<S>,
     /// Not below 0 where the pixels are those of the point: within the field, or where the lens is continued.
     pub(super) margin: f32x16<S>,
-    /// Of round lenses: the distance from the principal point by the sine of the angle off the axis.
+    /// For round lenses: the distance from the principal point divided by the sine of the angle off the axis.
     per_sin: f32x16<S>,
 }
 
@@ -482,8 +482,8 @@ mod tests {
                 assert!(inside > least_inside, "{name}: {inside}");
                 let is_bare = camera.windshield.is_none();
                 let is_continued = is_bare && matches!(camera.lens, Lens::FTheta(_));
-                // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that
-                // drives towards them may have them within its field: 100 of those of a telephoto lens.
+                // 999 points are beyond the field at the end of the exposure. When they are exposed, a camera that
+                // drives towards them may have them within its field: 100 of them with a telephoto lens.
                 assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
                 eprintln!("{name}: {max_error_px:.1e} px");
                 // Behind a windshield and far beyond the image 2.0e-3 px were measured.

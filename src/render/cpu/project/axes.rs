@@ -26,7 +26,7 @@ pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4])
 
 /// Columns of the rotation matrices of a block's unit quaternions: each Gaussian's own axes, in the world.
 ///
-/// Of a unit quaternion (w, x, y, z) the matrix is
+/// The matrix of a unit quaternion (w, x, y, z) is
 ///
 /// ```text
 /// 1 - 2(yy + zz)   2(xy - wz)       2(xz + wy)

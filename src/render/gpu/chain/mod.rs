@@ -94,7 +94,7 @@ impl Source<'_> {
     }
 }
 
-/// What is drawn.
+/// The input of a draw.
 #[derive(Clone, Copy, Debug)]
 struct DrawInput<'a> {
     frame: &'a Frame<'a>,
@@ -234,7 +234,7 @@ impl Chain {
         self.project.upload(&self.device, &work);
         add_time(&mut current.stats, "prepare", start.elapsed());
 
-        // What the device counts.
+        // Draw the region. The device counts its needs.
         let tiles = current.parameters.restrict(rows, region);
         let needs = self.draw_region(Source::Gaussians(&work), tiles, current)?;
         let count = needs.min_regions(self.limit());

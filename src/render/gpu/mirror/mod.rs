@@ -56,7 +56,7 @@ struct Page {
 #[derive(Debug)]
 struct Resident {
     chunk: Weak<Chunk>,
-    /// Of each cluster, in order.
+    /// The location of each cluster, in order.
     places: Vec<ClusterLocation>,
     /// The frame that drew the chunk last.
     last_frame: u64,

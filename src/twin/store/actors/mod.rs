@@ -62,7 +62,7 @@ pub struct DamagedActor {
     pub hash: String,
     /// The name that it states, if that can be read. It may be damaged, too, so that it stands for no asset.
     pub name: Option<String>,
-    /// What is wrong.
+    /// The error.
     pub reason: String,
 }
 
