@@ -86,7 +86,7 @@ impl Driven {
         self.names.iter().position(|other| other == name).unwrap()
     }
 
-    /// Where an actor is beside the ego's drive, while it is there: the ego's station, and the actor's place.
+    /// The ego's station, and the place of an actor relative to the ego's drive, while the actor is present.
     fn beside(&self, name: &str) -> Vec<(f64, CourseFootPoint)> {
         let course = Course::from_drive(&crate::DEMO.trajectory).unwrap();
         let index = self.index(name);

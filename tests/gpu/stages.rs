@@ -1,4 +1,4 @@
-//! Each stage alone, on the outputs of the cpu backend's previous stage: gpu against cpu and against f64.
+//! Each stage by itself, on the outputs of the cpu backend's previous stage: gpu against cpu and against f64.
 //! Mutation tests check that each comparison can fail, and that it distinguishes the wrong stage from the
 //! right ones.
 
@@ -46,7 +46,7 @@ struct Truth {
 /// One for all tests.
 static TRUTH: LazyLock<Truth> = LazyLock::new(|| Truth::new(&cpu(), 7_000, wide_views(), 0.0));
 
-/// The same street with every lens and with rolling shutters.
+/// A street with every lens and with rolling shutters.
 struct LensTruths {
     /// Always by six points.
     points: Truth,
