@@ -66,8 +66,8 @@ impl Coverage {
 }
 
 impl Image {
-    /// A smaller image in which each pixel is the mean of the pixels that it covers, as an agent shrinks an image. The mean of depths is
-    /// weighted by opacity, as depths of Gaussians are within a pixel.
+    /// A smaller image in which each pixel is the mean of the pixels that it covers, as an agent shrinks an image. The
+    /// mean of depths is weighted by opacity, as depths of Gaussians are within a pixel.
     pub fn averaged(&self, [width, height]: [u32; 2]) -> Self {
         let [own_width, own_height] = self.size_px;
         let mut new = Self {

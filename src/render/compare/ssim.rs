@@ -31,7 +31,8 @@ pub struct Ssim {
 }
 
 impl Ssim {
-    /// Compares two images of values from 0 to 1, `[height, width, 3]`. `counts` marks the pixels that count; all without it.
+    /// Compares two images of values from 0 to 1, `[height, width, 3]`. `counts` marks the pixels that count; all count
+    /// without it.
     ///
     /// # Panics
     /// If a length does not fit the size.
