@@ -1,7 +1,6 @@
 // Stage bin, last part: distributes the touches of each macro tile to the lists of its tiles, in order
 // of depth. One workgroup per batch of 1,024 touches of a macro tile: a few macro tiles, where a road meets
-// the horizon, have most of the touches; with one workgroup per macro tile, theirs would work long after all
-// others.
+// the horizon, have most of the touches. With one workgroup per macro tile, the device would wait for these.
 //
 // `batches` counts the batches of each macro tile. `count` counts the instances of each tile in each batch; a
 // prefix sum over these counts, in order of macro tile, tile, and batch, gives the index of the first

@@ -7,20 +7,22 @@ struct Expansion {
     // alpha, beta, gamma, kappa.
     terms: vec4f,
     mu: f32,
-    // From movements away from the axis and around it to pixels.
+    // Maps movements away from the axis and around it to pixels.
     plane: mat2x2f,
-    // How far the end of the lens' field is, as a length of (a, b, c).
+    // Distance to the end of the lens' field, as a length of (a, b, c).
     room: f32,
 }
 
-// How a place on the image changes the moment of exposure, and that the place.
+// The rolling shutter around a point: the exposure time depends on the image position, and the image position
+// depends on the exposure time.
 struct ShutterTerms {
     // (a, b, c) of the point per unit of the remaining exposure, and their image.
     motion: vec3f,
     motion_px: vec2f,
     // Change of the remaining exposure per pixel, with the feedback of the motion.
     per_px: vec2f,
-    // 1, or 0 for points that are exposed as the first or the last row is.
+    // 1 where the exposure time changes with the image position; 0 beyond the first and the last row, where it
+    // is clamped.
     rolls: f32,
     to_limit: f32,
 }
@@ -48,7 +50,7 @@ fn expand(view_index: u32, point_m: vec3f) -> Expansion {
     let distance_m = length(point_m);
     let unit = point_m / distance_m;
     let inside = through_windshield(view_index, unit, FORWARD);
-    // How the inside direction changes with x and y of the outside one: with x = sin φ and x' = sin h(φ, θ),
+    // Derivatives of the inside direction by x and y of the outside one: with x = sin φ and x' = sin h(φ, θ),
     // ∂x'/∂x = cos h ∂h/∂φ / cos φ; z follows from the unit length.
     let slopes = windshield_slopes(view_index, vec2f(arc_sine(unit.x), arc_sine(unit.y)));
     let cosines = sqrt(max(1.0 - unit.xy * unit.xy, vec2f(1e-12)));
@@ -71,7 +73,7 @@ fn expand(view_index: u32, point_m: vec3f) -> Expansion {
     return expansion;
 }
 
-// The same by the lens alone, of points or of directions behind the windshield.
+// The expansion by the lens only, of points or of directions behind the windshield.
 fn expand_lens(view_index: u32, point_m: vec3f) -> Expansion {
     let end = lenses[view_index].end;
     let model = lenses[view_index].model;
@@ -99,7 +101,8 @@ fn expand_lens(view_index: u32, point_m: vec3f) -> Expansion {
         }
         let alpha = radius.y;
         let beta = select(radius.x / sine_off, alpha, sine_off < 1e-4);
-        // Below 1e-3 rad off the axis the numerators are of second order, and rounding errors.
+        // Below 1e-3 rad off the axis the numerators are of second order and consist of rounding errors only, so
+        // the divisor is clamped.
         let per_sine = 1.0 / max(sine_off, 1e-3);
         expansion.terms = vec4f(alpha, beta, radius.z, (alpha * cosine - beta) * per_sine);
         expansion.mu = (alpha - beta * cosine) * per_sine;

@@ -13,7 +13,7 @@ const INSTANCE_PLANES: u32 = 1u;
 // Index in the tile's list, plus 1, of the splat that halves the transmittance; 0 if none has.
 var<private> halved_by: vec4u;
 
-// Notes the splat with this index if it brings the transmittance of pixels to a half or less.
+// Records the splat with this index if it brings the transmittance of pixels to a half or less.
 fn note_owner(list_index: u32, before: vec4f, after: vec4f, counts: vec4<bool>) {
     let halves = counts & (before > vec4f(0.5)) & (after <= vec4f(0.5));
     halved_by = select(halved_by, vec4u(list_index + 1u), halves);

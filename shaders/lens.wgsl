@@ -18,7 +18,7 @@ const FROM_DISTANCE: u32 = 3;
 const FORWARD: u32 = 1;
 const BACKWARD: u32 = 2;
 
-// Where a direction (of any length) lands, in pixels. Beyond the lens' field the model is continued
+// The image of a direction (of any length), in pixels. Beyond the lens' field the model is continued
 // linearly in the angle.
 fn project_extrapolated(view_index: u32, outside: vec3f) -> vec2f {
     let inside = through_windshield(view_index, outside, FORWARD);
@@ -163,7 +163,7 @@ fn jacobian(view_index: u32, slope: vec2f) -> mat2x2f {
     );
 }
 
-// Inverse of `distort`: Newton's method, which starts at the inverse of the radial part alone; a step is
+// Inverse of `distort`: Newton's method, which starts at the inverse of only the radial part; a step is
 // halved until it decreases the residual.
 fn undistort(view_index: u32, plane: vec2f) -> vec2f {
     let most = lenses[view_index].end;

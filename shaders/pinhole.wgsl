@@ -1,8 +1,9 @@
 // Stage project for static pinhole cameras: the projection is linearised at the Gaussian's centre (EWA
 // splatting). The other choice of `PROJECTION` is `unscented.wgsl`.
 
-// The splat of a Gaussian. One that is out of range is returned as not visible, unless `decided`: then
-// `cull` has found it visible, and that stands.
+// The splat of a Gaussian. A Gaussian that is out of range is returned as not visible, unless `decided`: then
+// `cull` has already found it visible, and the range is not tested again. The pipeline `project` may round
+// differently, and its splats must be those that `cull` counted.
 fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projected {
     // Camera space, in metres: reject what is too near, too far, or too transparent.
     let mean = vec4f(gaussian.mean_m, 1.0);

@@ -79,7 +79,7 @@ fn project(
     }
     let cluster_view_index = page_cluster_views[span.first + index];
     let cluster_view = cluster_views[cluster_view_index];
-    // The decision of `cull` stands, even where this pipeline rounds differently.
+    // Use the decision of `cull`, even where this pipeline rounds differently.
     let own_word = visible[cluster_view_index * MASK_WORDS + thread / 32u];
     let own_bit = 1u << (thread % 32u);
     if (own_word & own_bit) == 0u {
@@ -104,7 +104,7 @@ fn project(
     splat_indices[slot] = slot;
 }
 
-// A splat and what its key and its colour need.
+// A splat, and the inputs of its key and its colour.
 struct Projected {
     visible: bool,
     shape: SplatShape,
@@ -124,7 +124,7 @@ struct Footprint {
 }
 
 // The shape of a footprint after the pixel filter (`PixelFilter` in `src/render/layout.rs`), and whether any
-// of it lies on the rows that are drawn. A native image has a branch of its own, which keeps its bytes.
+// of it lies on the rows that are drawn. A native image has its own branch, which keeps its bytes.
 fn shape_of(foot: Footprint, gaussian_log2_opacity: f32, view: u32) -> Projected {
     let image = frame.view[view];
     let units2 = foot.units_per_px * foot.units_per_px;

@@ -1,5 +1,5 @@
 // Stage bin, after the sort of touches by macro tile: finds where each macro tile's touches start and
-// end. The host clears the ranges before, so a macro tile without touches keeps (0, 0).
+// end. The host clears the ranges first, so a macro tile without touches keeps (0, 0).
 
 #import constants
 #import layout

@@ -1,5 +1,5 @@
 // Exclusive prefix sum of `values` in place, by reduce-then-scan: three dispatches, so that no workgroup
-// has to wait for another one.
+// waits for another.
 //
 // `reduce` sums each block of 2,048 values, `sums` scans the sums of the blocks and appends the total,
 // and `apply` scans within each block. Sums saturate, so an overflowing total is detected.

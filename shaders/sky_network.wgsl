@@ -2,7 +2,7 @@
 // `src/scene/sky/inference.rs`.
 //
 // The threads of a tile evaluate the network together for four pixels at a time, and each thread
-// computes outputs of each layer. Pixels whose background is hidden are skipped. One thread alone would
+// computes outputs of each layer. Pixels whose background is hidden are skipped. A single thread would
 // need 9 KiB of values for its four pixels, which does not fit registers; with these values in private
 // memory, lavapipe took 35 s to compile the shader.
 
@@ -12,7 +12,7 @@
 // per vector.
 @group(0) @binding(9) var<storage, read> weights: array<vec4f>;
 
-// The four directions that are evaluated now, and whether their colours are wanted.
+// The four directions that are evaluated now, and whether their colours are needed.
 var<workgroup> directions: array<vec4f, 3>;
 var<workgroup> is_wanted: u32;
 // Outputs of the second layer, then of the first layer, then the encoded directions: 2 x 256 + 64 values
@@ -27,7 +27,8 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
     let joined = width + select(0u, encoded, background.skip != 0u);
     let second = width * (1u + encoded / 4u);
     let third = second + width * (1u + joined / 4u);
-    // Before the turns: a lens would otherwise be inverted in each of them.
+    // Compute the rays before the loop: inside it, a lens would be inverted once per iteration (`THREADS` times)
+    // instead of once.
     var own: array<vec4f, 3>;
     if wanted {
         let rays = sky_rays(view, at_px);
@@ -35,7 +36,7 @@ fn sky(view: u32, at_px: vec2f, wanted: bool, thread: u32) -> array<vec4f, 3> {
         own = array<vec4f, 3>(rays.x * scale, rays.y * scale, rays.z * scale);
     }
     var rgb: array<vec4f, 3>;
-    // Thread after thread, the pixels of each.
+    // One iteration for each thread, which evaluates the pixels of that thread.
     for (var turn = 0u; turn < THREADS; turn++) {
         if thread == turn {
             is_wanted = u32(wanted);

@@ -1,6 +1,6 @@
 // Stage project for lenses and rolling shutters by the unscented transform: the mean and covariance of
 // six projected sigma points. Twin of `src/render/unscented.rs`, which explains the choice of points. Where the
-// camera's expansion around the centre gives the same within a bound, it stands for the points.
+// camera's expansion around the centre differs from the points by less than a bound, it replaces them.
 //
 // f32 suffices because no large numbers cancel: the six points are taken relative to where the centre
 // lands, polynomials take fractions of the lens' field, a windshield's polynomials give the change of the
@@ -17,8 +17,9 @@ const CONVERGED: f32 = 1e-6;
 
 const ROOT_3: f32 = 1.7320508;
 
-// The splat of a Gaussian. One that is out of range is returned as not visible, unless `decided`: then
-// `cull` has found it visible, and that stands.
+// The splat of a Gaussian. A Gaussian that is out of range is returned as not visible, unless `decided`: then
+// `cull` has already found it visible, and the range is not tested again. The pipeline `project` may round
+// differently, and its splats must be those that `cull` counted.
 fn project_shape(gaussian: Geometry, view: ChunkView, decided: bool) -> Projected {
     let lens = index_of_lens(view);
     let mean = vec4f(gaussian.mean_m, 1.0);
@@ -113,7 +114,7 @@ fn splat_of_root(
     return projected;
 }
 
-// Where a point lands on the image, and the fraction of the exposure that remains at that moment.
+// The place of a point on the image, and the fraction of the exposure that remains at that moment.
 struct ProjectedPoint {
     at_px: vec2f,
     fraction: f32,
@@ -121,7 +122,7 @@ struct ProjectedPoint {
     point_m: vec3f,
 }
 
-// Where a point lands, given in the camera's frame at the end of the exposure. The row determines the
+// The image of a point that is given in the camera's frame at the end of the exposure. The row determines the
 // camera's pose and the pose determines the row: solved by fixed-point iteration from a first guess,
 // and by bisection where an iteration does not halve the error.
 fn project_point(view_index: u32, at_end_m: vec3f, guess: f32) -> ProjectedPoint {
@@ -147,7 +148,7 @@ fn project_point(view_index: u32, at_end_m: vec3f, guess: f32) -> ProjectedPoint
     return point;
 }
 
-// Where a point lands if the camera stands where it does when this fraction of the exposure remains.
+// The image of a point with the camera's pose at which this fraction of the exposure remains.
 fn project_point_at(view_index: u32, at_end_m: vec3f, fraction: f32) -> ProjectedPoint {
     let moved_m = at_end_m + fraction * lenses[view_index].moved_m;
     let point_m = moved_m + rotation_shift(view_index, moved_m, fraction);

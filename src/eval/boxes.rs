@@ -1,7 +1,7 @@
-//! Boxes around what moves, from a log's labels, and the pixels that they hide.
+//! Boxes around moving objects, from a log's labels, and the pixels that they hide.
 //!
-//! A twin has no vehicles and pedestrians, so pixels where a real image shows a moving one do not count. What stands still
-//! may be part of the twin, so it counts.
+//! A twin has no moving vehicles and pedestrians, so pixels where a real image shows one do not count. An object that
+//! stands still may be part of the twin, so its pixels count.
 
 use std::collections::BTreeMap;
 
@@ -14,16 +14,16 @@ use wildcity_scene::geometry::{Camera, Pose};
 /// A box that is slower than this stands still, in m/s.
 pub const MOVES_M_PER_S: f64 = 1.0;
 
-/// How far a hull is grown, in pixels.
+/// Distance by which a hull is grown, in pixels.
 pub const GROWN_PX: f64 = 3.0;
 
 /// A track is interpolated between rows at most this far apart, in microseconds.
 const LARGEST_GAP_US: i64 = 1_000_000;
 
-/// A track goes on at its speed so long before its first and after its last row, in microseconds.
+/// Time for which a track is extrapolated before its first and after its last row, in microseconds.
 const BEYOND_US: i64 = 100_000;
 
-/// Points along an edge that is only in part before the camera.
+/// Number of points along an edge that is only in part in front of the camera.
 const EDGE_POINTS: u32 = 64;
 
 /// Largest accepted side of a box, in metres.
@@ -56,15 +56,15 @@ pub struct MovingBox {
 /// Why a file of boxes was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum BoxesError {
-    /// A line is no box.
+    /// A line is not a valid box.
     #[error(
         "line {line}: {reason}; a line is {{\"time_us\", \"track\", \"size\": [length, width, height], \"world_from_box\": \
          {{\"xyz\", \"q\"}}}}, and perhaps \"velocity\""
     )]
     Line {
-        /// From 1.
+        /// Number of the line, from 1.
         line: usize,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
     /// A track has two boxes at one time.
@@ -100,7 +100,7 @@ impl Boxes {
     /// Reads boxes: JSON objects, one a line.
     ///
     /// # Errors
-    /// Names the first line that is no box, or the track that has two at one time.
+    /// Names the first line that is not a valid box, or the track that has two boxes at one time.
     pub fn parse(text: &str) -> Result<Self, BoxesError> {
         let mut tracks: BTreeMap<String, Vec<Row>> = BTreeMap::new();
         for (at, text) in text.lines().enumerate().filter(|(_, text)| !text.trim().is_empty()) {
@@ -151,7 +151,7 @@ impl Boxes {
         self.tracks.len()
     }
 
-    /// The boxes that move faster than [`MOVES_M_PER_S`] at a time, where they are then: between the rows around it.
+    /// The boxes that move faster than [`MOVES_M_PER_S`] at a time, interpolated between the rows around it.
     pub fn moving_at(&self, time_us: i64) -> Vec<MovingBox> {
         self.tracks.values().filter_map(|rows| moving_at(rows, time_us)).collect()
     }
@@ -202,7 +202,7 @@ fn between(a: &Row, b: &Row) -> DVec3 {
 
 impl MovingBox {
     /// The convex hull of its corners on the image of a camera, in pixels, in one sense of rotation; empty if it is not
-    /// before the camera. Of an edge that is only in part within the camera's field, that part counts.
+    /// in front of the camera. If only a part of an edge is within the camera's field, that part counts.
     pub fn hull_px(&self, camera: &Camera, world_from_camera: &Pose) -> Vec<DVec2> {
         let camera_from_box = world_from_camera.inverse() * self.world_from_box;
         let corner = |index: usize| {
@@ -261,7 +261,7 @@ pub fn hide(hull_px: &[DVec2], size_px: [u32; 2], grown_px: f64, counts: &mut [b
     let Some(first) = hull_px.first() else { return };
     let low = hull_px.iter().fold(*first, |low, point| low.min(*point)) - grown_px;
     let high = hull_px.iter().fold(*first, |high, point| high.max(*point)) + grown_px;
-    // Of pixels with their middles between two positions.
+    // The range of pixels whose middles lie between two positions.
     let range = |low: f64, high: f64, side: u32| {
         let first = (low - 0.5).ceil().clamp(0.0, f64::from(side)) as usize;
         let after = ((high - 0.5).floor() + 1.0).clamp(0.0, f64::from(side)) as usize;
@@ -277,7 +277,7 @@ pub fn hide(hull_px: &[DVec2], size_px: [u32; 2], grown_px: f64, counts: &mut [b
     }
 }
 
-/// Whether a point is within a convex polygon, or at most so far from it.
+/// Whether a point is within a convex polygon, or at most `distance` from it.
 fn is_near(point: DVec2, polygon: &[DVec2], distance: f64) -> bool {
     let edges = || polygon.iter().zip(polygon.iter().cycle().skip(1));
     let is_left = |(a, b): (&DVec2, &DVec2)| (*b - *a).perp_dot(point - *a) >= 0.0;

@@ -12,7 +12,7 @@ const HEADER: &str = "name,camera,width,height,counted,covered,psnr_db,ssim,ssim
 
 impl Evaluation {
     /// The images as CSV: a header, and one line per image. Numbers that are infinite or NaN are the words `inf` and
-    /// `NaN`. Cells of scores that were not asked for are empty.
+    /// `NaN`. Cells of scores that were not requested are empty.
     pub fn csv(&self) -> String {
         let lines = self.images.iter().map(line);
         std::iter::once(HEADER.to_owned()).chain(lines).collect()

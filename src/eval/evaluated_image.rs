@@ -22,13 +22,13 @@ pub struct EvaluatedImage {
     /// The scores of the image as it was rendered.
     #[serde(flatten)]
     pub rendered: Scored,
-    /// The scores after the repair; `None` if it was not asked for.
+    /// The scores of the repaired image; `None` without a repair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub repaired: Option<Scored>,
     /// Share of the pixels that moving boxes hide, from 0 to 1; `None` if there are no boxes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub moving: Option<f64>,
-    /// Depth against LiDAR; `None` if it was not asked for.
+    /// Depth against LiDAR; `None` if it was not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lidar: Option<LidarDepth>,
     /// Pictures for the page; empty if it was not among the worst.
@@ -54,7 +54,7 @@ impl EvaluatedImage {
         }
     }
 
-    /// The order from the lowest PSNR on, with images of which no pixel counts at the end.
+    /// Orders images by rising PSNR; images without a pixel that counts are the last.
     pub fn compare(&self, other: &Self) -> Ordering {
         // The sign of a NaN is not defined, and total_cmp would sort by it.
         let key = |image: &Self| match image.rendered.scores.psnr_db {

@@ -71,7 +71,7 @@ const CONVENTIONS: [(&str, &str); 14] = [
     ),
 ];
 
-/// What was compared.
+/// The scene and the images that were compared.
 #[derive(Clone, Debug, Serialize)]
 pub struct Subject {
     /// Name of the twin, or the scene file.
@@ -80,15 +80,15 @@ pub struct Subject {
     pub version: Option<u64>,
     /// Hash of the version.
     pub version_hash: Option<String>,
-    /// Where poses and images were read.
+    /// Source of the poses and images.
     pub images: String,
     /// From the axes of these poses to those of the scene, as eight numbers.
     pub alignment: String,
-    /// Every how many-th image was compared, in the order of their names; 1 for all.
+    /// Every `every`-th image was compared, in the order of their names; 1 for all.
     pub every: usize,
     /// Backend that rendered.
     pub backend: &'static str,
-    /// How it rendered.
+    /// Profile of the rendering.
     pub profile: RenderProfile,
     /// The model that repaired the images, if one did.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -98,18 +98,18 @@ pub struct Subject {
     /// [`Scores::lpips`]: super::Scores::lpips
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_network: Option<String>,
-    /// The boxes of what moves, if some were given.
+    /// The boxes of moving objects, if any were given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub boxes: Option<BoxesSubject>,
-    /// The points of a LiDAR, if some were given.
+    /// The points of a LiDAR, if any were given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lidar: Option<LidarSubject>,
 }
 
-/// The boxes of what moves.
+/// The boxes of moving objects.
 #[derive(Clone, Debug, Serialize)]
 pub struct BoxesSubject {
-    /// Where they were read.
+    /// File of the boxes.
     pub file: String,
     /// Number of tracks.
     pub tracks: usize,
@@ -118,11 +118,11 @@ pub struct BoxesSubject {
 /// The points of a LiDAR.
 #[derive(Clone, Debug, Serialize)]
 pub struct LidarSubject {
-    /// Where they were read.
+    /// File of the points.
     pub file: String,
-    /// Points that were brought into the world.
+    /// Points that were transformed into the world.
     pub points: usize,
-    /// Points that were left out, since no two poses at most 0.2 s apart are around their time.
+    /// Points that were left out, because no two poses at most 0.2 s apart enclose their time.
     pub left_out: usize,
 }
 
@@ -133,11 +133,11 @@ pub struct RepairSubject {
     pub model: String,
     /// Its version.
     pub version: String,
-    /// Hash of all that decides its pixels beside the images.
+    /// Hash of everything that its output depends on, except the images.
     pub repair_hash: String,
-    /// Where the images come from that it compares with: `recorded`, or `rendered` on the drive; none if it needs none.
+    /// Source of its reference images: `recorded`, or `rendered` on the drive; `None` if it needs none.
     pub references: Option<&'static str>,
-    /// Recorded images that are compared themselves, and were not shown to it.
+    /// Number of recorded images that the model did not get as references, because they are compared themselves.
     pub left_out: usize,
 }
 
@@ -145,7 +145,7 @@ pub struct RepairSubject {
 #[derive(Clone, Debug, Serialize)]
 pub struct Evaluation {
     format: &'static str,
-    /// What was compared.
+    /// The scene and the images that were compared.
     pub subject: Subject,
     conventions: BTreeMap<&'static str, &'static str>,
     /// Means of all images.
@@ -155,7 +155,7 @@ pub struct Evaluation {
     /// Distance of the features of all images from those of the real ones; `None` if there is no network for it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub kid: Option<KidScores>,
-    /// Views beside the drive, by their distance; empty if none was asked for.
+    /// Off-trajectory views, by their distance; empty if none was requested.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub extrapolation: Vec<Extrapolation>,
     /// The images, in the order in which they were listed.
@@ -188,7 +188,7 @@ impl Evaluation {
         }
     }
 
-    /// The images from the lowest PSNR on; those of which no pixel counts are the last.
+    /// The images by rising PSNR; images without a pixel that counts are the last.
     pub fn worst_first(&self) -> Vec<&EvaluatedImage> {
         let mut images: Vec<&EvaluatedImage> = self.images.iter().collect();
         images.sort_by(|a, b| a.compare(b));

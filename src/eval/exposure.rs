@@ -1,8 +1,8 @@
 //! The affine change of each colour channel that brings a rendered image closest to the real one.
 //!
 //! A camera chooses its exposure and white balance anew for each image. A scene that was trained with a change for each
-//! image has none for a held-out one, and is then compared after the best change. These numbers are always better, and
-//! belong beside the others, not in their place.
+//! image has none for a held-out one, and is then compared after the best change. These numbers are always better, so
+//! report them in addition to the others and not in place of them.
 
 use serde::Serialize;
 
@@ -13,7 +13,7 @@ use super::pair::Pair;
 pub struct Exposure {
     /// Factor of each channel.
     pub gain: [f64; 3],
-    /// What is added to each channel.
+    /// Offset of each channel.
     pub offset: [f64; 3],
 }
 

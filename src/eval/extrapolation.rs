@@ -1,4 +1,4 @@
-//! Views beside the drive, for which there is no real image: what can be told of them all the same.
+//! Off-trajectory views, for which there is no real image, and the metrics that need none.
 
 use serde::Serialize;
 
@@ -7,7 +7,7 @@ use super::mean::mean_of;
 use super::reprojection::Reprojection;
 use wildcity_render::compare::json_numbers::serialize_number;
 
-/// One view beside the drive.
+/// One off-trajectory view.
 #[derive(Clone, Debug, Serialize)]
 pub struct ExtrapolatedView {
     /// Name of the real image that it was moved from.
@@ -16,19 +16,19 @@ pub struct ExtrapolatedView {
     pub trust: f64,
     /// Share of its pixels with an opacity of at least 1/2.
     pub covered: f64,
-    /// As it was rendered.
+    /// Scores of the view as it was rendered.
     pub rendered: ViewScores,
-    /// After the repair; `None` if it was not asked for.
+    /// Scores of the repaired view; `None` without a repair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub repaired: Option<ViewScores>,
 }
 
-/// What is known of a view without a real image.
+/// Scores of a view that need no real image at its pose.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ViewScores {
-    /// The view brought back onto the real image.
+    /// Error of the view after it is warped back onto the real image.
     pub reprojection: Reprojection,
-    /// [Flicker](wildcity_render::compare::flicker::flicker) against the view a step before it on the same line.
+    /// [Flicker](wildcity_render::compare::flicker::flicker) against the previous view at the same lateral offset.
     #[serde(serialize_with = "serialize_number")]
     pub flicker: f64,
 }
@@ -36,7 +36,7 @@ pub struct ViewScores {
 /// The views at one distance from the drive.
 #[derive(Clone, Debug, Serialize)]
 pub struct Extrapolation {
-    /// How far to the left of the drive, in metres; to the right if it is negative.
+    /// Lateral offset from the drive, in metres: positive to the left, negative to the right.
     pub offset_m: f64,
     /// Mean trust.
     #[serde(serialize_with = "serialize_number")]
@@ -46,7 +46,7 @@ pub struct Extrapolation {
     pub covered: f64,
     /// Means of the views as they were rendered.
     pub rendered: ViewMeans,
-    /// Means of the repaired views; `None` if it was not asked for.
+    /// Means of the repaired views; `None` without a repair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub repaired: Option<ViewMeans>,
     /// Flicker of the repaired views divided by that of the rendered ones.
@@ -59,13 +59,13 @@ pub struct Extrapolation {
     pub kid: Option<KidScores>,
     /// The views, in the order of the images.
     pub views: Vec<ExtrapolatedView>,
-    /// JPEG files for the page: the real image, the rendered view, what came back of it; with a repair also the repaired
-    /// view.
+    /// JPEG files for the page: the real image, the rendered view, and its pixels that were warped back; with a repair
+    /// also the repaired view.
     #[serde(skip)]
     pub pictures: Vec<(&'static str, Vec<u8>)>,
 }
 
-/// Means over views. A view without a valid pixel is not in a mean; NaN if none has one.
+/// Means over views. A view without a valid pixel is left out; NaN if no view is left.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ViewMeans {
     /// Mean PSNR of the reprojection, in dB.

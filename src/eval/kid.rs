@@ -12,7 +12,7 @@ use wildcity_render::compare::json_numbers::serialize_number;
 /// Number of subsets, if the sets are larger than one.
 pub(crate) const SUBSETS: usize = 100;
 
-/// Images of each set in a subset, at most.
+/// Largest number of images of each set in a subset.
 pub(crate) const SUBSET_SIZE: usize = 1000;
 
 /// Seed of the choice of the subsets.
@@ -40,9 +40,9 @@ pub struct Kid {
 pub struct KidScores {
     /// Name of the network in its manifest.
     pub network: String,
-    /// Of the images as they were rendered.
+    /// Distance of the images as they were rendered.
     pub rendered: Kid,
-    /// After the repair; `None` if it was not asked for.
+    /// Distance of the repaired images; `None` without a repair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub repaired: Option<Kid>,
 }
@@ -67,7 +67,7 @@ impl Kid {
         Self::of_subsets(a, b, SUBSETS, SUBSET_SIZE)
     }
 
-    /// The same with another number and size of subsets. If both sets fit into one, there is one subset: all.
+    /// The distance by another number and size of subsets. If both sets fit into one subset, all images are compared.
     ///
     /// # Errors
     /// As [`Kid::of`].

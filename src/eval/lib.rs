@@ -5,9 +5,9 @@
 //! pair            a real image, a rendered one, and the pixels that count
 //! exposure        the best affine change of each channel
 //! scores          PSNR, SSIM and FLIP of a pair, and the map of its errors
-//! boxes           boxes around what moves, and the pixels that they hide
+//! boxes           boxes around moving objects, and the pixels that they hide
 //! lidar           points of a LiDAR in the world, and rendered depth against them
-//! reprojection    a view beside the drive, brought back onto a real image
+//! reprojection    an off-trajectory view, warped back onto a real image
 //! extrapolation   the views at one distance from the drive
 //! kid             the distance of two sets of images by features of a network
 //! evaluated_image the scores of one image
@@ -17,9 +17,8 @@
 //! page            the HTML page
 //! ```
 //!
-//! The measures themselves are in [`wildcity_render::compare`], where the report takes them from as well. Images are
-//! compared in 8 bits, as agents get them and as files hold them. So other programs compute the same numbers from the
-//! files.
+//! The measures themselves are in [`wildcity_render::compare`], which the report uses as well. Images are compared in
+//! 8 bits, as agents get them and files store them, so that other programs compute the same numbers from the files.
 
 mod boxes;
 mod csv;

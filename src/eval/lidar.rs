@@ -1,7 +1,7 @@
 //! Rendered depth against LiDAR.
 //!
-//! A LiDAR turns while the vehicle drives, so each point has a time of its own, and is brought into the world from where the
-//! vehicle was then: `p_world = T_ego(t) T_lidar p`. It is then projected into the image.
+//! A LiDAR turns while the vehicle drives, so each point has its own time, and is transformed into the world with the
+//! vehicle's pose at that time: `p_world = T_ego(t) T_lidar p`. It is then projected into the image.
 
 use std::collections::HashMap;
 
@@ -15,10 +15,10 @@ use wildcity_scene::align::Alignment;
 use wildcity_scene::geometry::{Camera, Pose, PoseError};
 use wildcity_scene::trajectory::Keyframe;
 
-/// Poses are interpolated if they are at most so far apart, in microseconds.
+/// Largest time between two poses for them to be interpolated, in microseconds.
 pub(crate) const LARGEST_GAP_US: i64 = 200_000;
 
-/// Of points within this distance on the image the nearest counts, in pixels.
+/// Among points within this distance on the image, only the nearest counts, in pixels.
 pub(crate) const SAME_PX: f64 = 2.0;
 
 /// Pixels with less opacity have no depth.
@@ -27,26 +27,26 @@ pub(crate) const LEAST_OPACITY: f32 = 0.5;
 /// Limits of the bins of depth, in metres. Points beyond the last do not count.
 pub const BINS_M: [f64; 4] = [0.0, 10.0, 30.0, 80.0];
 
-/// Why no depth was compared, where none was.
+/// Why no depth was compared.
 pub const NO_LIDAR_POINT: &str = "no LiDAR point was compared: none is within an image, less than 80 m away, at a time near the \
                                   image's (--lidar-window), where the scene is opaque and pixels count";
 
 /// Points of a LiDAR with their times.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LidarPoints {
-    /// In the LiDAR's axes, in metres.
+    /// Positions in the LiDAR's axes, in metres.
     points_m: Vec<DVec3>,
-    /// Of each point, in microseconds, not decreasing.
+    /// Time of each point, in microseconds, not decreasing.
     time_us: Vec<i64>,
     rig_from_lidar: Pose,
-    /// The poses of the rig of the file, if it has some.
+    /// The poses of the rig in the file, if it has any.
     pub poses: Option<Vec<Keyframe>>,
 }
 
 /// Why a LiDAR file was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum LidarError {
-    /// It is no safetensors file.
+    /// It is not a safetensors file.
     #[error("not a safetensors file: {0}; `safetensors.numpy.save_file` writes one")]
     File(String),
     /// A tensor is missing.
@@ -59,10 +59,10 @@ pub enum LidarError {
         name: &'static str,
         /// Its type and shape.
         found: String,
-        /// What is accepted.
+        /// The accepted type and shape.
         must: &'static str,
     },
-    /// A matrix is no rigid transform.
+    /// A matrix is not a rigid transform.
     #[error(
         "{name}[{index}] is no pose: {reason}; give rotation and translation in metres, last row 0 0 0 1"
     )]
@@ -71,13 +71,13 @@ pub enum LidarError {
         name: &'static str,
         /// The matrix.
         index: usize,
-        /// Why not.
+        /// The reason.
         reason: String,
     },
     /// Poses are not in order of time.
     #[error("pose_time_us[{0}] is not after the one before it")]
     Time(usize),
-    /// There is no pose to bring points into the world with.
+    /// There is no pose to transform points into the world.
     #[error(
         "there is no pose of the vehicle: give pose_time_us and world_from_rig in the file, or a twin with a drive"
     )]
@@ -87,26 +87,26 @@ pub enum LidarError {
 /// Points in the world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WorldPoints {
-    /// In metres, in order of time.
+    /// Positions in metres, in order of time.
     pub points_m: Vec<DVec3>,
-    /// In microseconds.
+    /// Times in microseconds.
     pub time_us: Vec<i64>,
-    /// Points that were left out, since no two poses at most 0.2 s apart are around their time.
+    /// Points that were left out, because no two poses at most 0.2 s apart enclose their time.
     pub skipped: usize,
 }
 
-/// A rendered image as LiDAR is compared with it. Maps are `[height, width]`.
+/// A rendered image that is compared with LiDAR. Maps are `[height, width]`.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthMap<'a> {
     /// Its camera.
     pub camera: &'a Camera,
     /// Its pose.
     pub world_from_camera: &'a Pose,
-    /// [`Camera::depth_m`] of each pixel.
+    /// Depth of each pixel, as in [`Camera::depth_m`].
     pub depth_m: &'a [f32],
-    /// Of each pixel, 0 to 1.
+    /// Opacity of each pixel, 0 to 1.
     pub opacity: &'a [f32],
-    /// Which pixels count; all without it.
+    /// The pixels that count; all without it.
     pub counts: Option<&'a [bool]>,
 }
 
@@ -118,19 +118,19 @@ pub struct LidarDepth {
     /// Mean absolute difference of the rendered depth to the point's, in metres; NaN without points.
     #[serde(serialize_with = "serialize_number")]
     pub mean_m: f64,
-    /// Median of it.
+    /// Median of this difference, in metres.
     #[serde(serialize_with = "serialize_number")]
     pub median_m: f64,
-    /// By the point's depth.
+    /// The differences by the depth of the point.
     pub bins: [LidarBin; 3],
 }
 
-/// Points of a range of depths.
+/// The points in a range of depths.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct LidarBin {
-    /// From this depth on, in metres ..
+    /// Least depth, in metres.
     pub from_m: f64,
-    /// .. and below this one.
+    /// End of the range, exclusive, in metres.
     pub to_m: f64,
     /// Number of points.
     pub points: usize,
@@ -152,7 +152,7 @@ pub struct LidarMeans {
     /// Mean of the images' medians, in metres.
     #[serde(serialize_with = "serialize_number")]
     pub median_m: f64,
-    /// Of the points of all images together.
+    /// The differences of the points of all images together, by depth.
     pub bins: [LidarBin; 3],
 }
 
@@ -177,7 +177,7 @@ impl LidarPoints {
         }
         let points = points.chunks_exact(3).map(|xyz| DVec3::new(xyz[0], xyz[1], xyz[2]));
         let mut timed: Vec<(i64, DVec3)> = times.into_iter().zip(points).collect();
-        // Sensors write NaN where nothing came back.
+        // Sensors write NaN where there was no return.
         timed.retain(|(_, point_m)| point_m.is_finite());
         timed.sort_by_key(|(time_us, _)| *time_us);
         let (time_us, points_m) = timed.into_iter().unzip();
@@ -347,7 +347,7 @@ fn seen(points_m: &[DVec3], map: &DepthMap<'_>) -> Vec<Seen> {
     points_m.iter().filter_map(project).collect()
 }
 
-/// From the nearest on, those without one of them within [`SAME_PX`]: the others may be hidden behind it.
+/// Keeps a point, from the nearest on, if no kept point is within [`SAME_PX`]: it may be hidden behind that one.
 fn nearest(mut seen: Vec<Seen>) -> Vec<Seen> {
     seen.sort_by(|a, b| a.depth_m.total_cmp(&b.depth_m));
     let cell_of = |at_px: DVec2| [at_px.x, at_px.y].map(|at| (at / SAME_PX).floor() as i32);
@@ -377,7 +377,7 @@ fn median(sorted: &[f64]) -> f64 {
     }
 }
 
-/// The poses of the rig, if the file has some.
+/// The poses of the rig, if the file has any.
 fn poses(file: &SafeTensors<'_>) -> Result<Option<Vec<Keyframe>>, LidarError> {
     let Some(times) = times(file, "pose_time_us")? else { return Ok(None) };
     let shape = [Some(times.len()), Some(4), Some(4)];
@@ -403,7 +403,7 @@ fn pose(name: &'static str, index: usize, rows: &[f64]) -> Result<Pose, LidarErr
     let rotation = DMat3::from_mat4(matrix);
     let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
     let error = off.iter().fold(0.0, |most: f64, value| most.max(value.abs()));
-    // A NaN is no rotation either.
+    // A matrix with a NaN is refused, too.
     let is_rotation = error <= 1e-4 && rotation.determinant() > 0.0;
     if !is_rotation || matrix.row(3) != DVec4::W {
         return Err(wrong(format!(

@@ -8,21 +8,21 @@ use super::mean::mean_of;
 use super::scores::{AlignedScores, Scored, Scores, pooled_psnr_db};
 use wildcity_render::compare::json_numbers::serialize_number;
 
-/// Means of the values of some images. Images of which no pixel counts are left out. NaN if there is no other.
+/// Means of the values of some images. Images without a pixel that counts are left out. NaN if no image is left.
 #[derive(Clone, Debug, Serialize)]
 pub struct Means {
     /// Number of images.
     pub images: usize,
-    /// Of the images as they were rendered.
+    /// Means of the images as they were rendered.
     #[serde(flatten)]
     pub rendered: ScoreMeans,
-    /// Of the same images after the repair; `None` if it was not asked for.
+    /// Means of the same images after the repair; `None` without a repair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub repaired: Option<ScoreMeans>,
-    /// Repaired minus rendered; `None` if it was not asked for.
+    /// Repaired minus rendered; `None` without a repair.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gain: Option<Gain>,
-    /// Depth against LiDAR; `None` if it was not asked for.
+    /// Depth against LiDAR; `None` if it was not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lidar: Option<LidarMeans>,
 }
@@ -45,10 +45,10 @@ pub struct ScoreMeans {
     /// Mean FLIP.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
-    /// Mean of [`Scores::lpips`]; `None` if it was not asked for.
+    /// Mean of [`Scores::lpips`]; `None` if it was not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
-    /// Means after the best change of exposure; `None` if it was not asked for.
+    /// Means after the best change of exposure; `None` if they were not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub aligned: Option<AlignedMeans>,
 }
@@ -64,19 +64,20 @@ pub struct AlignedMeans {
     pub ssim: f64,
 }
 
-/// What a repair changed: the mean after it minus the mean before. More is better for PSNR and SSIM, less for the others.
+/// The change by a repair: the mean after it minus the mean before. Larger is better for PSNR and SSIM, smaller for the
+/// others.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Gain {
-    /// In dB.
+    /// Change of PSNR, in dB.
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
-    /// Of [`Scores::ssim`].
+    /// Change of [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
-    /// Of FLIP.
+    /// Change of FLIP.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
-    /// Of LPIPS; `None` if it was not asked for.
+    /// Change of LPIPS; `None` if it was not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
 }
@@ -109,7 +110,7 @@ impl Means {
 impl ScoreMeans {
     fn of(scored: &[&Scored]) -> Self {
         let mean = |value: &dyn Fn(&Scores) -> f64| {
-            // A mask may leave pixels, but no window.
+            // A mask may leave pixels, but not a whole window.
             mean_of(scored.iter().map(|scored| value(&scored.scores)).filter(|v| !v.is_nan()))
         };
         let is_aligned = scored.iter().any(|scored| scored.scores.aligned.is_some());

@@ -12,7 +12,7 @@ pub struct Pair {
 /// Why two images cannot be compared.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PairError {
-    /// An image has another number of values than its size says.
+    /// The number of values of an image does not match its size.
     #[error("the {what} has {values} values, but {width} x {height} px have {expected}")]
     Size {
         /// `real image`, `rendered image` or `mask`.
@@ -29,7 +29,7 @@ pub enum PairError {
 }
 
 impl Pair {
-    /// Puts two images of one size together. `counts` says which pixels are compared; all without it.
+    /// Combines two images of one size. `counts` marks the pixels that are compared; all without it.
     ///
     /// # Errors
     /// [`PairError::Size`].
@@ -51,7 +51,7 @@ impl Pair {
                 return Err(PairError::Size { what, values, width, height, expected });
             }
         }
-        // A mask that hides nothing is none.
+        // A mask that hides no pixel is dropped.
         let counts = counts.filter(|counts| counts.contains(&false));
         Ok(Self { size_px, truth, rendered, counts })
     }
@@ -71,7 +71,7 @@ impl Pair {
         &self.rendered
     }
 
-    /// Which pixels count; `None` if all do.
+    /// The pixels that count; `None` if all do.
     pub(super) fn counts(&self) -> Option<&[bool]> {
         self.counts.as_deref()
     }

@@ -1,8 +1,8 @@
-//! Reprojection: a view beside the drive, brought back onto the real image that it was moved from.
+//! Reprojection: an off-trajectory view, warped back onto the real image that it was moved from.
 //!
-//! Beside the drive there is no real image. But most of what a view there shows was seen from the drive, and must have the
-//! same colours. What shines or is far off in depth differs, so this number has a floor; it compares methods on the
-//! same views.
+//! Off the trajectory there is no real image. But most surfaces in such a view were seen from the drive, and must have
+//! the same colours. Specular surfaces and errors of the depth make a difference even in a perfect view, so use this
+//! number only to compare methods on the same views.
 
 use serde::Serialize;
 
@@ -10,10 +10,10 @@ use super::pair::{Pair, PairError};
 use super::scores::PairScores;
 use wildcity_render::compare::json_numbers::serialize_number;
 
-/// How far a view that was brought back is from the real image.
+/// The error of a view that was warped back, against the real image.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Reprojection {
-    /// Over the pixels that came back, in dB.
+    /// PSNR over the pixels that came back, in dB.
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
     /// Mean LDR-FLIP of these pixels.
@@ -24,8 +24,9 @@ pub struct Reprojection {
 }
 
 impl Reprojection {
-    /// Compares. `truth` and `back` are `[height, width, 3]` in 8 bits; `valid` is `[height, width]`, above 0 where `back`
-    /// has a value; `counts` says which pixels of the real image count, all without it.
+    /// Compares the view `back` with the real image `truth`. Both are `[height, width, 3]` in 8 bits. `valid` is
+    /// `[height, width]`, above 0 where `back` has a value. `counts` marks the pixels of the real image that count; all
+    /// count without it.
     ///
     /// # Errors
     /// [`PairError::Size`].

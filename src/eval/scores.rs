@@ -9,7 +9,7 @@ use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_render::compare::psnr::psnr_db;
 use wildcity_render::compare::ssim::Ssim;
 
-/// How far a rendered image is from the real one. A number is NaN if no pixel counts.
+/// Differences of a rendered image and the real one. A number is NaN if no pixel counts.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Scores {
     /// Peak signal-to-noise ratio over the pixels that count, in dB; infinite if none differs.
@@ -24,12 +24,12 @@ pub struct Scores {
     /// Mean of LDR-FLIP over the pixels that count. Masked pixels are replaced by the real image before.
     #[serde(serialize_with = "serialize_number")]
     pub flip: f64,
-    /// Distance of the two images by a network that the user gave; `None` if none was.
+    /// Distance of the two images by the network that the user gave; `None` without one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
     /// Share of the pixels that count, from 0 to 1.
     pub counted: f64,
-    /// The same after the best change of exposure.
+    /// The scores after the best change of exposure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub aligned: Option<AlignedScores>,
 }
@@ -61,7 +61,7 @@ pub struct Scored {
     pub(super) values: u64,
 }
 
-/// The scores of a pair, and what else comes out of comparing it.
+/// The scores of a pair, and the other results of its comparison.
 #[derive(Clone, Debug)]
 pub struct PairScores {
     /// The scores.
@@ -98,7 +98,7 @@ impl PairScores {
         Self { scores, error_map, squared_error, values }
     }
 
-    /// Without the map.
+    /// The scores and sums, without the map.
     pub fn scored(&self) -> Scored {
         let &Self { scores, squared_error, values, .. } = self;
         Scored { scores, squared_error, values }
@@ -154,7 +154,7 @@ fn aligned(pair: &Pair, truth: &[f64]) -> AlignedScores {
 mod tests {
     use super::*;
 
-    /// A textured image, and the same spoiled by +20 in the left half.
+    /// A textured image, and a copy with +20 in the left half.
     fn images() -> (Vec<u8>, Vec<u8>) {
         let truth: Vec<u8> = (0..3 * 40 * 30).map(|i| 40 + (i * 7919 % 120) as u8).collect();
         let spoil = |(i, value): (usize, &u8)| value + if i / 3 % 40 < 20 { 20 } else { 0 };
@@ -182,7 +182,7 @@ mod tests {
         let left_db = 20.0 * (255.0_f64 / 20.0).log10();
         assert!((left.scores.psnr_db - left_db).abs() < 1e-9, "{left:?}");
         assert!(left.error_map.iter().enumerate().all(|(i, e)| (i % 40 < 20) == (*e > 0.0)));
-        // That half is the truth again after the best change of exposure.
+        // After the best change of exposure, that half equals the truth again.
         assert!(left.scores.aligned.unwrap().psnr_db > 200.0);
         let nothing = scores(Some(vec![false; 1200])).scores;
         // A single pixel that does not count takes its windows away.

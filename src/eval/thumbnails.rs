@@ -14,7 +14,7 @@ const WIDTH_PX: u32 = 480;
 /// JPEG quality of the pictures on the page.
 const JPEG_QUALITY: u8 = 88;
 
-/// Pixels that do not count, in maps of errors.
+/// Colour of pixels that do not count, in maps of errors.
 const UNCOUNTED_RGB: [u8; 3] = [120, 120, 120];
 
 /// JPEG files of at most 480 px of width.
@@ -41,7 +41,7 @@ impl Thumbnails {
         Ok(Self { files, repaired: None })
     }
 
-    /// With the repaired image in a pair of its own.
+    /// Adds the pictures of the repaired image, which is in its own pair.
     ///
     /// # Errors
     /// The encoder's message.

@@ -1,7 +1,7 @@
 //! Vehicles and a pedestrian as assets of actors: the street's parked cars in more detail, and a person.
 //!
-//! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not. What they look like
-//! beside the parked cars was judged on pictures.
+//! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not. Pictures were used to
+//! check that they look right next to the parked cars.
 
 use glam::DVec3;
 

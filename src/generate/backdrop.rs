@@ -6,7 +6,7 @@ use super::random::{Random, noise, smooth};
 use super::route::Route;
 use super::surface::{Paint, Painter};
 
-/// How far the land reaches, in metres.
+/// Extent of the land, in metres.
 const LAND_TO_M: f64 = 560.0;
 /// Land nearer to the centre line than this is painted by other modules, in metres.
 const LAND_FROM_M: f64 = 27.0;

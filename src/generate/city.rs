@@ -26,12 +26,12 @@ use super::{CitySettings, GenerateError};
 /// Shortest and longest street, except for the last two, in metres: long enough that side streets do not meet
 /// behind the houses where the route bends.
 const STREET_M: [f64; 2] = [150.0, 220.0];
-/// How far from its centre line a street reaches, in metres: the side street's 82, the house at its
+/// Extent of a street from its centre line, in metres: the side street's 82, the house at its
 /// end, 13, and eaves.
 const ASIDE_M: f64 = 110.0;
-/// Streets that are painted at once, at most: each is 115 MB at 5 million Gaussians per km.
+/// Most streets that are painted at once: each is 115 MB at 5 million Gaussians per km.
 const PAINTED_AT_ONCE: usize = 4;
-/// How far from both ends of the route the drive stays, in metres.
+/// Distance of the drive from both ends of the route, in metres.
 const INDENT_M: f64 = 8.0;
 
 /// All Gaussians of one cell.

@@ -32,7 +32,7 @@ impl Wall {
     }
 }
 
-/// What fills the ground floor.
+/// The use of the ground floor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum GroundFloor {
     /// Windows, and a door in one bay.
@@ -41,7 +41,7 @@ pub(super) enum GroundFloor {
     Shop,
 }
 
-/// How a house looks from outside.
+/// The outside of a house.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
     /// The plaster or brick.
@@ -62,7 +62,7 @@ pub(super) struct Style {
     pub(super) brick: bool,
     /// Balconies in every second bay.
     pub(super) balconies: bool,
-    /// What fills the ground floor.
+    /// The use of the ground floor.
     pub(super) ground_floor: GroundFloor,
     /// Whether the drive passes the house; then its windows have all their parts.
     pub(super) near: bool,
@@ -122,9 +122,9 @@ pub(super) struct Facade<'p, 'a, 'w> {
     pub(super) bay_m: f64,
 }
 
-/// Spacing on plain wall, beside an opening and in between, in metres. Surrounds cover its edge.
+/// Spacing on plain wall, next to an opening and in between, in metres. Surrounds cover its edge.
 const WALL_M: [f64; 2] = [0.15, 0.52];
-/// How deep window panes lie in the wall, in metres.
+/// Depth of window panes in the wall, in metres.
 pub(super) const RECESS_M: f64 = 0.14;
 
 impl Facade<'_, '_, '_> {
@@ -142,7 +142,7 @@ impl Facade<'_, '_, '_> {
         self.window(u, v, random);
     }
 
-    /// Wall beside openings: fine at its sides.
+    /// Wall next to openings: fine at its sides.
     pub(super) fn pier(&mut self, u: [f64; 2], v: [f64; 2]) {
         let us = self.painter.graded(u[0], u[1], WALL_M[0], WALL_M[1]);
         let vs = self.painter.even(v[0], v[1], 0.62);
@@ -195,7 +195,7 @@ impl Facade<'_, '_, '_> {
             return;
         }
         self.rect(&us, &[v[0] - 0.19, v[0] - 0.10], 0.01, |_, _| trim.times(0.72));
-        // Reveals: the wall's thickness beside and above the panes.
+        // Reveals: the wall's thickness at the sides of the panes and above them.
         let shade = self.style.wall.open(0.6);
         let vs = self.painter.even(v[0], v[1], 0.40);
         for (at_m, outwards) in [(u[0], true), (u[1], false)] {

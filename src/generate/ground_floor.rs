@@ -1,4 +1,4 @@
-//! Doors and shops: what the ground floor has instead of windows.
+//! Doors and shops, which the ground floor has instead of windows.
 
 use glam::DVec3;
 

@@ -56,7 +56,7 @@ pub const REVISION: u32 = 3;
 /// by `scenes/sky.py`; world axes.
 pub const SKY: &[u8] = include_bytes!("../../scenes/sky.safetensors");
 
-/// What the street is made from.
+/// The settings of a street.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StreetSettings {
@@ -64,7 +64,7 @@ pub struct StreetSettings {
     pub seed: u64,
     /// Length of the street that is driven, in metres: 100 to 1,000.
     pub length_m: f64,
-    /// Where a side street crosses, in metres from the start: at least 40 from both ends.
+    /// Station at which a side street crosses, in metres from the start: at least 40 from both ends.
     pub crossing_m: f64,
     /// Number of Gaussians as a multiple of that at the spacings in the source, 0.1 to 4. Spacings are divided by
     /// its square root.
@@ -81,13 +81,13 @@ pub struct Street {
     pub trajectory: Trajectory,
 }
 
-/// What a city is made from.
+/// The settings of a city.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CitySettings {
     /// Seed of everything that is random.
     pub seed: u64,
-    /// Length of the route, in metres: whole ones, 100 to 100,000.
+    /// Length of the route, in whole metres, 100 to 100,000.
     pub length_m: f64,
     /// Millions of Gaussians per kilometre, 1 to 15: within a tenth of that on average.
     pub millions_per_km: f64,
@@ -105,7 +105,7 @@ pub enum GenerateError {
         field: &'static str,
         /// The refused value.
         value: f64,
-        /// What must hold instead.
+        /// The values that are accepted.
         must: &'static str,
     },
 }
@@ -188,7 +188,7 @@ impl CitySettings {
         ])
     }
 
-    /// About how many Gaussians there will be.
+    /// Approximate number of Gaussians.
     pub fn gaussians(&self) -> u64 {
         (self.millions_per_km * 1e3 * self.length_m) as u64
     }

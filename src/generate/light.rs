@@ -162,7 +162,7 @@ impl Occluder {
     }
 }
 
-/// Where the shadow of a point falls on the plane z = 0, in metres.
+/// Position of the shadow of a point on the plane z = 0, in metres.
 fn on_ground(point_m: DVec3) -> DVec2 {
     point_m.truncate() - TO_SUN.truncate() * (point_m.z / TO_SUN.z)
 }

@@ -97,7 +97,7 @@ pub(super) fn hedge(
     }
 }
 
-/// How leaves look: how many to a clump, how long, in metres, and how green.
+/// The appearance of leaves: their number in a clump, their length in metres, and their colour.
 struct Foliage {
     leaves: usize,
     size_m: f64,

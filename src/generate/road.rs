@@ -8,13 +8,13 @@ use super::surface::{Paint, Painter};
 
 /// Half width of the two lanes together, in metres: twice 3.6 m.
 pub(super) const LANES_M: f64 = 3.6;
-/// Where the parking bays end and the kerb begins, in metres from the centre line.
+/// Distance from the centre line at which the parking bays end and the kerb begins, in metres.
 pub(super) const KERB_M: f64 = 5.8;
 /// Width of the kerb stones, in metres.
 const KERB_STONE_M: f64 = 0.15;
-/// Where the pavements end and the houses begin, in metres from the centre line.
+/// Distance from the centre line at which the pavements end and the houses begin, in metres.
 pub(super) const FRONT_M: f64 = 9.4;
-/// How high the pavement lies, in metres.
+/// Height of the pavement, in metres.
 pub(super) const PAVEMENT_M: f64 = 0.12;
 /// The middle of the driven lane, in metres left of the centre line: the right lane.
 pub(super) const LANE_T_M: f64 = -1.75;
@@ -23,12 +23,12 @@ pub(super) const LANE_T_M: f64 = -1.75;
 pub(super) const SIDE_LANES_M: f64 = 3.5;
 /// From the side street's middle line to its houses, in metres.
 pub(super) const SIDE_FRONT_M: f64 = 6.2;
-/// How far the side street goes to either side, in metres from the centre line.
+/// Length of the side street to either side, in metres from the centre line.
 pub(super) const SIDE_REACH_M: f64 = 82.0;
 
-/// Where the zebra crossings lie, in metres from the middle of the crossing.
+/// Distance of the zebra crossings from the middle of the crossing, in metres.
 pub(super) const ZEBRA_M: [f64; 2] = [6.4, 9.6];
-/// Where the stop lines lie, in metres from the middle of the crossing.
+/// Distance of the stop lines from the middle of the crossing, in metres.
 pub(super) const STOP_M: [f64; 2] = [10.8, 11.2];
 /// No lane marks within this distance of the middle of the crossing, in metres.
 const JUNCTION_M: f64 = 11.2;
@@ -36,7 +36,7 @@ const JUNCTION_M: f64 = 11.2;
 const DASH_M: f64 = 3.0;
 /// Half width of the centre line, in metres.
 const LINE_M: f64 = 0.065;
-/// Width of a zebra stripe and of the gap beside it, in metres.
+/// Width of a zebra stripe and of the gap next to it, in metres.
 const STRIPE_M: f64 = 0.48;
 /// Pavement slabs are squares of this side, in metres.
 const SLAB_M: f64 = 0.90;
@@ -106,7 +106,7 @@ impl Ground<'_> {
         self.flat(painter, &ss, &ts, 0.0, |s_m, t_m| self.lane_paint(s_m, t_m));
     }
 
-    /// The lanes where pedestrians cross, with the stop line before it.
+    /// The lanes where pedestrians cross, with the stop line in front of the crossing.
     fn zebra(&self, painter: &mut Painter, [from_s_m, to_s_m]: [f64; 2]) {
         let mut ts = vec![-LANES_M];
         while let Some(&t_m) = ts.last().filter(|&&t_m| t_m < LANES_M - 0.1) {
@@ -117,7 +117,7 @@ impl Ground<'_> {
         self.flat(painter, &ss, &ts, 0.0, |s_m, t_m| self.lane_paint(s_m, t_m));
     }
 
-    /// Positions of manholes: one every 31 m, beside the wheel tracks of either lane.
+    /// Positions of manholes: one every 31 m, next to the wheel tracks of either lane.
     fn covers(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
         let (seed, cross_s_m, [from_m, to_m]) =
             (self.covers_seed, self.cross_s_m, self.route.driven_m);
@@ -219,7 +219,7 @@ impl Ground<'_> {
         self.flat(painter, &stones, &side_of(top_m.to_vec()), PAVEMENT_M, |s_m, _| {
             Some(stone(s_m))
         });
-        // The kerb's face looks at the road.
+        // The kerb faces the road.
         let (along, up) = (oriented(side, stones), [0.0, 0.5 * PAVEMENT_M, PAVEMENT_M]);
         painter.sheet(
             &along,

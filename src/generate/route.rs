@@ -8,16 +8,16 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::Keyframe;
 
-/// How far the street goes on beyond both ends of the drive, in metres.
+/// Length of the street beyond both ends of the drive, in metres.
 pub(super) const BEYOND_M: f64 = 80.0;
 
 /// Spacing of keyframes, in metres.
 const KEYFRAME_M: f64 = 0.5;
-/// How fast the recorded drive of a street is, in m/s.
+/// Speed of the recorded drive of a street, in m/s.
 const SPEED_M_S: f64 = 10.0;
-/// How far from both ends of the driven part the drive stays, in metres.
+/// Distance of the drive from both ends of the driven part, in metres.
 const INDENT_M: f64 = 8.0;
-/// How far the table of the centre line goes beyond the houses, in metres.
+/// Length of the centre line's table beyond the houses, in metres.
 const SLACK_M: f64 = 40.0;
 /// Arc length between nodes of the table, in metres.
 const NODE_M: f64 = 0.25;
@@ -63,7 +63,7 @@ pub(super) struct Wave {
 /// A point of the centre line with its directions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Station {
-    /// Where, in metres.
+    /// Its position, in metres.
     pub(super) point_m: DVec3,
     /// Unit, along the street.
     pub(super) forward: DVec3,
@@ -72,7 +72,7 @@ pub(super) struct Station {
 }
 
 impl Station {
-    /// A point beside the centre line: `t_m` to the left, `z_m` above the road.
+    /// A point `t_m` to the left of the centre line and `z_m` above the road.
     pub(super) fn beside(&self, t_m: f64, z_m: f64) -> DVec3 {
         self.point_m + t_m * self.left + z_m * DVec3::Z
     }
@@ -148,8 +148,8 @@ impl Route {
         Trajectory { name: name.into(), keyframes: keyframes(poses, SPEED_M_S) }
     }
 
-    /// Poses every 0.5 m along the lane `t_m` to the left of the centre line, from a station to another
-    /// one, both in metres. Sets `station_m` to the station of the pose after the last.
+    /// Poses every 0.5 m along the lane `t_m` to the left of the centre line, from one station to another,
+    /// both in metres. Sets `station_m` to the station of the pose after the last.
     pub(super) fn poses(&self, t_m: f64, station_m: &mut f64, to_s_m: f64) -> Vec<Pose> {
         let mut poses = Vec::new();
         while *station_m <= to_s_m {

@@ -1,10 +1,10 @@
-//! Damage to a street as captures have it: right on the recorded drive, wrong beside it.
+//! Synthetic reconstruction errors, like those of captures: small on the recorded drive, large off the trajectory.
 //!
-//! A capture is trained on images from one line, the drive. What those images do not determine, training leaves to
-//! chance. For a Gaussian, let the plane be that through it and the drive where the cameras saw it. They saw it along
-//! directions in this plane alone, so they do not tell how its colour changes along the plane's normal; nor do they
-//! show a sheet that lies in such a plane, since they look at its edge. Positions along the rays are known better, and
-//! are therefore a small part of the damage.
+//! A capture is trained on images from one line, the drive. Training cannot determine what those images do not
+//! constrain. Consider the plane through a Gaussian and the segment of the drive from which the cameras saw it: all
+//! viewing rays lie in this plane. So the images do not constrain how the colour changes along the plane's normal, and
+//! they do not show a thin sheet in this plane, which they see edge-on. They constrain positions along the rays better,
+//! so displacements are a small part of the damage.
 
 use std::ops::Range;
 
@@ -18,22 +18,24 @@ use super::GenerateError;
 use super::random::{Random, noise};
 
 /// Height of the cameras above the origin of the rig, in metres.
-const EYE_M: f64 = 1.6;
-/// Edge of a patch of Gaussians that are displaced and tinted alike, in metres.
+const CAMERA_HEIGHT_M: f64 = 1.6;
+/// Edge of a patch of Gaussians that are displaced and tinted in the same way, in metres.
 const PATCH_M: f64 = 0.7;
-/// Eyes between two that the search for the nearest looks at first.
+/// The search for the nearest camera position tests every `STRIDE`-th one first.
 const STRIDE: usize = 8;
 
-/// How far beside the middle of the rig the side cameras are, in metres: what lies to the side was seen from there.
-const BESIDE_M: f64 = 0.3;
-/// A Gaussian was seen from this far before the point of the drive that is nearest to it: so many metres, and so many
-/// times its distance from that point, at most [`BEFORE_MOST_M`].
-const BEFORE: (f64, f64) = (4.0, 0.8);
-/// See [`BEFORE`], in metres.
-const BEFORE_MOST_M: f64 = 60.0;
+/// Lateral distance of the side cameras from the middle of the rig, in metres. They saw what lies to the side.
+const SIDE_CAMERA_M: f64 = 0.3;
+/// A Gaussian is assumed to be seen from a point of the drive that lies 4 m + 0.8 x distance behind the point that is
+/// nearest to it, at most [`VIEWED_FROM_BEHIND_MAX_M`]. This is the constant part, in metres.
+const VIEWED_FROM_BEHIND_M: f64 = 4.0;
+/// The part per metre of distance from the nearest point: see [`VIEWED_FROM_BEHIND_M`].
+const VIEWED_FROM_BEHIND_PER_M: f64 = 0.8;
+/// The largest value of the sum, in metres: see [`VIEWED_FROM_BEHIND_M`].
+const VIEWED_FROM_BEHIND_MAX_M: f64 = 60.0;
 
 // Sizes of the damage at an amount of 1. With 0.5, images of a city have 30 dB on the drive, and 27, 21 and 19 dB at
-// 1, 3 and 5 m beside it (the three front cameras at 360 x 232 pixels).
+// 1, 3 and 5 m off it (the three front cameras at 360 x 232 pixels).
 /// Share of the Gaussians that are missing.
 const LOST: f64 = 0.02;
 /// Largest displacement along the ray, as a share of the distance.
@@ -42,13 +44,15 @@ const MOVED: f64 = 0.014;
 const TINT: f64 = 4.0;
 /// See [`TINT`].
 const TINT_LEAST: f64 = 0.4;
-/// Shares of the change that all three channels have, and that a patch has; the rest is each channel's or Gaussian's.
-const TINT_SHARED: (f64, f64) = (0.8, 0.9);
+/// Share of the change that is equal in all three channels; the rest is drawn for each channel.
+const TINT_GREY: f64 = 0.8;
+/// Share of the change that a whole patch has; the rest is drawn for each Gaussian.
+const TINT_PATCH: f64 = 0.9;
 /// Share of the Gaussians that are needles along the ray, up to [`NEEDLE_LENGTH`] times as long as they were wide.
 const NEEDLES: f64 = 0.05;
 /// See [`NEEDLES`].
 const NEEDLE_LENGTH: f64 = 4.0;
-/// Number of sheets in the air per Gaussian.
+/// Number of floating sheets per Gaussian.
 const SHEETS: f64 = 0.06;
 /// Standard deviation of a sheet along the ray, in metres, for a Gaussian that is 15 m away.
 const SHEET_M: f64 = 0.4;
@@ -58,48 +62,49 @@ const SHEET_M: f64 = 0.4;
 pub struct Spoil {
     amount: f64,
     seed: u64,
-    eyes: Vec<Eye>,
+    cameras: Vec<CameraPosition>,
 }
 
 /// A position of the recording cameras.
 #[derive(Clone, Copy, Debug)]
-struct Eye {
+struct CameraPosition {
     at_m: DVec3,
     left: DVec3,
     station_m: f64,
 }
 
-/// How the cameras saw a Gaussian.
+/// The ray along which a camera saw a Gaussian.
 #[derive(Clone, Copy, Debug)]
-struct Sight {
-    eye_m: DVec3,
-    /// From the eye to the Gaussian.
+struct ViewingRay {
+    camera_m: DVec3,
+    /// Vector from the camera to the Gaussian, in metres.
     ray_m: DVec3,
-    /// Unit, of the plane that the Gaussian and the drive lie in.
+    /// Unit normal of the plane in which the Gaussian and the drive lie.
     normal: DVec3,
 }
 
 impl Spoil {
     /// Damage by `amount`, from 0 (none) to 1, to what was recorded along `drive`. The same arguments spoil the
-    /// same Gaussian in the same way, whatever others are with it.
+    /// same Gaussian in the same way, whichever other Gaussians are given.
     ///
     /// # Errors
     /// The amount is out of range.
     pub fn new(amount: f64, seed: u64, drive: &Trajectory) -> Result<Self, GenerateError> {
         let holds = (0.0..=1.0).contains(&amount);
         super::first_refused([("spoil", amount, holds, "a twin is spoiled by 0 to 1")])?;
-        let mut eyes: Vec<Eye> = Vec::with_capacity(drive.keyframes.len());
+        let mut cameras: Vec<CameraPosition> = Vec::with_capacity(drive.keyframes.len());
         for keyframe in &drive.keyframes {
             let pose = &keyframe.world_from_rig;
-            let at_m = pose.transform_point(EYE_M * DVec3::Z);
-            let station_m = eyes.last().map(|eye| eye.station_m + eye.at_m.distance(at_m));
+            let at_m = pose.transform_point(CAMERA_HEIGHT_M * DVec3::Z);
+            let station_m =
+                cameras.last().map(|camera| camera.station_m + camera.at_m.distance(at_m));
             let left = pose.rotation * DVec3::Y;
-            eyes.push(Eye { at_m, left, station_m: station_m.unwrap_or(0.0) });
+            cameras.push(CameraPosition { at_m, left, station_m: station_m.unwrap_or(0.0) });
         }
-        Ok(Self { amount, seed, eyes })
+        Ok(Self { amount, seed, cameras })
     }
 
-    /// The Gaussians with the damage, of SH degree 1 at least. None leaves its cell
+    /// The damaged Gaussians, of SH degree 1 at least. None leaves its cell
     /// ([`wildcity_scene::chunk::CELL_M`]).
     pub fn apply(&self, gaussians: &Gaussians) -> Gaussians {
         let mut whole = gaussians.clone();
@@ -115,45 +120,46 @@ impl Spoil {
         spoiled
     }
 
-    /// Indices of eyes among which the nearest of each point is.
+    /// Indices of a range of camera positions that contains the nearest one of each point.
     fn near(&self, means_m: &[[f64; 3]]) -> Range<usize> {
         let [mut low_m, mut high_m] = [DVec3::INFINITY, DVec3::NEG_INFINITY];
         for mean_m in means_m {
             let mean_m = DVec3::from_array(*mean_m);
             (low_m, high_m) = (low_m.min(mean_m), high_m.max(mean_m));
         }
-        let distance_m = |eye: &Eye| eye.at_m.distance(0.5 * (low_m + high_m));
-        let nearest_m = self.eyes.iter().map(distance_m).fold(f64::INFINITY, f64::min);
-        let is_near = |eye: &Eye| distance_m(eye) <= nearest_m + low_m.distance(high_m);
-        let first = self.eyes.iter().position(is_near).unwrap_or(0);
-        let last = self.eyes.iter().rposition(is_near).unwrap_or(0);
-        first.saturating_sub(STRIDE) / STRIDE * STRIDE..(last + STRIDE).min(self.eyes.len())
+        let distance_m = |camera: &CameraPosition| camera.at_m.distance(0.5 * (low_m + high_m));
+        let nearest_m = self.cameras.iter().map(distance_m).fold(f64::INFINITY, f64::min);
+        let is_near =
+            |camera: &CameraPosition| distance_m(camera) <= nearest_m + low_m.distance(high_m);
+        let first = self.cameras.iter().position(is_near).unwrap_or(0);
+        let last = self.cameras.iter().rposition(is_near).unwrap_or(0);
+        first.saturating_sub(STRIDE) / STRIDE * STRIDE..(last + STRIDE).min(self.cameras.len())
     }
 
-    /// The nearest of some eyes.
-    fn nearest(&self, near: Range<usize>, point_m: DVec3) -> Eye {
-        let squared_m2 = |index: &usize| self.eyes[*index].at_m.distance_squared(point_m);
+    /// The nearest of some camera positions to a point.
+    fn nearest(&self, near: Range<usize>, point_m: DVec3) -> CameraPosition {
+        let squared_m2 = |index: &usize| self.cameras[*index].at_m.distance_squared(point_m);
         let by_distance = |a: &usize, b: &usize| squared_m2(a).total_cmp(&squared_m2(b));
         let coarse = near.clone().step_by(STRIDE).min_by(by_distance).unwrap_or(0);
-        let fine = coarse.saturating_sub(STRIDE)..(coarse + STRIDE).min(self.eyes.len());
-        self.eyes[fine.min_by(by_distance).unwrap_or(coarse)]
+        let fine = coarse.saturating_sub(STRIDE)..(coarse + STRIDE).min(self.cameras.len());
+        self.cameras[fine.min_by(by_distance).unwrap_or(coarse)]
     }
 
-    fn sight(&self, near: Range<usize>, mean_m: DVec3) -> Sight {
+    fn viewing_ray(&self, near: Range<usize>, mean_m: DVec3) -> ViewingRay {
         let nearest = self.nearest(near, mean_m);
-        let (least_m, times) = BEFORE;
-        let before_m = least_m + times * nearest.at_m.distance(mean_m);
-        let station_m = nearest.station_m - before_m.min(BEFORE_MOST_M);
-        let at = self.eyes.partition_point(|eye| eye.station_m < station_m);
-        let seen = self.eyes[at.min(self.eyes.len() - 1)];
+        let behind_m =
+            VIEWED_FROM_BEHIND_M + VIEWED_FROM_BEHIND_PER_M * nearest.at_m.distance(mean_m);
+        let station_m = nearest.station_m - behind_m.min(VIEWED_FROM_BEHIND_MAX_M);
+        let at = self.cameras.partition_point(|camera| camera.station_m < station_m);
+        let seen = self.cameras[at.min(self.cameras.len() - 1)];
         let along = (nearest.at_m - seen.at_m).normalize_or(seen.left.cross(DVec3::Z));
         let aside = ((mean_m - seen.at_m).dot(seen.left) / 4.0).clamp(-1.0, 1.0);
-        let eye_m = seen.at_m + BESIDE_M * aside * seen.left;
-        let ray_m = mean_m - eye_m;
-        Sight { eye_m, ray_m, normal: along.cross(ray_m).normalize_or(DVec3::Z) }
+        let camera_m = seen.at_m + SIDE_CAMERA_M * aside * seen.left;
+        let ray_m = mean_m - camera_m;
+        ViewingRay { camera_m, ray_m, normal: along.cross(ray_m).normalize_or(DVec3::Z) }
     }
 
-    /// Appends a Gaussian with its damage, and perhaps a sheet before it, or nothing.
+    /// Appends a Gaussian with its damage, and perhaps a sheet in front of it, or nothing.
     fn spoil(&self, near: Range<usize>, whole: &Gaussians, index: usize, out: &mut Gaussians) {
         let mean_m = whole.means_m[index];
         let key = mean_m.iter().fold(self.seed, |key, m| mix(key ^ m.to_bits()));
@@ -163,12 +169,12 @@ impl Spoil {
         }
         out.push_from(whole, index);
         let at = out.len() - 1;
-        let sight = self.sight(near, DVec3::from_array(mean_m));
-        let ray = sight.ray_m.normalize_or(DVec3::X);
-        let axes = DMat3::from_cols(ray, sight.normal.cross(ray), sight.normal);
+        let viewing = self.viewing_ray(near, DVec3::from_array(mean_m));
+        let ray = viewing.ray_m.normalize_or(DVec3::X);
+        let axes = DMat3::from_cols(ray, viewing.normal.cross(ray), viewing.normal);
 
         let growth = 1.0 + MOVED * self.amount * self.patch(1, mean_m);
-        let moved_m = (sight.eye_m + growth * sight.ray_m).to_array();
+        let moved_m = (viewing.camera_m + growth * viewing.ray_m).to_array();
         if cell_at(&moved_m) == cell_at(&mean_m) {
             // As large in the image as before.
             out.means_m[at] = moved_m;
@@ -176,16 +182,16 @@ impl Spoil {
         }
 
         let strength = self.amount * TINT * TINT_LEAST.powf(random.unit());
-        let (grey, patch) = TINT_SHARED;
-        let mixed =
-            |stream: u64, own: f64| patch * 2.0 * self.patch(stream, mean_m) + (1.0 - patch) * own;
+        let mixed = |stream: u64, own: f64| {
+            TINT_PATCH * 2.0 * self.patch(stream, mean_m) + (1.0 - TINT_PATCH) * own
+        };
         let own = random.range(-1.0, 1.0);
         let first = at * 3 * sh::coefficients(out.sh_degree);
         for channel in 0..3 {
             let channels_own = random.range(-1.0, 1.0);
-            let change =
-                grey * mixed(2, own) + (1.0 - grey) * mixed(3 + channel as u64, channels_own);
-            let slope = strength * change / sh::C1 * sight.normal;
+            let change = TINT_GREY * mixed(2, own)
+                + (1.0 - TINT_GREY) * mixed(3 + channel as u64, channels_own);
+            let slope = strength * change / sh::C1 * viewing.normal;
             // The basis of degree 1 is C1 (-y, z, -x).
             for (coefficient, value) in [-slope.y, slope.z, -slope.x].into_iter().enumerate() {
                 out.sh[first + 3 * (coefficient + 1) + channel] += value as f32;
@@ -201,10 +207,10 @@ impl Spoil {
         }
         if random.chance(SHEETS * self.amount) {
             let share = random.range(0.5, 0.95);
-            let sheet_m = (sight.eye_m + share * sight.ray_m).to_array();
+            let sheet_m = (viewing.camera_m + share * viewing.ray_m).to_array();
             if cell_at(&sheet_m) == cell_at(&mean_m) {
                 let at_15_m = SHEET_M * random.range(0.5, 1.5);
-                let long_m = at_15_m * (sight.ray_m.length() / 15.0).clamp(0.3, 2.0);
+                let long_m = at_15_m * (viewing.ray_m.length() / 15.0).clamp(0.3, 2.0);
                 out.push_from(whole, index);
                 out.means_m[at + 1] = sheet_m;
                 shape(out, at + 1, axes, [long_m, 0.5 * long_m, 0.002]);

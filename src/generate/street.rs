@@ -13,7 +13,7 @@ use super::{Street, StreetSettings, backdrop};
 
 /// Middle of the parking bays, in metres from the centre line.
 const BAY_T_M: f64 = 4.78;
-/// Where trees, lamps and signs stand, in metres from the centre line.
+/// Distance of trees, lamps and signs from the centre line, in metres.
 const FURNITURE_T_M: f64 = KERB_M + 0.75;
 /// No cars or trees this close to the middle of the crossing, in metres.
 const CLEAR_M: f64 = 15.0;

@@ -18,7 +18,7 @@ const THICKNESS_M: f64 = 0.004;
 /// Factor by which cells grow from an edge inwards: they are fine where colours meet and coarse in between.
 const GROWTH: f64 = 1.9;
 
-/// How a surface looks.
+/// The appearance of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Paint {
     /// Display colour of the material in white light, 0 to 1.
@@ -37,17 +37,17 @@ impl Paint {
         Self { rgb: DVec3::new(r, g, b), gloss: 0.0, open: 1.0, glows: false }
     }
 
-    /// The same, with a reflection of the sky.
+    /// This paint with a reflection of the sky.
     pub(super) const fn gloss(self, gloss: f64) -> Self {
         Self { gloss, ..self }
     }
 
-    /// The same, brighter or darker.
+    /// This paint, brighter or darker.
     pub(super) fn times(self, factor: f64) -> Self {
         Self { rgb: self.rgb * factor, ..self }
     }
 
-    /// The same, where surroundings block some of the light.
+    /// This paint where the surroundings block some of the light.
     pub(super) fn open(self, open: f64) -> Self {
         Self { open: self.open * open, ..self }
     }
@@ -72,7 +72,7 @@ pub(super) struct Patch {
 /// Collects the street's Gaussians.
 #[derive(Debug)]
 pub(super) struct Painter<'a> {
-    /// What was painted so far; SH degree 1.
+    /// The Gaussians that have been painted; SH degree 1.
     pub(super) gaussians: Gaussians,
     light: &'a Light,
     /// Spacing of everything, as a factor: above 1 is coarser.
@@ -92,7 +92,7 @@ impl<'a> Painter<'a> {
         }
     }
 
-    /// The same for an object that is seen from near by: with `detail` times as many cells along every edge.
+    /// A canvas for an object that is seen from near by, with `detail` times as many cells along every edge.
     pub(super) fn detailed(light: &'a Light, detail: usize) -> Self {
         Self { spacing: 1.0 / detail as f64, detail, ..Self::new(light, 1.0) }
     }
@@ -249,7 +249,7 @@ impl<'a> Painter<'a> {
 /// Colour of the mirrored sky.
 const MIRRORED_SKY: DVec3 = DVec3::new(0.80, 0.90, 1.0);
 
-/// How the mirrored sky changes with the viewing direction `d`, as a vector to dot it with.
+/// Change of the mirrored sky with the viewing direction `d`, as a vector that is multiplied by `d` (dot product).
 ///
 /// A surface with normal n reflects more at grazing angles, where d·n rises from -1 to 0. The more the
 /// viewing direction rises along the surface, the higher and brighter is the reflected part of the sky.

@@ -16,7 +16,7 @@ pub fn release_free_memory() {
     #[expect(unsafe_code, reason = "a function of the C library that the standard library lacks")]
     // SAFETY: `malloc_trim` takes a number of bytes and locks the heap itself. Any thread may call it at any time.
     unsafe {
-        // The result says whether there was anything to give back.
+        // The result says whether any memory was returned; it is not needed.
         let _ = libc::malloc_trim(0);
     }
 }

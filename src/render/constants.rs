@@ -18,8 +18,8 @@ pub const MAX_INSTANCES: u64 = 1 << 27;
 /// because alpha decides per pixel.
 pub const EXTENT_SLACK_PX: f32 = 2e-3;
 
-/// How far beyond the image's edges the projection is still linearised at the centre itself, in half-widths
-/// of the image. Farther out the slope is clamped (gsplat's `persp_proj`; the code of Kerbl et al. 2023 has
+/// Distance beyond the image's edges up to which the projection is linearised at the centre itself, in
+/// half-widths of the image. Farther out the slope is clamped (gsplat's `persp_proj`; the code of Kerbl et al. 2023 has
 /// the same rule for a centred principal point).
 pub const SLOPE_SLACK: f64 = 0.3;
 

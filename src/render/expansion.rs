@@ -1,4 +1,4 @@
-//! When the expansion of a camera around a Gaussian's centre stands for the six points of the unscented transform.
+//! When the expansion of a camera around a Gaussian's centre replaces the six points of the unscented transform.
 //!
 //! The expansion has all terms of second order in the size of a Gaussian: they shift the mean and widen the
 //! covariance. The six points have terms of higher order as well, which matter only for Gaussians that are large for
@@ -9,7 +9,7 @@
 //! With standard deviations as shares of the distance, `s` the largest and `Σ` the sum of their squares, the bound is
 //!
 //! ```text
-//! second Σ + third s³ + what a shutter adds
+//! second Σ + third s³ + term of a rolling shutter
 //! ```
 //!
 //! - `third`: a column of the covariance's root has `t₁(v) + 3 t₃(v)`, where `t₁` and `t₃` are the terms of first and
@@ -69,13 +69,13 @@ impl ExpansionBound {
 struct FieldBounds {
     /// Most pixels per radian, or per unit of slope.
     px_per_rad: f64,
-    /// Of second derivatives that the expansion leaves out.
+    /// Bound of second derivatives that the expansion leaves out.
     second_px: f64,
-    /// Of terms of third order.
+    /// Bound of terms of third order.
     third_px: f64,
 }
 
-/// The largest angle off the axis that the image shows, and a margin for Gaussians beside it, in radians.
+/// The largest angle off the axis that the image shows, and a margin for Gaussians outside of it, in radians.
 fn max_seen_rad(camera: &Camera) -> f64 {
     camera.limit_rad().min(1.25 * camera.corner_rad() + 0.1)
 }
@@ -119,7 +119,7 @@ fn slopes(camera: &Camera) -> FieldBounds {
         bounds.second_px = bounds.second_px.max(0.5 * bend);
     }
     bounds.third_px = 0.6 * bounds.px_per_rad;
-    // What is rounding and not a distortion.
+    // Differences that are rounding errors and not distortion.
     if bare.is_pinhole() {
         bounds.second_px = 0.0;
     }

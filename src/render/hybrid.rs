@@ -65,7 +65,7 @@ fn render_split(
     Ok(stats)
 }
 
-/// How close the images of the gpu backend are to those of the cpu backend, by the number of stages that run
+/// PSNR of the images of the gpu backend against those of the cpu backend, by the number of stages that run
 /// on the cpu.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bisection {
@@ -106,7 +106,7 @@ pub fn bisect(cpu: &Cpu, gpu: &Gpu, frame: &Frame<'_>) -> Result<Bisection, Rend
 impl Bisection {
     /// The name of the gpu stage that is wrong; `None` if every image is right.
     ///
-    /// Of the images that are wrong it takes the one with the most stages on the cpu: the first stage that
+    /// Among the images that are wrong it takes the one with the most stages on the cpu: the first stage that
     /// the gpu ran for it is the faulty one.
     pub fn wrong(&self) -> Option<&'static str> {
         let is_right = |(_, db): &&(Option<Stage>, f64)| *db >= MIN_PSNR_DB;
@@ -143,7 +143,7 @@ impl Images {
         let rgb8 = self.rgb8.iter().flatten().zip(truth.rgb8.iter().flatten());
         let linear = psnr_db(rgba.map(|(&a, &b)| f64::from(a - b)));
         let rounded = psnr_db_u8(rgb8);
-        // A NaN counts as wrong, whatever the other is.
+        // A NaN counts as wrong, whatever the other value is.
         if linear < rounded || linear.is_nan() { linear } else { rounded }
     }
 }

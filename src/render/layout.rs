@@ -44,7 +44,7 @@ pub struct Cutoffs {
     pub near_m: f32,
     /// Farthest z, in metres.
     pub far_m: f32,
-    /// Whether opacity is scaled down by what the blur adds to a splat's area.
+    /// Whether opacity is scaled down in proportion to the area that the blur adds to a splat.
     pub antialiased: bool,
     /// Largest alpha.
     pub alpha_cap: f32,
@@ -83,7 +83,7 @@ impl Cutoffs {
     }
 }
 
-/// What a view adds to the diagonal of screen covariances, along x and y, in px².
+/// The variances that a view adds to the diagonal of screen covariances, along x and y, in px².
 ///
 /// The blur of a profile belongs to pixels of the camera's native size: a twin is trained on these. A pixel of
 /// an image whose sides are `s` times the native ones is the mean of native pixels. Their splats have the
@@ -95,12 +95,12 @@ impl Cutoffs {
 /// part of a pixel, but blending multiplies what the layers let through as if their parts were independent, and
 /// so lets through too little. Measured best on two scenes at a half, a third and a quarter of the size: a
 /// spread of `(1 - s²)/15`, and a peak lower by the power 3/4 of the determinants' ratio instead of 1/2. That is
-/// 1.3 to 2.2 dB better, and costs a splat that lies alone part of its sum (BENCHMARKS.md, "Small images").
+/// 1.3 to 2.2 dB better, and makes a single splat lose a part of its sum (BENCHMARKS.md, "Small images").
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PixelFilter {
     /// The profile's blur of native pixels.
     pub native_px2: DVec2,
-    /// The same, and the spread of the native pixels that one pixel averages.
+    /// This blur plus the spread of the native pixels that one pixel averages.
     pub total_px2: DVec2,
 }
 
@@ -115,7 +115,7 @@ pub(super) struct Filtered {
     pub(super) det: f64,
     /// Determinant before the blur of native pixels as a share of the one after it.
     pub(super) blur_share: f64,
-    /// That after the blur of native pixels as a share of the one after the whole filter: 1 in a native image.
+    /// Determinant after the blur of native pixels as a share of the one after the whole filter: 1 in a native image.
     pub(super) shrink_share: f64,
 }
 
@@ -159,7 +159,7 @@ impl PixelFilter {
         }
     }
 
-    /// The same with its variances rounded to f32, as the fast backends have them.
+    /// This covariance with its variances rounded to f32, as the fast backends have them.
     pub(super) fn rounded(&self) -> Self {
         let round = |px2: DVec2| px2.as_vec2().as_dvec2();
         Self { native_px2: round(self.native_px2), total_px2: round(self.total_px2) }
@@ -189,7 +189,7 @@ pub struct ChunkView {
     pub center_px: [f32; 2],
     /// Image size, in pixels.
     pub size_px: [f32; 2],
-    /// What is added to screen covariances.
+    /// The variances that are added to screen covariances.
     pub filter: PixelFilter,
     /// Smallest slope x/z and y/z at which the projection is linearised.
     pub slope_min: [f32; 2],
@@ -261,7 +261,7 @@ impl ChunkShadow {
         let half_m = 0.5 * (max_m - min_m);
         (0..3).all(|axis| {
             let row = Vec4::from_array(self.actor_from_chunk[axis]);
-            // Beyond any rounding error: 1e-5 m at 100 m.
+            // Larger than any rounding error, which is 1e-5 m at 100 m.
             let spread_m = row.truncate().abs().dot(half_m) + 1e-3;
             row.dot(center_m).abs() <= self.reach_m[axis] + spread_m
         })
@@ -291,8 +291,8 @@ impl ChunkShadow {
 /// `fx x/z + cx + k s (fx/z) √(1 + t²) + k √blur < 0`, where `s` is its largest standard deviation, `t` its
 /// clamped slope, `k` the extent in standard deviations and `blur` that of the [`PixelFilter`]: `√cov_xx` is
 /// at most `(fx/z) √(1 + t²) s + √blur`. Multiplied by `z/fx` the condition is linear in the centre:
-/// `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The other edges are alike. Near and far have no width,
-/// since only centres are compared with them.
+/// `x + ((cx + k √blur)/fx) z + k s √(1 + t²) < 0`. The other edges are analogous. Near and far have no
+/// width, since only centres are compared with them.
 #[derive(Clone, Copy, Debug)]
 pub struct Frustum {
     planes: [Plane; 6],

@@ -42,7 +42,7 @@ use wildcity_scene::{Rays, RenderProfile, Rig, Scene};
 
 pub use view::{Readout, RollingShutter, View};
 
-/// What is rendered together: all views of one step.
+/// The input of a render call: all views of one step.
 #[derive(Clone, Copy, Debug)]
 pub struct Frame<'a> {
     /// The scene.
@@ -68,27 +68,27 @@ pub const MAX_VIEWS: usize = Rig::MAX_CAMERAS;
 #[derive(Debug, Default)]
 pub struct Target<'a> {
     /// `[height, width, 4]`: linear red, green and blue of the Gaussians (premultiplied) over the sky or the
-    /// background; and the opacity of the Gaussians alone.
+    /// background; and the opacity of the Gaussians only.
     pub rgba: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: the same colours, clamped to [0, 1] and rounded to 8 bits.
     pub rgb8: Option<&'a mut [u8]>,
     /// `[height, width]`: expected depth ([`Camera::depth_m`]: z, or the distance for a lens that may see 90°
     /// and more) in metres, 0 where opacity is 0.
     pub depth_m: Option<&'a mut [f32]>,
-    /// `[height, width]`: accumulated opacity, which tells how valid the depth is.
+    /// `[height, width]`: accumulated opacity, a measure of the validity of the depth.
     pub opacity: Option<&'a mut [f32]>,
     /// `[height, width, 3]`: unit normals of the surfaces of `depth_m`, which is then required, too. They are
     /// in the camera's axes and point towards the camera; 0 where there is no depth.
     pub normals: Option<&'a mut [f32]>,
-    /// `[height, width]`: whose Gaussian brings the transmittance to a half or less: 0 none, [`TWIN_INSTANCE`] the
-    /// twin, and actor `k` is `k` + [`FIRST_ACTOR_INSTANCE`].
+    /// `[height, width]`: owner of the Gaussian that brings the transmittance to a half or less: 0 none,
+    /// [`TWIN_INSTANCE`] the twin, and `k` + [`FIRST_ACTOR_INSTANCE`] actor `k`.
     pub instances: Option<&'a mut [u16]>,
     /// The camera's exposure and overlay, applied to `rgba` and `rgb8`.
     pub appearance: Option<&'a Appearance>,
 }
 
 impl Target<'_> {
-    /// The last step of every backend: masks what the lens does not see, and computes normals.
+    /// The last step of every backend: masks pixels outside of the lens' field, and computes normals.
     fn finish(&mut self, view: &View) {
         self.mask(&view.camera);
         if let (Some(depth_m), Some(normals)) = (&self.depth_m, &mut self.normals) {
@@ -129,7 +129,7 @@ pub struct FrameStats {
     pub instances: u64,
     /// Number of Gaussian-pixel evaluations of the rasterizer, with those of idle lanes.
     pub evaluations: u64,
-    /// The most that was held in the machine's memory between two stages, in bytes. 0 if the backend does not count it.
+    /// Largest size of the intermediate buffers in the machine's memory, in bytes. 0 if the backend does not count it.
     pub held_bytes: u64,
 }
 
@@ -181,12 +181,12 @@ pub enum RenderError {
         /// Width and height of the image.
         wanted: [u32; 2],
     },
-    /// The number of targets is not that of views.
+    /// The number of targets differs from the number of views.
     #[error("{targets} targets for {views} views; each view needs its own")]
     Targets {
-        /// How many targets were given.
+        /// Number of targets.
         targets: usize,
-        /// How many views.
+        /// Number of views.
         views: usize,
     },
     /// The frame exceeds a limit of the backend.
@@ -197,15 +197,15 @@ pub enum RenderError {
         /// The largest number that fits.
         limit: u64,
     },
-    /// The scene alone exceeds the memory that the device may use.
+    /// The scene by itself exceeds the memory that the device may use.
     #[error(
         "the scene takes at least {needed_bytes} bytes of the GPU's memory and {limit_bytes} are \
          allowed: allow more with --gpu-memory-gib, or draw less with the profile's tau_px and reach_m"
     )]
     DeviceMemory {
-        /// What its Gaussians take, without the unused ends of pages.
+        /// Memory of its Gaussians, without the unused ends of pages.
         needed_bytes: u64,
-        /// What they may take at most.
+        /// Largest memory that they may take.
         limit_bytes: u64,
     },
     /// The sky cannot be drawn as the profile asks.
@@ -262,17 +262,17 @@ pub trait Backend: Send + Sync {
         false
     }
 
-    /// Limits what it holds between the stages of a frame, in bytes. With less memory a frame is drawn in more parts, one
-    /// after the other; its images do not depend on it.
+    /// Limits the intermediate buffers between the stages of a frame, in bytes. With less memory a frame is drawn in
+    /// more parts, one after the other; its images do not depend on the limit.
     fn limit_frame_bytes(&self, _bytes: u64) {}
 
-    /// The most that it holds in the machine's memory between the stages of a frame of these views, whatever the scene,
+    /// Upper bound of its intermediate buffers in the machine's memory for a frame of these views, whatever the scene,
     /// in bytes.
     fn frame_bytes(&self, _views: &[View]) -> u64 {
         0
     }
 
-    /// As [`Backend::frame_bytes`], of a small frame that is rendered while a large one is.
+    /// As [`Backend::frame_bytes`], for a small frame that is rendered while a large one is.
     fn bytes_beside(&self, _views: &[View]) -> u64 {
         0
     }

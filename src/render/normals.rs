@@ -55,7 +55,7 @@ pub(super) fn write(view: &View, depth_m: &[f32], normals: &mut [f32]) {
                         (None, None) => None,
                     };
                     let facing = of_plane.unwrap_or_else(|| -point.ray.normalize_or_zero());
-                    // Of the two normals, the one that points towards the camera.
+                    // Take the normal that points towards the camera.
                     if facing.dot(point.ray) > 0.0 { -facing } else { facing }
                 });
                 normal.copy_from_slice(&normal_here.unwrap_or_default().as_vec3().to_array());

@@ -37,19 +37,20 @@ impl Stage {
 /// of bin requires both.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StageOutputs {
-    /// Of project: all views' splats, in order of (view, global id).
+    /// Output of project: all views' splats, in order of (view, global id).
     pub splats: Vec<Splat>,
     /// The sort key of each splat: [`Cutoffs::sort_key`](super::layout::Cutoffs::sort_key).
     pub keys: Vec<u32>,
-    /// Of sort: indices of splats in order of their keys, equal keys in order of indices.
+    /// Output of sort: indices of splats in order of their keys, equal keys in order of indices.
     pub order: Option<Vec<u32>>,
-    /// Of bin.
+    /// Output of bin.
     pub tiles: Option<TileLists>,
-    /// Of project: whose splats they are, for instance ids; in order of `first_splat`. The gpu backend gives none.
+    /// Output of project: the owners of the splats, for instance ids, in order of `first_splat`. Empty on the gpu
+    /// backend.
     pub owners: Vec<SplatOwner>,
 }
 
-/// Whose splats begin at a place of [`StageOutputs::splats`].
+/// The owner of the splats from a place of [`StageOutputs::splats`] on.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SplatOwner {
     /// Index of the first splat.

@@ -3,7 +3,7 @@
 //!
 //! Six points at √3 standard deviations along a Gaussian's axes are projected as points. Their mean is the
 //! splat's mean, and their scatter its covariance, each point with weight 1/6 (Julier and Uhlmann 1997; for
-//! Gaussians and such cameras Wu et al. 2024, 3DGUT). The rest of the chain is that of a pinhole.
+//! Gaussians and such cameras Wu et al. 2024, 3DGUT). The other stages are those of a pinhole.
 //!
 //! **The centre has no weight.** Of the weights that are exact for a linear camera, this is the choice where
 //! all are positive, so nothing cancels, and the covariance keeps a root of six columns. The squares of the
@@ -32,8 +32,8 @@ use wildcity_scene::RenderProfile;
 use wildcity_scene::geometry::camera::{FieldCone, ScaleWithin, WIDEST_RAD};
 use wildcity_scene::geometry::{Camera, Pose};
 
-/// How far beyond the lens' field a centre may lie and still be drawn, in radians: as far as a pinhole of 62°
-/// draws Gaussians beside its image, up to its camera plane.
+/// Largest angle of a centre beyond the lens' field at which it is still drawn, in radians: as far as a pinhole
+/// of 62° draws Gaussians outside of its image, up to its camera plane.
 pub const FIELD_MARGIN_RAD: f64 = 0.5;
 
 /// A view that is not a static pinhole, ready to project many Gaussians.
@@ -76,23 +76,23 @@ pub struct Footprint {
 /// off the axis, so `reach` is a bound within the narrowest of some cones that has all points.
 #[derive(Clone, Copy, Debug)]
 pub struct CullBound {
-    /// How far off the axis a centre may lie and still be drawn, in radians.
+    /// Largest angle off the axis at which a centre is still drawn, in radians.
     pub max_center_rad: f64,
     /// The cosine of that angle.
     pub max_center_cos: f64,
-    /// How far off the axis the image's corner is, in radians.
+    /// Angle of the image's farthest corner off the axis, in radians.
     pub image_rad: f64,
     /// Least pixels per radian between a point and the image.
     pub least_px_per_rad: f64,
     /// Farthest reach of splats with all their points in a cone, from the narrowest cone to the widest.
     pub reaches: [ReachWithin; FieldCone::SCALES],
-    /// What the blur adds to the reach, in pixels.
+    /// Contribution of the blur to the reach, in pixels.
     pub blur_px: f64,
-    /// Most that a windshield changes the angle between two rays, in radians; 0 without one.
+    /// Largest change of the angle between two rays by a windshield, in radians; 0 without one.
     pub windshield_rad: f64,
-    /// How far the camera moves during the exposure, in metres.
+    /// Distance that the camera moves during the exposure, in metres.
     pub translation_m: f64,
-    /// How far the camera rotates during the exposure, in radians.
+    /// Angle by which the camera rotates during the exposure, in radians.
     pub rotation_rad: f64,
 }
 
@@ -148,7 +148,7 @@ impl<'a> UnscentedView<'a> {
         })
     }
 
-    /// The same camera elsewhere, or in other motion: only what depends on its poses is computed again.
+    /// This camera at another pose or in another motion: only values that depend on its poses are computed again.
     pub fn moved<'b>(&self, view: &'b View) -> UnscentedView<'b> {
         let [translation_m, rotation_rad] = motion(view);
         UnscentedView {
@@ -174,7 +174,7 @@ impl<'a> UnscentedView<'a> {
     /// `None` if it cannot be seen.
     #[inline(always)]
     pub fn project(&self, mean_m: DVec3, axes_m: DMat3) -> Option<Footprint> {
-        // The centre: culled beside the image, before near, beyond far, and far outside of the field.
+        // The centre: culled outside of the image, nearer than near, beyond far, and far outside of the field.
         let [near_m, far_m] = self.range_m;
         let sigma_m =
             axes_m.x_axis.length().max(axes_m.y_axis.length()).max(axes_m.z_axis.length());
@@ -214,7 +214,7 @@ impl<'a> UnscentedView<'a> {
         &self.cull_bound
     }
 
-    /// When an expansion stands for the six points; `None` if never.
+    /// When an expansion replaces the six points; `None` if never.
     pub fn expansion_bound(&self) -> Option<&ExpansionBound> {
         self.expansion_bound.as_ref()
     }
@@ -265,7 +265,7 @@ impl<'a> UnscentedView<'a> {
     }
 }
 
-/// How far a view's camera moves during the exposure, in metres, and by how many radians it rotates.
+/// The distance that a view's camera moves during the exposure, in metres, and the angle of its rotation in radians.
 fn motion(view: &View) -> [f64; 2] {
     let Some(RollingShutter { world_from_camera_first: first, .. }) = &view.rolling_shutter else {
         return [0.0; 2];
@@ -274,7 +274,7 @@ fn motion(view: &View) -> [f64; 2] {
     [first.position_m.distance(last.position_m), first.rotation.angle_between(last.rotation)]
 }
 
-/// How far off the axis a centre may lie and still be drawn, in radians.
+/// Largest angle off the axis at which a centre is still drawn, in radians.
 pub fn max_center_angle_rad(camera: &Camera) -> f64 {
     (camera.limit_rad() + FIELD_MARGIN_RAD).min(WIDEST_RAD)
 }

@@ -17,8 +17,8 @@ pub struct View {
     /// The camera's motion while its rows are exposed; `None` if all are exposed at once, or the camera is at
     /// rest.
     pub rolling_shutter: Option<RollingShutter>,
-    /// How its rows are exposed, if one after the other: also a camera at rest sees actors move meanwhile. Without
-    /// it, that of `rolling_shutter`.
+    /// How its rows are exposed, if one after the other: actors move during the exposure even if the camera is at
+    /// rest. Without it, as in `rolling_shutter`.
     pub readout: Option<Readout>,
 }
 
@@ -40,9 +40,9 @@ pub struct RollingShutter {
     pub world_from_camera_first: Pose,
 }
 
-/// A rolling shutter relative to the camera's frame at the end of the exposure, so that f32 loses little:
-/// what remains of the exposure, and of the camera's motion, while a place of the image is exposed. The
-/// motion is that of [`Pose::interpolate`].
+/// A rolling shutter relative to the camera's frame at the end of the exposure, so that f32 loses little: the
+/// remaining part of the exposure, and of the camera's motion, while a place of the image is exposed. The motion
+/// is that of [`Pose::interpolate`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ShutterMotion {
     /// `[a, b, c]`: at (x, y) of the image, in pixels, the fraction `a x + b y + c` of the exposure remains,
@@ -50,7 +50,7 @@ pub(super) struct ShutterMotion {
     pub(super) remaining: [f64; 3],
     /// The camera's translation during the whole exposure, in metres, in world axes.
     pub(super) translation_world_m: DVec3,
-    /// The same in the camera's frame at the end of the exposure.
+    /// This translation in the camera's frame at the end of the exposure.
     pub(super) translation_m: DVec3,
     /// Unit axis of the camera's rotation during the exposure, in its own frame.
     pub(super) axis: DVec3,
@@ -61,7 +61,7 @@ pub(super) struct ShutterMotion {
 /// A point of the world on the image of a camera that may move.
 #[derive(Clone, Copy, Debug)]
 pub struct ProjectedPoint {
-    /// Its place on the image or beside it, in pixels.
+    /// Its position in pixels, which may be outside of the image.
     pub at_px: DVec2,
     /// When it is exposed, as a fraction of the exposure: 0 with the first row, 1 with the last.
     pub fraction: f64,
@@ -123,7 +123,7 @@ impl View {
         durations.map(|shutter| shutter.duration_us).max().unwrap_or(0)
     }
 
-    /// The same view from an actor's axes: how the camera sees the Gaussians of a placed chunk.
+    /// This view from an actor's axes: how the camera sees the Gaussians of a placed chunk.
     ///
     /// The camera's motion relative to the actor is taken as that of [`Pose::interpolate`] between its ends. This is
     /// exact for an actor that does not turn. For one that turns by an angle α during the exposure, the camera's arc
@@ -204,7 +204,7 @@ impl View {
     /// by. Where an object passes so close that a round leaves more than half of the error, the interval
     /// between a moment that is too early and one that is too late is halved instead. An object that moves
     /// over the image as fast as the rows are read may have several solutions; it is found on one of them, or
-    /// beside the image.
+    /// outside of the image.
     #[inline(always)]
     pub fn project_extrapolated(&self, world_m: DVec3, first_guess: f64) -> ProjectedPoint {
         let project_at = |fraction: f64, world_from_camera: Pose| {
@@ -255,7 +255,7 @@ impl View {
         };
         let columns = along(width_px);
         let rows = along(height_px);
-        // The same for the opposite direction.
+        // Slope and offset for the opposite direction.
         let reversed =
             |[slope, start]: [f64; 2], size_px: u32| [-slope, start + slope * f64::from(size_px)];
         let remaining = match direction {
@@ -272,7 +272,7 @@ impl View {
         };
         let translation_world_m = last.position_m - first.position_m;
         let rotation = first.rotation.inverse() * last.rotation;
-        // Of the two quaternions of a rotation, the one with the smaller angle.
+        // Take the quaternion of the rotation that has the smaller angle; the other has the opposite sign.
         let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
         let sine = rotation.xyz().length();
         Some(ShutterMotion {

@@ -12,7 +12,7 @@ pub enum RepairError {
         file: PathBuf,
         /// The path of the field, such as `inputs[0].role`.
         field: String,
-        /// What is wrong, and what is accepted.
+        /// The error, and the accepted values.
         message: String,
     },
     /// There is no model of this name.
@@ -55,12 +55,12 @@ pub enum RepairError {
          libonnxruntime.so from version 1.18 on (pip install onnxruntime has one, in onnxruntime/capi)"
     )]
     RuntimeUnnamed,
-    /// The runtime library is not there, or is something else.
+    /// The runtime library does not exist, or is not an ONNX runtime.
     #[error("--onnxruntime {}: {message}", path.display())]
     Runtime {
         /// The library as named.
         path: PathBuf,
-        /// What is wrong, and what is accepted.
+        /// The error, and the accepted values.
         message: String,
     },
     /// Another runtime library is loaded already; a process has one.
@@ -105,7 +105,7 @@ pub enum RepairError {
     Input {
         /// The role of the input, or `image`.
         field: String,
-        /// What is wrong, and what is accepted.
+        /// The error, and the accepted values.
         message: String,
     },
     /// An output has another shape than the manifest promises.
@@ -129,9 +129,9 @@ pub enum RepairError {
     NotFinite {
         /// The name of the output.
         output: String,
-        /// How many values are not finite.
+        /// Number of values that are not finite.
         count: usize,
-        /// How many values there are.
+        /// Number of all values.
         of: usize,
     },
     /// A run took too long and was stopped; the model is usable again.
@@ -145,7 +145,7 @@ pub enum RepairError {
     /// The model ran too long too often, or did not stop. It is not used again.
     #[error("the model is withdrawn: {reason}; load it again")]
     Withdrawn {
-        /// What happened.
+        /// The reason.
         reason: String,
     },
     /// The runtime failed.
@@ -157,7 +157,7 @@ pub enum RepairError {
     /// The model cannot be cut into tiles.
     #[error("size.fit: tiles are refused: {message}; use \"resize\" or \"pad\"")]
     Tiles {
-        /// What the probe showed.
+        /// The result of the probe.
         message: String,
     },
 }

@@ -1,5 +1,5 @@
-//! Reads the files of a model. What is hashed is what runs: each file is read once, and the session is built
-//! from those bytes. A file that is replaced afterwards changes nothing until the model is loaded again.
+//! Reads the files of a model. The hash covers the bytes that run: each file is read once, and the session is
+//! built from those bytes. A file that is replaced afterwards changes nothing until the model is loaded again.
 
 use std::fs;
 use std::io::Read;
@@ -17,7 +17,7 @@ pub(crate) struct ModelFiles {
     pub(crate) graph: GraphFiles,
 }
 
-/// What a session is built from.
+/// The files from which a session is built.
 pub(crate) struct GraphFiles {
     /// The .onnx file.
     pub(crate) path: PathBuf,
@@ -26,7 +26,7 @@ pub(crate) struct GraphFiles {
     pub(crate) weights: Vec<(String, Arc<[u8]>)>,
 }
 
-/// Reads a manifest alone.
+/// Reads only a manifest.
 pub(crate) fn read_manifest(path: &Path) -> Result<Manifest, RepairError> {
     Manifest::parse(&read_text(path)?, path)
 }
@@ -84,7 +84,7 @@ fn read_at_most(path: &Path, limit: u64) -> Result<Vec<u8>, RepairError> {
     Ok(bytes)
 }
 
-/// Whether a runtime library can be there at all: a clear message before the loader's.
+/// The absolute path of the runtime library. Checks that it is a file, for a clearer message than the loader's.
 pub(crate) fn check_library(path: &Path) -> Result<PathBuf, String> {
     let absolute =
         fs::canonicalize(path).map_err(|error| format!("{error}; name a libonnxruntime.so"))?;

@@ -8,7 +8,7 @@ use crate::resample::{Kernel, resample};
 
 /// The size in which the model sees an image.
 pub(crate) struct Fitted {
-    /// What the model gets.
+    /// The size that the model gets.
     pub(crate) height: usize,
     pub(crate) width: usize,
     /// The part of it that is the image; the rest is padding.
@@ -17,7 +17,7 @@ pub(crate) struct Fitted {
 }
 
 impl Fitted {
-    /// Of an image of a height and a width.
+    /// The size for an image of a height and a width.
     pub(crate) fn of(size: &Size, [height, width]: [usize; 2]) -> Result<Fitted, RepairError> {
         let fixed = size.fixed.map(|sides| sides.map(|side| side as usize));
         let multiple = size.multiple();
@@ -53,12 +53,12 @@ impl Fitted {
             true => resample(&planes, self.height, self.width, Kernel::Lanczos3),
             false => planes.padded(self.height, self.width),
         };
-        // Rounded here, so that a residual is against what the model got.
+        // Rounded here, so that a residual is relative to the values that the model got.
         if dtype == Dtype::F16 { fitted.rounded_to_f16() } else { fitted }
     }
 }
 
-/// The multiples nearest to the aspect of an image with about so many pixels.
+/// The multiples of `multiple` nearest to an image's aspect ratio, with about `pixels` pixels.
 fn resized([height, width]: [usize; 2], pixels: f64, multiple: usize) -> [usize; 2] {
     let ratio = (pixels / (height as f64 * width as f64)).sqrt();
     let largest = MAX_SIDE_PX / multiple;

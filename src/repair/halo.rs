@@ -1,10 +1,10 @@
-//! How far a pixel of the output depends on the input, measured.
+//! Measures the halo: the distance within which a pixel of the output depends on the input.
 //!
 //! A NaN goes into one pixel of every input that has pixels. Sums and products carry it on whatever the other
 //! values are, so the outputs that become NaN are all that depend on that pixel. (A small change of the value
 //! may vanish in an activation and then shows too little.) With strides the answer depends on the phase of
-//! the pixel, so each is tried. An operation that swallows NaN would hide something: the caller compares tiles
-//! with the whole once, before it relies on the halo.
+//! the pixel, so each is tried. An operation that does not propagate NaN would hide a dependency, so the
+//! caller compares tiles with the whole image once, before it relies on the halo.
 
 use crate::error::RepairError;
 use crate::limits::MAX_HALO_PROBE_PX;
@@ -13,19 +13,19 @@ use crate::planes::Planes;
 /// Pixels in a row and in a column that are tried in a model of a fixed size: enough for strides up to 8.
 const FIXED_PHASES: usize = 8;
 
-/// How far the output depends on the input.
+/// The distance within which the output depends on the input.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Halo {
-    /// In pixels of the input, in each direction.
+    /// At most this number of pixels of the input, in each direction.
     Pixels(usize),
     /// On the whole image, or on more than the probe could show.
     Whole,
 }
 
-/// A model at work: planes of each input with pixels to planes of the output. NaN is no error here.
+/// Runs a model: planes of each input with pixels to planes of the output. A NaN in the output is not an error.
 pub(crate) type Run<'a> = dyn FnMut(&[Planes]) -> Result<Planes, RepairError> + 'a;
 
-/// What is probed.
+/// The model that is probed.
 pub(crate) struct Probe {
     /// Channels of each input with pixels, and its range.
     pub(crate) inputs: Vec<(usize, [f32; 2])>,
@@ -76,7 +76,7 @@ impl Probe {
         Ok(Halo::Pixels(halo))
     }
 
-    /// The same images every time: a pattern with all frequencies, in the range of each input.
+    /// Test images, equal in every call: a pattern with all frequencies, in the range of each input.
     pub(crate) fn images(&self, height: usize, width: usize) -> Vec<Planes> {
         let image = |(at, (channels, [black, white])): (usize, &(usize, [f32; 2]))| {
             let mut planes = Planes::zeros(*channels, height, width);
@@ -94,8 +94,8 @@ impl Probe {
     }
 }
 
-/// Largest distance of a NaN from the pixel, in pixels of the input. None if one is at the border: then more
-/// may lie beyond; or if there is none at all: then the model hides them.
+/// Largest distance of a NaN from the pixel, in pixels of the input. `None` if a NaN is at the border, because more may
+/// lie beyond it, or if there is no NaN, because the model then hides them.
 fn reach(output: &Planes, [y, x]: [usize; 2], scale: usize) -> Option<usize> {
     let mut reach = None;
     for channel in 0..output.channels {

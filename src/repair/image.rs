@@ -1,4 +1,4 @@
-//! Images, and what a model gets beside one.
+//! Images, and the maps that a model gets in addition to one.
 
 use crate::error::RepairError;
 use crate::limits::MAX_SIDE_PX;
@@ -21,15 +21,15 @@ impl Image {
     }
 }
 
-/// A rendered image and what else is known of it. A field is needed if the manifest has its role. All have
-/// the size of `rendered`; planes are row by row.
+/// A rendered image and its maps. A field is needed if the manifest has its role. All have the size of
+/// `rendered`; planes are row by row.
 #[derive(Clone, Copy, Debug)]
 pub struct View<'a> {
     /// The image to repair. Role `rgb` or `luma`.
     pub rendered: &'a Image,
-    /// A recorded image that is nearby.
+    /// A recorded image from nearby.
     pub reference: Option<&'a Image>,
-    /// Recorded images, brought into this view.
+    /// Recorded images, warped into this view.
     pub reference_warped: Option<&'a Image>,
     /// 1 where `reference_warped` has a value, else 0.
     pub reference_valid: Option<&'a [f32]>,
@@ -46,7 +46,7 @@ pub struct View<'a> {
 }
 
 impl<'a> View<'a> {
-    /// An image with nothing beside it.
+    /// An image without maps.
     pub fn new(rendered: &'a Image) -> Self {
         View {
             rendered,

@@ -1,14 +1,14 @@
 //! Repair of rendered images by an ONNX model: an image in, an image and two hashes out.
 //!
-//! A model is an .onnx file with a manifest beside it ([`Manifest`], `"format": "wildcity.repair/1"`). The
-//! manifest says what each input means (its role), which sizes the model takes, and how its output is merged
-//! with the image. [`Model::load`] checks all of it: names, types and ranks of the inputs, the hash of each
+//! A model is an .onnx file with a manifest in the same folder ([`Manifest`], `"format": "wildcity.repair/1"`). The
+//! manifest defines the meaning of each input (its role), the sizes that the model takes, and how its output is
+//! merged with the image. [`Model::load`] checks all of it: names, types and ranks of the inputs, the hash of each
 //! file, and a probe run (shape, NaN, time). [`Model::repair`] is a function: the same image gives the same
 //! bytes, with the cpu provider at any number of threads.
 //!
 //! Only `onnx.rs` names the runtime. The library is opened when the first model is loaded; without a model
-//! there is no thread, buffer or library. The package knows neither the renderer nor sessions; of a scene, it knows
-//! cameras and poses.
+//! there is no thread, buffer or library. The package depends neither on the renderer nor on sessions; from
+//! `wildcity-scene` it uses cameras and poses.
 //!
 //! | file | what it does |
 //! |---|---|
@@ -19,12 +19,12 @@
 //! | `planes`, `resample`, `roles` | images as planes of f32, their sizes, their ranges |
 //! | `tiles`, `halo` | windows of an image; how far a pixel of the output depends on the input |
 //! | `merge` | output of the model to an image |
-//! | `runner`, `probe`, `fitted` | runs of the graph; what they show at load; the size in which it sees an image |
+//! | `runner`, `probe`, `fitted` | runs of the graph; the probe run at load; the size in which it sees an image |
 //! | `model` | all of it in order |
-//! | `models` | the models that a program offers by name, each loaded when it is first asked for |
+//! | `models` | the models that a program offers by name, each loaded on its first use |
 //! | `network` | networks that measure images: a distance of two, or features of one |
 //! | `select` | which views of a step are repaired, by trust |
-//! | [`mod@reference`] | recorded images brought into a view by its depth |
+//! | [`mod@reference`] | recorded images warped into a view by its depth |
 
 mod error;
 mod files;

@@ -1,4 +1,4 @@
-//! The manifest of a model: what its inputs mean, which sizes it takes, how its output is merged.
+//! The manifest of a model: the meaning of its inputs, the sizes that it takes, and how its output is merged.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ pub struct Manifest {
     pub licence: String,
     /// The .onnx file, then files of external weights.
     pub files: Vec<ModelFile>,
-    /// Where the model may run. The first is the default; there is no fall-back to another.
+    /// The providers on which the model may run. The first is the default; there is no fall-back to another.
     pub providers: Vec<Provider>,
     /// GPU memory that the provider may take, in MiB.
     #[serde(default = "default_memory_mib")]
@@ -44,13 +44,13 @@ pub(crate) fn default_memory_mib() -> u32 {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelFile {
-    /// Beside the manifest: a name without folders.
+    /// Name in the manifest's folder.
     pub path: String,
     /// BLAKE3 of the content, 64 hexadecimal digits.
     pub blake3: String,
 }
 
-/// What computes.
+/// Execution providers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Provider {
@@ -58,7 +58,7 @@ pub enum Provider {
     Cpu,
     /// NVIDIA CUDA.
     Cuda,
-    /// NVIDIA TensorRT, and CUDA for what it does not take.
+    /// NVIDIA TensorRT, and CUDA for the nodes that it does not support.
     Tensorrt,
 }
 
@@ -85,10 +85,10 @@ pub struct Size {
     pub multiple_of: Option<u32>,
     /// How an image becomes such a size.
     pub fit: Fit,
-    /// Of `resize`: pixels that the model should see, about.
+    /// For `resize`: approximate number of pixels that the model should see.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pixels: Option<u32>,
-    /// Of `tile` with `multiple_of`: height and width of a tile, its halo included.
+    /// For `tile` with `multiple_of`: height and width of a tile, its halo included.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tile: Option<[u32; 2]>,
 }
@@ -111,7 +111,7 @@ pub enum Fit {
 pub enum Merge {
     /// The output is the image.
     Replace,
-    /// rendered + (output - what the model got): a model that changes nothing changes no byte.
+    /// rendered + (output - input of the model): a model that changes nothing changes no byte.
     Residual,
 }
 
@@ -132,21 +132,21 @@ pub enum Layout {
 pub struct Input {
     /// Its name in the graph.
     pub name: String,
-    /// What it means.
+    /// Its meaning.
     pub role: InputRole,
     /// Its type in the graph.
     #[serde(default)]
     pub dtype: Dtype,
-    /// Of images: the values of black and white.
+    /// For images: the values of black and white.
     #[serde(default = "default_range")]
     pub range: [f32; 2],
-    /// Of `depth`.
+    /// For `depth`: its unit.
     #[serde(default)]
     pub unit: Unit,
-    /// Of `constant`: each of its values.
+    /// For `constant`: the value of all its elements.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub value: Option<f64>,
-    /// Of `constant`: its shape; a scalar has none.
+    /// For `constant`: its shape; empty for a scalar.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub shape: Vec<u32>,
 }
@@ -155,19 +155,19 @@ fn default_range() -> [f32; 2] {
     [0.0, 1.0]
 }
 
-/// What an input means.
+/// Meanings of inputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum InputRole {
     /// The rendered image, 3 channels.
     Rgb,
-    /// Its luma (BT.601, full range), 1 channel; chroma is resampled beside the model.
+    /// Its luma (BT.601, full range), 1 channel; chroma is resampled without the model.
     Luma,
     /// A recorded image nearby, 3 channels.
     Reference,
-    /// Recorded images brought into the view, 3 channels.
+    /// Recorded images warped into the view, 3 channels.
     ReferenceWarped,
-    /// Where `reference_warped` has a value, 1 channel.
+    /// 1 where `reference_warped` has a value, else 0, 1 channel.
     ReferenceValid,
     /// 1 channel, metres.
     Depth,
@@ -179,7 +179,7 @@ pub enum InputRole {
     Mask,
     /// Shape \[batch, 1\].
     Trust,
-    /// The same value everywhere, such as a time step.
+    /// One value everywhere, such as a time step.
     Constant,
 }
 
@@ -222,7 +222,7 @@ pub enum Dtype {
     F32,
     /// 16 bits (IEEE half).
     F16,
-    /// 64 bits; of `constant` only.
+    /// 64 bits; only for `constant`.
     I64,
 }
 
@@ -230,10 +230,10 @@ pub enum Dtype {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Unit {
-    /// Metres; 0 where nothing is.
+    /// Metres; 0 where there is no surface.
     #[default]
     Metre,
-    /// 1 / metres; 0 where nothing is.
+    /// 1 / metres; 0 where there is no surface.
     Inverse,
 }
 
@@ -243,12 +243,12 @@ pub enum Unit {
 pub struct Output {
     /// Its name in the graph.
     pub name: String,
-    /// What it means.
+    /// Its meaning.
     pub role: OutputRole,
     /// The values of black and white.
     #[serde(default = "default_range")]
     pub range: [f32; 2],
-    /// Size of the output in sizes of the input.
+    /// Scale of the output relative to the input.
     #[serde(default = "default_scale")]
     pub scale: u32,
 }
@@ -257,7 +257,7 @@ fn default_scale() -> u32 {
     1
 }
 
-/// What an output means.
+/// Meanings of outputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OutputRole {
@@ -265,7 +265,7 @@ pub enum OutputRole {
     Rgb,
     /// Its luma, 1 channel.
     Luma,
-    /// What is to be added to the image, 3 channels, in units of `range`.
+    /// A residual that is added to the image, 3 channels, in units of `range`.
     Residual,
 }
 

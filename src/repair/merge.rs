@@ -1,4 +1,4 @@
-//! Output of the model to an image of 8 bits.
+//! Converts the output of the model to an image of 8 bits.
 
 use crate::image::{Image, View};
 use crate::manifest::{Manifest, Merge, OutputRole};
@@ -6,7 +6,7 @@ use crate::planes::Planes;
 use crate::resample::{Kernel, resample};
 use crate::roles;
 
-/// The image. `seen` is what the model got as its image, `output` what it returned for that; both are free of
+/// The image. `seen` is the image that the model got, and `output` what it returned; both are free of
 /// padding, and smaller or larger than the image if the fit is `resize`.
 pub(crate) fn merge(manifest: &Manifest, view: &View<'_>, seen: Planes, output: Planes) -> Image {
     let role = manifest.output().role;

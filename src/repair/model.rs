@@ -20,12 +20,12 @@ use crate::runner::Runner;
 use crate::signature;
 use crate::tiles::Window;
 
-/// Where and how a model runs.
+/// The runtime, the provider and the limits with which a model runs.
 #[derive(Clone, Debug)]
 pub struct LoadOptions {
     /// The runtime: a libonnxruntime.so from version 1.18 on. An empty path is refused as `RuntimeUnnamed`.
     pub library: PathBuf,
-    /// One of the manifest's; its first if none is given.
+    /// The provider: one of the manifest's, or its first if none is given.
     pub provider: Option<Provider>,
     /// Threads of the cpu provider. The bytes do not depend on it.
     pub threads: usize,
@@ -66,14 +66,14 @@ pub struct Repaired {
     pub hash: blake3::Hash,
 }
 
-/// How long the parts of a repair took.
+/// Times of the parts of a repair.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RepairTimes {
-    /// From images and maps to the inputs of the graph: their sizes and ranges.
+    /// Time to convert images and maps to the inputs of the graph: their sizes and ranges.
     pub fit: Duration,
-    /// The graph, for all tiles.
+    /// Time of the graph, for all tiles.
     pub run: Duration,
-    /// From its output to an image of 8 bits, and the hashes.
+    /// Time to convert its output to an image of 8 bits, and for the hashes.
     pub merge: Duration,
 }
 
@@ -82,7 +82,7 @@ pub struct Model {
     runner: Runner,
     provider: Provider,
     repair_hash: blake3::Hash,
-    /// In pixels, if the fit is `tile`.
+    /// The measured halo in pixels, if the fit is `tile`.
     halo: Option<usize>,
     is_deterministic: bool,
 }
@@ -102,7 +102,7 @@ impl Model {
     /// the whole.
     ///
     /// # Errors
-    /// All of [`RepairError`] but `Input`.
+    /// All of [`RepairError`] except `Input`.
     pub fn load(path: &Path, options: &LoadOptions) -> Result<Model, RepairError> {
         let files = files::read(path)?;
         let manifest = &files.manifest;
@@ -140,7 +140,7 @@ impl Model {
         &self.runner.manifest
     }
 
-    /// What computes.
+    /// The execution provider.
     pub fn provider(&self) -> Provider {
         self.provider
     }
@@ -152,8 +152,8 @@ impl Model {
         format!("{}, commit {}", onnx::library_name(), commit.unwrap_or("unknown"))
     }
 
-    /// BLAKE3 of all that decides the bytes beside the images: manifest (which pins the files), build of the
-    /// runtime, provider.
+    /// BLAKE3 of everything that the output depends on, except the images: manifest (which pins the files),
+    /// build of the runtime, provider.
     pub fn repair_hash(&self) -> blake3::Hash {
         self.repair_hash
     }
@@ -173,7 +173,7 @@ impl Model {
         self.manifest().inputs.iter().any(|input| input.role == role)
     }
 
-    /// Whether it ran too long too often, and no run will succeed any more. Another load makes it usable.
+    /// Whether it ran too long too often, and no run will succeed any more. Loading it again makes it usable.
     pub fn is_withdrawn(&self) -> bool {
         self.runner.is_withdrawn()
     }
@@ -195,7 +195,7 @@ impl Model {
         self.repair_timed(view).map(|(repaired, _)| repaired)
     }
 
-    /// Repairs an image, and tells how long the parts of it took.
+    /// Repairs an image. Returns the times of the parts, too.
     ///
     /// # Errors
     /// As [`Model::repair`].

@@ -1,5 +1,5 @@
-//! The models that a program offers, by name. Each is loaded when it is first asked for, so that a program
-//! whose users ask for none loads no library.
+//! The models that a program offers, by name. Each is loaded on its first use, so that a program whose users
+//! request none loads no library.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -27,11 +27,11 @@ struct Entry {
 }
 
 impl Models {
-    /// Reads the manifests at `paths`, and nothing else: no model and no library is loaded. That the library
-    /// is a file is checked if there is a manifest.
+    /// Reads only the manifests at `paths`: no model and no library is loaded. If there is a manifest, checks that
+    /// the library is a file.
     ///
     /// # Errors
-    /// A manifest cannot be read, two have the same name, or the library is not named or no file.
+    /// A manifest cannot be read, two have the same name, or the library is not named or is not a file.
     pub fn read(paths: &[PathBuf], options: LoadOptions) -> Result<Models, RepairError> {
         let mut entries: BTreeMap<String, Entry> = BTreeMap::new();
         for path in paths {
@@ -62,7 +62,7 @@ impl Models {
         self.entries.keys().map(String::as_str)
     }
 
-    /// The images that the models' sessions compare with, in memory.
+    /// The cache of reference images for the models' sessions.
     pub fn references(&self) -> &ReferenceCache {
         &self.references
     }

@@ -1,7 +1,7 @@
 //! Networks that measure images: a distance of two images (LPIPS), or the features of one (for KID).
 //!
-//! A network is an .onnx file with a manifest beside it, like a model that repairs, but its output is numbers. It has an
-//! input of the role `image` and, if it compares, one of the role `truth`.
+//! A network is an .onnx file with a manifest in the same folder, like a repair model, but its output is numbers. It
+//! has an input of the role `image` and, if it compares images, one of the role `truth`.
 
 use std::path::Path;
 use std::time::Duration;
@@ -38,7 +38,7 @@ pub struct NetworkManifest {
     pub licence: String,
     /// The .onnx file, then files of external weights.
     pub files: Vec<ModelFile>,
-    /// Where it may run. The first is the default; there is no fall-back to another.
+    /// The providers on which it may run. The first is the default; there is no fall-back to another.
     pub providers: Vec<Provider>,
     /// GPU memory that the provider may take, in MiB.
     #[serde(default = "default_memory_mib")]
@@ -60,7 +60,7 @@ pub struct NetworkManifest {
 pub struct NetworkInput {
     /// Its name in the graph.
     pub name: String,
-    /// Which image it gets.
+    /// The image that it gets.
     pub role: NetworkRole,
     /// Its type in the graph: f32 or f16.
     #[serde(default)]
@@ -74,7 +74,7 @@ fn default_range() -> [f32; 2] {
     [-1.0, 1.0]
 }
 
-/// Which image an input of a network gets.
+/// The image that an input of a network gets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum NetworkRole {
@@ -135,7 +135,7 @@ impl NetworkManifest {
         Ok(())
     }
 
-    /// Whether it compares two images; else it measures one.
+    /// Whether it compares two images. Otherwise it measures one.
     pub fn compares(&self) -> bool {
         self.inputs.iter().any(|input| input.role == NetworkRole::Truth)
     }
@@ -146,7 +146,7 @@ impl Network {
     /// network or model.
     ///
     /// # Errors
-    /// Those of [`crate::Model::load`].
+    /// The errors of [`crate::Model::load`].
     pub fn load(path: &Path, options: &LoadOptions) -> Result<Self, RepairError> {
         let manifest = NetworkManifest::parse(&files::read_text(path)?, path)?;
         if !(1..=MAX_THREADS).contains(&options.threads) {

@@ -82,7 +82,7 @@ pub(crate) fn library_name() -> String {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Port {
     pub(crate) name: String,
-    /// None if the type has no meaning here.
+    /// `None` if the crate does not support the type.
     pub(crate) dtype: Option<Dtype>,
     /// The runtime's name of the type.
     pub(crate) type_name: String,
@@ -128,14 +128,14 @@ pub(crate) struct Feed {
     pub(crate) values: Vec<f32>,
 }
 
-/// What a graph returned.
+/// A value that a graph returned.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Returned {
     pub(crate) shape: Vec<i64>,
     pub(crate) values: Vec<f32>,
 }
 
-/// How a session is built.
+/// Options for building a session.
 #[derive(Clone, Debug)]
 pub(crate) struct Settings {
     pub(crate) library: PathBuf,
@@ -175,7 +175,7 @@ impl Worker {
             .name("repair".to_owned())
             .spawn(move || match session(&environment, files, &session_settings) {
                 Ok(session) => work(session, &ready, &next_job),
-                // A caller that gave up does not listen.
+                // The caller may have given up and dropped the receiver.
                 Err(error) => drop(ready.send(Err(error))),
             })
             .map_err(|error| RepairError::Run { message: format!("no thread: {error}") })?;
@@ -229,7 +229,7 @@ impl Worker {
         limit: Duration,
     ) -> RepairError {
         let limit_ms = limit.as_millis() as u64;
-        // A refused request has the same effect as one that is not heeded.
+        // A refused request has the same effect as one that the run ignores.
         let _ = options.terminate();
         self.timeouts += 1;
         let reason = match answers.recv_timeout(STOP_TIMEOUT) {

@@ -21,7 +21,7 @@ pub(crate) struct Rect {
 }
 
 impl Rect {
-    /// The same rectangle in an image `by` times as large.
+    /// This rectangle in an image `by` times as large.
     pub(crate) fn scaled(self, by: usize) -> Rect {
         Rect {
             top: self.top * by,
@@ -77,7 +77,7 @@ impl Planes {
         }
     }
 
-    /// Larger planes; what is new, on the right and below, mirrors the image at its last pixel.
+    /// Larger planes. The added pixels, on the right and below, mirror the image at its last pixel.
     pub(crate) fn padded(&self, height: usize, width: usize) -> Planes {
         if self.height == height && self.width == width {
             return self.clone();

@@ -1,4 +1,4 @@
-//! What a model shows when it is loaded: its shapes, whether it repeats its bytes, and its halo.
+//! Probes a model when it is loaded: its shapes, whether it is deterministic, and its halo.
 
 use crate::error::RepairError;
 use crate::halo::{Halo, Probe};
@@ -9,7 +9,7 @@ use crate::planes::{Planes, Rect};
 use crate::runner::Runner;
 use crate::tiles::Window;
 
-/// What the probe found.
+/// The results of the probe.
 pub(crate) struct Probed {
     /// Whether three runs gave the same bytes.
     pub(crate) is_deterministic: bool,
@@ -17,7 +17,7 @@ pub(crate) struct Probed {
     pub(crate) halo: Option<usize>,
 }
 
-/// Runs the model on a pattern: shape, NaN, time, repeated bytes; then the halo.
+/// Runs the model on a pattern, and checks shape, NaN, time and repeated bytes; then measures the halo.
 pub(crate) fn probe(runner: &Runner) -> Result<Probed, RepairError> {
     let manifest = &runner.manifest;
     let size = &manifest.size;

@@ -1,4 +1,4 @@
-//! What each role holds: planes of a view in the range of the model.
+//! The data of each role: planes of a view in the range of the model.
 
 use crate::error::RepairError;
 use crate::image::{Image, View};
@@ -63,12 +63,12 @@ pub(crate) fn luma(rgb: &Planes) -> Planes {
     luma
 }
 
-/// 0 to 255 as the model has it.
+/// Converts 0 to 255 to the model's range.
 pub(crate) fn in_range(planes: Planes, [black, white]: [f32; 2]) -> Planes {
     planes.map(|value| black + value / 255.0 * (white - black))
 }
 
-/// What the model has, as 0 to 255.
+/// Converts the model's range to 0 to 255.
 pub(crate) fn out_of_range(planes: Planes, [black, white]: [f32; 2]) -> Planes {
     planes.map(|value| (value - black) / (white - black) * 255.0)
 }
@@ -81,7 +81,7 @@ fn plain(
     Ok(Planes { channels, height, width, values: values.to_vec() })
 }
 
-/// Depth where there is one, else 0.
+/// The depth where there is one, else 0.
 fn depth(metres: Planes, unit: Unit) -> Planes {
     match unit {
         Unit::Metre => metres.map(|depth| depth.max(0.0)),

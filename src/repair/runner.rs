@@ -49,7 +49,7 @@ impl Runner {
         inputs.map(feed).collect()
     }
 
-    /// How images are cut, with a halo in pixels.
+    /// The sizes with which images are cut into windows, with a halo in pixels.
     pub(crate) fn tiling(&self, halo: usize) -> Tiling {
         let size = &self.manifest.size;
         let tile = size.fixed.or(size.tile).unwrap_or([u32::MAX; 2]).map(|side| side as usize);

@@ -1,8 +1,9 @@
-//! Which views of a step are repaired: by trust, with hysteresis, and at most so many a step.
+//! Selects the views of a step that are repaired: by trust, with hysteresis, and at most
+//! [`Selection::per_step`] of them.
 //!
-//! Trust is 1 on the recorded drive, so nothing is repaired there. Two thresholds keep a camera near one of
-//! them from going on and off, which would be seen as flicker. No clock has a part in it: budgets count
-//! images, so that a replay decides alike.
+//! Trust is 1 on the recorded drive, so nothing is repaired there. Two thresholds (hysteresis) prevent repair from
+//! switching on and off between steps, which would be visible as flicker. The selection does not depend on a
+//! clock: its budget is a number of images, so that a replay makes the same decisions.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,13 +11,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Selection {
-    /// A camera is repaired from trust below this on (about 1.4 m beside the drive).
+    /// Repair of a camera begins when its trust falls below this value (about 1.4 m off the drive).
     pub below: f64,
-    /// A camera is no longer repaired from trust above this on (about 0.8 m).
+    /// Repair of a camera ends when its trust rises above this value (about 0.8 m off the drive).
     pub above: f64,
-    /// Under this trust nothing is repaired: a model would invent the image.
+    /// Below this trust nothing is repaired, because a model would hallucinate the image.
     pub at_least: f64,
-    /// Most images of a step. Those with the least trust come first, then the first cameras.
+    /// Largest number of repaired images per step: those with the least trust; of equal trust, the first cameras.
     pub per_step: usize,
 }
 
@@ -26,7 +27,7 @@ impl Default for Selection {
     }
 }
 
-/// What is repaired in a step.
+/// The decision for a step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decision {
     /// Per camera: whether it is in repair after this step. The `before` of the next step.
@@ -61,7 +62,7 @@ impl Selection {
         Ok(())
     }
 
-    /// Whether a camera is in repair at a trust, given whether it was before.
+    /// Whether a camera is in repair at a trust, given whether it was after the previous step.
     fn is_on(&self, was_on: bool, trust: f64) -> bool {
         match was_on {
             true => trust <= self.above,
@@ -74,7 +75,7 @@ impl Selection {
         self.is_on(was_on, trust) && trust >= self.at_least
     }
 
-    /// Decides a step. `trust` has a value per camera; `before` says which cameras were in repair after the
+    /// Decides a step. `trust` has a value per camera; `before` marks the cameras that were in repair after the
     /// previous step, and is empty after a reset and for single observations, which have no history. A trust
     /// that is not a number counts as 0.
     pub fn decide(&self, before: &[bool], trust: &[f64]) -> Decision {

@@ -1,22 +1,22 @@
-//! Windows of an image that equal the whole.
+//! Windows of an image whose outputs together equal the output for the whole image.
 //!
 //! Every window has the size of a tile and begins at a multiple of `multiple_of`, so that strides fall on the
-//! same pixels as in the whole image. Of a window only the part counts that is at least a halo away from its
-//! borders, except where its border is that of the image: there the model pads as it does in the whole.
+//! same pixels as in the whole image. Only the part of a window counts that is at least a halo away from its
+//! borders. Borders of the image are an exception: there, the model pads as it does in the whole image.
 
 use crate::error::RepairError;
 use crate::planes::Rect;
 
-/// A tile: what the model sees, and which part of its output is used.
+/// A tile: the window that the model sees, and the part of its output that is used.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Window {
-    /// In the image.
+    /// The window, in the image.
     pub(crate) seen: Rect,
-    /// In the image, within `seen`. The parts of all windows cover the image, each pixel once.
+    /// The part that is used, in the image and within `seen`. The parts of all windows cover each pixel once.
     pub(crate) used: Rect,
 }
 
-/// How images are cut.
+/// The sizes with which images are cut into windows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Tiling {
     /// Height and width of a window.
@@ -87,7 +87,7 @@ impl Tiling {
 struct Span {
     start: usize,
     len: usize,
-    /// First pixel and the one after the last.
+    /// First pixel, and the pixel after the last.
     used: (usize, usize),
 }
 

@@ -1,4 +1,5 @@
-//! Reads a manifest, and checks what its types do not say. An error has the field and what is accepted.
+//! Reads a manifest, and checks the rules that its types do not express. An error names the field and the accepted
+//! values.
 
 use std::path::Path;
 
@@ -25,7 +26,8 @@ impl Manifest {
     }
 }
 
-/// Reads a manifest of a format, and checks it. A file of another format is refused as that, and not for one of its fields.
+/// Reads a manifest of a format, and checks it. A file of another format is refused because of its format, and not
+/// because of one of its fields.
 pub(crate) fn read<T: DeserializeOwned>(
     bytes: &[u8],
     file: &Path,
@@ -57,7 +59,7 @@ pub(crate) fn read<T: DeserializeOwned>(
     Ok(manifest)
 }
 
-/// What the types do not say. The field and what is accepted.
+/// Checks the rules that the types do not express. An error is the field and the accepted values.
 fn check(manifest: &Manifest) -> Checked {
     check_name(&manifest.name)?;
     check_run(&manifest.providers, manifest.timeout_ms, manifest.memory_mib)?;
@@ -77,7 +79,7 @@ pub(crate) fn check_name(name: &str) -> Checked {
     Ok(())
 }
 
-/// Where it runs, how long, and with how much memory.
+/// Checks the providers, the time-out and the memory.
 pub(crate) fn check_run(providers: &[Provider], timeout_ms: u64, memory_mib: u32) -> Checked {
     let wrong = |field: &str, message: String| Err((field.to_owned(), message));
     if providers.is_empty() {
@@ -231,7 +233,7 @@ fn check_output(manifest: &Manifest) -> Checked {
     Ok(())
 }
 
-/// Whether two values can be those of black and white.
+/// Whether two values can be the values of black and white.
 pub(crate) fn is_range(range: [f32; 2]) -> bool {
     range.iter().all(|end| end.is_finite()) && range[0] != range[1]
 }

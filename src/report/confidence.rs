@@ -1,4 +1,4 @@
-//! How far images can be trusted on the recorded drive and beside it, with an image from each distance.
+//! Trust in images on the recorded drive and at lateral offsets from it, with an image from each distance.
 
 use std::sync::Arc;
 
@@ -82,13 +82,13 @@ pub fn confidence_by_offset(
     Ok(all)
 }
 
-/// What the cameras observe at one sample point.
+/// The observation of all cameras at one sample point.
 struct Observed {
     /// Trust of each camera's image.
     trusts: Vec<Trust>,
-    /// The first camera.
+    /// The view of the first camera.
     first_view: View,
-    /// Its image.
+    /// The image of the first camera.
     first_rgb8: Vec<u8>,
 }
 

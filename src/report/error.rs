@@ -1,8 +1,8 @@
 //! Why a report cannot be made.
 //!
-//! The `Display` text of an error says everything, down to the text of the operating system, and so errors
+//! The `Display` text of an error is complete, down to the text of the operating system, and so errors
 //! of this project have no `source`: the cause is a field named `cause`, or the error passes it on as
-//! `transparent`. A caller that prints an error, with `{:#}` or `to_string`, then says each thing once.
+//! `transparent`. A caller that prints an error, with `{:#}` or `to_string`, then prints each cause once.
 
 use wildcity_render::RenderError;
 use wildcity_repair::RepairError;
@@ -21,7 +21,7 @@ pub enum ReportError {
     /// A frame cannot be rendered.
     #[error(transparent)]
     Render(#[from] RenderError),
-    /// A camera cannot be scaled to so small an image.
+    /// A camera cannot be scaled to such a small image.
     #[error(transparent)]
     Camera(#[from] CameraError),
     /// A setting does not fit the twin's profile.
@@ -52,10 +52,10 @@ pub enum ReportError {
         model: String,
         /// Name of the camera.
         camera: String,
-        /// What the model says.
+        /// The error of the model.
         cause: Box<RepairError>,
     },
-    /// Repair is measured beside a drive.
+    /// Repair is measured at offsets from a drive, and the twin has none.
     #[error(
         "--repair: the twin has no recorded drive, so there is nothing beside it; leave --repair out"
     )]

@@ -1,5 +1,5 @@
-//! What one step of a street holds, moves and runs, with each feature of a scene and without: a scene pays
-//! only for what it has.
+//! Memory, traffic and GPU work of one step of a street, with each feature of a scene and without: a scene pays
+//! only for the features that it has.
 //!
 //! These are counts (pipelines, buffers, dispatches, bytes), not times: they are the same on every machine,
 //! and show at once if the base scene pays for a feature that it does not have.
@@ -32,11 +32,11 @@ pub struct FeatureCounts {
     /// The feature, for example `SH degree 1`.
     #[serde(rename = "with")]
     pub feature: &'static str,
-    /// What one step takes.
+    /// The resources of one step.
     pub counts: ResourceCounts,
 }
 
-/// What one step takes.
+/// The resources that one step takes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct ResourceCounts {
     /// Gaussians in the frame.
@@ -52,11 +52,11 @@ pub struct ResourceCounts {
     pub host_bytes_per_pixel: u64,
     /// Evaluations of a Gaussian at a pixel by the cpu backend.
     pub evaluations: u64,
-    /// What a device does. None without a device.
+    /// The resources on a device. `None` without a device.
     pub device: Option<DeviceCounts>,
 }
 
-/// What one step takes on a device that renders nothing else.
+/// The resources that one step takes on a device that renders nothing else.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct DeviceCounts {
     /// Bytes per Gaussian in device memory.
@@ -90,7 +90,7 @@ pub const COLUMNS: [&str; 11] = [
     "read back, B per pixel",
 ];
 
-/// What the table does not have: repair.
+/// Why the table has no row for repair.
 pub const WITHOUT_REPAIR: &str = "Repair adds nothing here: a model gets the finished images of sessions that ask for it, and its \
      library is loaded with the first of them.";
 

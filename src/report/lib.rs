@@ -1,17 +1,17 @@
-//! Measures what each setting of the renderer costs and what it loses, on one twin and one machine, and
-//! reports it as one HTML page, as JSON, and as CSV.
+//! Measures the cost and the error of each setting of the renderer, on one twin and one machine, and reports
+//! them as one HTML page, as JSON, and as CSV.
 //!
 //! ```text
 //! setting         one way to render a twin
 //! settings        the settings to compare, and those that cannot affect the twin
-//! sample_points   the poses to compare at: along the recorded drive, beside it, or around a capture
+//! sample_points   the poses to compare at: on the recorded drive, at offsets from it, or around a capture
 //! measure         renders each setting and the f64 reference, and compares them
 //! measurement     the error of a setting, and its cost
 //! timing          how long a step takes, in turn with the twin as it is served
-//! recommend       the Pareto front, and the setting for a wanted error or time
+//! recommend       the Pareto front, and the setting for a required error or time
 //! confidence      trust in the images, over the distance from the recorded drive
 //! feature_costs   memory and GPU work of one step, with each feature of a scene and without
-//! repair          what repair gains beside the drive, and what it costs
+//! repair          what repair gains on and off the drive, and what it costs
 //! plots, page     the HTML page
 //! ```
 //!

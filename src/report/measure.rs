@@ -3,7 +3,7 @@
 //! **Windows are compared, and whole steps are timed.** The f64 reference takes a minute for six full images.
 //! Windows keep the full focal length, since levels of detail depend on it: a smaller image would be another
 //! test. All settings see the same windows. The PSNR is of values before they are rounded to 8 bits, since
-//! rounding alone leaves 59 dB.
+//! the rounding by itself limits PSNR to 59 dB.
 
 use std::io::Cursor;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ pub struct Benchmark<'a> {
     pub backends: &'a [Box<dyn Backend>],
     /// The sample points.
     pub sample_points: &'a [SamplePoint],
-    /// How often a step is timed at each point, after one run that is not counted.
+    /// Number of timed runs of a step at each point, after one run that is not counted.
     pub repeat: u32,
     /// Opens a new instance of the gpu backend's device, which has rendered nothing yet. None if there is no
     /// device.
@@ -48,7 +48,7 @@ const GPU: &str = "gpu";
 
 /// Images of the f64 reference, at full detail and without a draw distance.
 pub struct ReferenceImages {
-    /// By sample point and window.
+    /// The images, by sample point and window.
     windows: Vec<Vec<Image>>,
     /// Time that a step of all cameras would take, in milliseconds: the time of the windows, scaled to the
     /// pixels of the whole images.
@@ -184,7 +184,7 @@ struct ErrorTotals {
     worst: Option<WorstWindow>,
 }
 
-/// The window with the least PSNR so far.
+/// The window with the least PSNR until now.
 struct WorstWindow {
     psnr_db: f64,
     sample_point: String,
@@ -194,9 +194,9 @@ struct WorstWindow {
 
 /// Errors at one sample point.
 struct PointErrors {
-    /// Of all windows together.
+    /// PSNR of all windows together, in dB.
     psnr_db: f64,
-    /// Of the worst window.
+    /// PSNR of the worst window, in dB.
     min_db: f64,
 }
 

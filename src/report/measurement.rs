@@ -44,8 +44,8 @@ pub struct SampleResult {
     /// PSNR of the window that has the least, in dB. A setting is selected by it.
     #[serde(rename = "least_db", serialize_with = "serialize_number")]
     pub min_db: f64,
-    /// 95th percentile of the step time, in milliseconds: of fewer than twenty steps, the longest. None
-    /// beside the drive, where no step is timed.
+    /// 95th percentile of the step time, in milliseconds: of fewer than twenty steps, the longest. None for a
+    /// point off the drive, where no step is timed.
     pub p95_ms: Option<f64>,
 }
 
@@ -55,13 +55,13 @@ pub struct Cost {
     /// Median time of a step of all cameras, in milliseconds: rendering, and encoding if the setting has an
     /// encoding.
     pub step_ms: f64,
-    /// Gaussians that a step renders; the most of all sample points.
+    /// Number of Gaussians that a step renders: the largest of all sample points.
     pub gaussians: u64,
     /// Host memory of these Gaussians and of a baked sky, in bytes.
     pub scene_bytes: u64,
     /// Memory of all buffers on a device that renders these steps and nothing else, in bytes. None for a
-    /// backend without a device, if the driver does not report it, and if a second device beside the
-    /// backend's has no room.
+    /// backend without a device, if the driver does not report it, and if a second device does not fit into
+    /// memory next to the backend's.
     pub device_bytes: Option<u64>,
     /// Bytes of a Gaussian on disk, before compression.
     #[serde(rename = "stored_bytes_each")]
@@ -87,8 +87,8 @@ impl Measurement {
         min(self.by_sample_point.iter().map(|result| result.min_db))
     }
 
-    /// The longest 95th percentile of the step time at a sample point, in milliseconds. `--at-most-ms` goes
-    /// by it.
+    /// The longest 95th percentile of the step time at a sample point, in milliseconds. `--at-most-ms` limits
+    /// it.
     pub fn p95_ms(&self) -> f64 {
         let all = self.by_sample_point.iter().filter_map(|result| result.p95_ms);
         all.fold(f64::NAN, f64::max)
@@ -109,7 +109,7 @@ impl Measurement {
 
 /// Scales the times of all settings to one speed of the machine: the speed at which the twin as it is served
 /// took its median time. A setting that was measured while other programs ran is then not slower than the
-/// rest. The first backend's baseline tells how fast the machine was, for settings of other backends too.
+/// rest. The first backend's baseline gives the speed of the machine, for settings of other backends too.
 pub fn normalize_machine_speed(all: &mut [Measurement]) {
     let baselines_ms: Vec<f64> = all.iter().map(|m| m.baseline_ms).collect();
     let usual_ms = quantile(&baselines_ms, 0.5);

@@ -62,7 +62,7 @@ pub fn render(report: &Report) -> Result<String, ReportError> {
     Ok(markup.into_string() + "\n")
 }
 
-/// What was measured, and how.
+/// The subject of the report, and how it was measured.
 fn introduction(report: &Report) -> Markup {
     let subject = &report.subject;
     let [window_width, window_height] = report.sampling.window_px;

@@ -210,8 +210,8 @@ fn draw_labels(root: &Area<'_>, mut labels: Vec<Label<'_>>) -> PlotResult<()> {
     Ok(())
 }
 
-/// Moves rising heights apart, so that each is at least a line below the one before and the last is at most
-/// `bottom_px`. Moves them as little as that takes.
+/// Moves rising heights apart, so that each is at least a line below the previous one and the last is at most
+/// `bottom_px`. Moves them as little as possible.
 fn spread(heights_px: &[i32], bottom_px: i32) -> Vec<i32> {
     let mut spread = heights_px.to_vec();
     for i in 1..spread.len() {

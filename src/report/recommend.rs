@@ -1,10 +1,10 @@
-//! The Pareto front of error and time, and the setting for a wanted error or time.
+//! The Pareto front of error and time, and the setting for a required error or time.
 //!
 //! **A setting is selected at every other station and verified at the rest.** Its worst selection point must
 //! be better than the goal by a margin: the standard deviation of the worse half of the points, at least 1 dB
 //! or a tenth of the time. Of eight values of a normal distribution the worst lies 1.4 deviations from the
-//! mean on average; so the goal lies 2.4 deviations away, where one point of 120 falls. A margin of 1 dB
-//! alone selected a setting with 36 dB at two points of a capture that had 34.4 dB at two others.
+//! mean on average; so the goal lies 2.4 deviations away, where one point of 120 falls. With a margin of
+//! only 1 dB, a setting was selected that had 36 dB at two points of a capture and 34.4 dB at two others.
 //!
 //! A setting that misses the goal at the verification points is not recommended, and no profile is written:
 //! a setting that is good by chance is worse than none. Records and image sizes are measured but not
@@ -20,7 +20,7 @@ use wildcity_render::compare::json_numbers::serialize_number;
 use wildcity_scene::profile::ProfileError;
 use wildcity_scene::{ProfileOverrides, RenderProfile};
 
-/// What the user wants of a setting.
+/// The goal that the user gave.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Goal {
@@ -36,7 +36,7 @@ pub enum Goal {
 /// encoded: a profile does not choose the encoding.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Recommendation {
-    /// What the user wants.
+    /// The goal.
     #[serde(rename = "wanted")]
     pub goal: Goal,
     /// Name of the setting.
@@ -48,7 +48,7 @@ pub struct Recommendation {
     /// The worst value at the selection points, in the goal's unit.
     #[serde(rename = "chosen_by")]
     pub selection_worst: f64,
-    /// How much better than the goal that value had to be, in the same unit: the spread of the points.
+    /// The margin by which that value had to be better than the goal, in the same unit: the spread of the points.
     pub margin: f64,
     /// The worst value at the verification points, in the same unit.
     #[serde(rename = "verified")]
@@ -56,12 +56,12 @@ pub struct Recommendation {
     /// The state of the images in which all of this was measured: [`RENDERED`].
     #[serde(rename = "measured")]
     pub measured_state: &'static str,
-    /// What encodings lose and take in addition.
+    /// The additional error and time of encodings.
     #[serde(rename = "encoded")]
     pub encodings: Vec<EncodingCost>,
 }
 
-/// What the twin as it is served loses and takes when its images are encoded.
+/// The additional error and time of the twin as it is served when its images are encoded.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EncodingCost {
     /// Name of the setting, for example `jpeg 90`.
@@ -73,8 +73,8 @@ pub struct EncodingCost {
     /// Least PSNR of a window at any sample point after decoding, in dB.
     #[serde(rename = "least_db", serialize_with = "serialize_number")]
     pub min_db: f64,
-    /// How much longer the median step takes than without encoding, in milliseconds. The two are timed in
-    /// turn; it can be below 0 by chance.
+    /// Median time of a step minus that without encoding, in milliseconds. The two are timed in turn; the
+    /// difference can be below 0 by chance.
     #[serde(rename = "more_ms")]
     pub extra_ms: f64,
 }
@@ -170,7 +170,7 @@ pub fn recommend(
     })
 }
 
-/// The fastest candidate that reaches a wanted error, or the most exact one that reaches a wanted time.
+/// The fastest candidate that reaches a required error, or the most exact one that reaches a required time.
 fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candidate<'a>> {
     let reaching = candidates.iter().copied();
     let mut reaching = reaching.filter(|c| goal.is_met_by(c.assessment.guaranteed));
@@ -230,7 +230,7 @@ impl Recommendation {
         format!("wildcity serve --backend {} --profile {profile}", self.backend)
     }
 
-    /// Says what the values belong to, and what encodings add to them.
+    /// Describes the images that the values belong to, and what encodings add to them.
     pub fn explanation(&self) -> String {
         let of_encoding = |cost: &EncodingCost| {
             let EncodingCost { encoding, is_default, min_db, extra_ms } = cost;
@@ -246,14 +246,14 @@ impl Recommendation {
     }
 }
 
-/// What the sample points say of a setting, in dB or milliseconds, whichever the goal is in.
+/// The results of a setting at the sample points, in the goal's unit: dB or milliseconds.
 #[derive(Clone, Copy)]
 struct Assessment {
     /// The worst value at the selection points.
     selection_worst: f64,
     /// The spread of the selection points.
     margin: f64,
-    /// The worst value, less the margin: what other points can be expected to have.
+    /// The worst value minus the margin: the value that other points can be expected to reach.
     guaranteed: f64,
     /// The worst value at the verification points.
     verification_worst: f64,

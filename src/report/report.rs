@@ -20,7 +20,7 @@ pub struct Report {
     pub subject: Subject,
     /// The backends; [`super::setting::Setting::backend`] is an index into them.
     pub backends: Vec<Column>,
-    /// How many sample points there are, and how much is compared at each.
+    /// The number of sample points, and the size of the windows that are compared.
     pub sampling: Sampling,
     /// Names of the sample points.
     #[serde(rename = "places")]
@@ -38,7 +38,7 @@ pub struct Report {
     /// Trust in the images over the distance from the recorded drive. Empty without a drive.
     #[serde(rename = "believed")]
     pub confidence: Vec<Confidence>,
-    /// What the user asked for, if anything.
+    /// The goal that the user gave, if any.
     #[serde(rename = "wanted")]
     pub goal: Option<Goal>,
     /// The setting that reaches the goal.
@@ -51,7 +51,7 @@ pub struct Report {
     /// Memory and GPU work of one step, with each feature and without.
     #[serde(rename = "needed")]
     pub feature_costs: Vec<FeatureCounts>,
-    /// What repair gains and costs, if models were given.
+    /// The gain and the cost of repair, if models were given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub repair: Option<RepairReport>,
 }
@@ -75,14 +75,14 @@ pub struct Subject {
     pub profile: RenderProfile,
     /// Cameras of a step.
     pub cameras: usize,
-    /// How often a step was timed at each sample point.
+    /// Number of timed runs of a step at each sample point.
     pub repeat: u32,
 }
 
 impl Report {
     /// The settings as CSV: a header, and one line per setting, with decimal points and no quotes except
-    /// around names. A cell is empty where there is no value: dB beside a drive if none was recorded, and
-    /// bytes of a device if the backend has none.
+    /// around names. A cell is empty where there is no value: dB at offsets from a drive if none was recorded,
+    /// and bytes of a device if the backend has none.
     pub fn csv(&self) -> String {
         let by_offset = OFFSETS_M.map(|offset_m| format!("psnr_db_at_{offset_m}_m")).join(",");
         let mut csv = format!(

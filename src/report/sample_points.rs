@@ -1,4 +1,4 @@
-//! The poses at which settings are compared: along the recorded drive and beside it, or around a capture.
+//! The poses at which settings are compared: along the recorded drive and at offsets from it, or around a capture.
 
 use glam::{DQuat, DVec3};
 
@@ -21,16 +21,16 @@ pub struct SamplePoint {
     pub for_selection: bool,
     /// Pose of the rig. None for a twin without a drive.
     pub world_from_rig: Option<Pose>,
-    /// The cameras with their whole images. They are what is timed.
+    /// The cameras with their whole images, which are timed.
     pub views: Vec<View>,
-    /// A window of each camera's image at full focal length. The windows are what is compared.
+    /// A window of each camera's image at full focal length. Only the windows are compared.
     pub windows: Vec<View>,
 }
 
-/// How many sample points there are, and how much is compared at each.
+/// The number of sample points, and the size of the windows that are compared.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Sampling {
-    /// Stations along the drive. Each has a sample point per distance of [`OFFSETS_M`]; a twin without a
+    /// Number of stations along the drive. Each has a sample point per distance of [`OFFSETS_M`]; a twin without a
     /// drive gets as many points around it.
     pub stations: u32,
     /// Width and height of the compared windows, in pixels.
@@ -103,7 +103,7 @@ pub(super) fn mean_speed_m_per_us(drive: &Trajectory) -> f64 {
     if duration_us > 0 { drive.length_m() / duration_us as f64 } else { 0.0 }
 }
 
-/// Sample points around a capture for each station: as many as there are offsets beside a drive.
+/// Number of sample points around a capture for each station: as many as there are offsets from a drive.
 const POINTS_PER_STATION: u32 = OFFSETS_M.len() as u32;
 
 /// Share of the sides of these images in which windows lie: around the middle, where the object is.
@@ -113,7 +113,7 @@ const WINDOW_SHARE: f64 = 0.5;
 const AROUND_SIZE_PX: [u32; 2] = [640, 480];
 /// Focal length of these images, in pixels.
 const AROUND_FOCAL_PX: f64 = 600.0;
-/// How far above the object these cameras stand, seen from its middle.
+/// Elevation of these cameras, seen from the middle of the object.
 const AROUND_ELEVATION_DEG: f64 = 20.0;
 
 /// Cameras on a circle around the middle of a captured object. Each sees all of it. z is up.
@@ -170,10 +170,10 @@ impl SamplePoint {
         self
     }
 
-    /// The same point with all images and windows scaled.
+    /// This point with all images and windows scaled.
     ///
     /// # Errors
-    /// A camera cannot be scaled to so small an image.
+    /// A camera cannot be scaled to such a small image.
     pub(super) fn scaled(&self, setting: &Setting) -> Result<Self, CameraError> {
         let scale_all = |views: &[View]| -> Result<Vec<View>, CameraError> {
             let mut views: Vec<View> =
@@ -191,10 +191,10 @@ impl SamplePoint {
     }
 }
 
-/// A view with the sides of its image and its intrinsics scaled.
+/// A view whose image sides and intrinsics are scaled.
 ///
 /// # Errors
-/// The camera cannot be scaled to so small an image.
+/// The camera cannot be scaled to such a small image.
 pub(super) fn scaled(view: View, scale: f64) -> Result<View, CameraError> {
     let side_px = |px: u32| ((f64::from(px) * scale).round() as u64).max(1);
     let camera = view.camera;

@@ -10,7 +10,7 @@ use wildcity_scene::{Rays, RecordFormat, RenderProfile};
 pub struct Setting {
     /// For example `tau_px=2`; unique within a report.
     pub name: String,
-    /// What the setting changes.
+    /// The part of the rendering that the setting changes.
     pub family: Family,
     /// Index of the backend among those of the report.
     pub backend: usize,
@@ -42,7 +42,7 @@ impl Setting {
         Ok(profile)
     }
 
-    /// Whether `wildcity serve` can render so without the twin being stored again: only its profile and
+    /// Whether `wildcity serve` can use the setting without the twin being stored again: only its profile and
     /// backend differ.
     pub fn can_be_served(&self) -> bool {
         self.record.is_none()
@@ -62,17 +62,17 @@ pub enum ImageEncoding {
     Jpeg(u8),
 }
 
-/// What a setting changes.
+/// The parts of the rendering that settings change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Family {
-    /// Nothing: the twin as it is served.
+    /// No change: the twin as it is served.
     AsServed,
     /// The backend.
     Backend,
     /// Levels of detail.
     Detail,
-    /// How far blocks are drawn.
+    /// The draw distance.
     #[serde(rename = "reach")]
     DrawDistance,
     /// Record format of the Gaussians.

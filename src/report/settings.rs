@@ -1,13 +1,12 @@
 //! The settings that are compared, each a change of one thing, and combinations that a profile can have.
 //!
 //! **Settings that cannot affect this twin are skipped**, and the page names them: `sky_error` without a
-//! sky, exact rays without a lens, `tau_px` without levels of detail. The tile size is no setting either:
-//! see `TILE_SIZE_REASON`; BENCHMARKS.md has what was measured of it (rows or blocks of pixels, one level
-//! of tiles or two).
+//! sky, exact rays without a lens, `tau_px` without levels of detail. The tile size is not a setting either: see
+//! `TILE_SIZE_REASON`. BENCHMARKS.md has its measurements (rows or blocks of pixels, one level of tiles or two).
 //!
-//! **Small images are compared with the reference's image shrunk** to their size, since that is what they stand
-//! for. "Own blur" is the same image with the profile's blur in its own pixels: what a camera of that size
-//! without a native size renders.
+//! **Small images are compared with the reference's image shrunk** to their size, because they replace that image.
+//! "Own blur" is the same image with the profile's blur in its own pixels, as a camera of that size without a native
+//! size renders it.
 //!
 //! **Non-pinhole cameras have two references.** All settings are compared with splats, so that their own
 //! errors show. One more row compares the twin as it is served with a ray for every pixel.
@@ -28,13 +27,13 @@ pub struct TwinFeatures {
     pub record: RecordFormat,
     /// Whether it has levels of detail.
     pub has_levels: bool,
-    /// What is behind its Gaussians.
+    /// Its background, behind the Gaussians.
     pub background: BackgroundKind,
     /// Whether a camera has a lens, a windshield, or a rolling shutter while it moves.
     pub has_non_pinhole: bool,
 }
 
-/// What is behind the Gaussians of a twin.
+/// The background of a twin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BackgroundKind {
     /// No sky: black, or one colour.
@@ -73,9 +72,9 @@ impl Skipped {
 
 /// Values of `tau_px`: largest error of a level of detail on the screen, in pixels.
 const TAUS_PX: [f64; 5] = [0.0, 0.5, 1.0, 2.0, 4.0];
-/// Values of `alpha_cut`, beside the default 1/255.
+/// Values of `alpha_cut`, in addition to the default 1/255.
 const ALPHA_CUTS: [f64; 3] = [0.008, 0.016, 0.032];
-/// Values of `stop`, the transmittance that ends a pixel, beside the default 1e-4.
+/// Values of `stop`, the transmittance that ends a pixel, in addition to the default 1e-4.
 const STOPS: [f64; 3] = [1e-3, 4e-3, 1.6e-2];
 /// Values of `sky_error`: colour error of the baked sky; 0 evaluates it for every pixel.
 const SKY_ERRORS: [f64; 4] = [0.0, 0.01, 0.05, 0.1];
@@ -305,7 +304,7 @@ impl<'a> ListBuilder<'a> {
                 changes.insert(0, tau_change(tau_px));
             }
             let combined = self.profile_setting(Family::Combined, changes);
-            // Without levels of detail two combinations are the same.
+            // Without levels of detail, two combinations are equal.
             if self.settings.iter().all(|other| other.name != combined.name) {
                 self.settings.push(combined);
             }

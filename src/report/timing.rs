@@ -1,8 +1,8 @@
-//! How long a step takes, measured in turn with a step of the twin as it is served.
+//! Times of a step, measured in turn with a step of the twin as it is served.
 //!
 //! The speed of a machine changes while a report is made. Timed one after another, the last settings took
 //! twice as long as the first, because other programs had begun to compile. A step of the served twin right
-//! after each step of a setting tells how fast the machine was at that moment;
+//! after each step of a setting shows how fast the machine was at that moment;
 //! [`super::measurement::normalize_machine_speed`] scales all times to one speed.
 
 use std::time::Instant;

@@ -73,7 +73,7 @@ pub enum AppearanceError {
     /// The overlay cannot be decoded, or has too many pixels.
     #[error("the overlay cannot be read: {reason}")]
     Overlay {
-        /// What is wrong with the overlay.
+        /// The error in the overlay.
         reason: String,
     },
 }
@@ -141,7 +141,7 @@ impl Appearance {
     /// Checks the appearance for a camera whose image has this width and height.
     ///
     /// # Errors
-    /// An exposure coefficient is out of range, or the overlay has another size than the image.
+    /// An exposure coefficient is out of range, or the size of the overlay differs from that of the image.
     pub fn check(&self, camera_px: [u32; 2]) -> Result<(), AppearanceError> {
         if let Some(Exposure { matrix, offset }) = &self.exposure {
             for (field, values) in [("matrix", matrix.as_flattened()), ("offset", offset)] {

@@ -548,8 +548,8 @@ fn spread(x: u64) -> u64 {
 pub struct Scene {
     /// Chunks of one SH degree, in order of (cell y, cell x).
     pub chunks: Vec<Arc<Chunk>>,
-    /// Actors. Of Gaussians with equal depths, those of the twin are in front, then those of actors in the order of
-    /// this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
+    /// Actors. Among Gaussians with equal depths, those of the twin are in front, then those of actors in the order
+    /// of this list. At most [`PlacedChunk::MAX_ACTORS`] actors.
     pub placed: Vec<PlacedChunk>,
     /// The sky; without one, the background colour of the render profile is drawn (black by default).
     pub sky: Option<Arc<Sky>>,
@@ -608,7 +608,7 @@ impl Scene {
         self.chunks.iter().chain(own)
     }
 
-    /// Memory that the chunks have allocated, in bytes. What several actors share is counted once.
+    /// Memory that the chunks have allocated, in bytes. Memory that several actors share is counted once.
     pub fn bytes(&self) -> usize {
         self.distinct_chunks().map(|chunk| chunk.bytes()).sum()
     }
@@ -718,7 +718,7 @@ mod tests {
         let groups = (0..count.div_ceil(LANES)).flat_map(|k| pushed.lane_group(k).iter().copied());
         let mut lanes: Vec<Lanes> = groups.collect();
         lanes[(CLUSTER + 7) / LANES * columns(0)].0[7] = f32::NAN;
-        // What lies in lanes after the last Gaussian does not count.
+        // Values in lanes after the last Gaussian do not count.
         lanes.last_mut().unwrap().0[LANES - 1] = 1e30;
         let mut pages = LanePages::new(columns(0), None);
         pages.extend_from_slice(&lanes);

@@ -1,7 +1,7 @@
 //! The data of a city twin: Gaussians in chunks and levels of detail, cameras and rigs, recorded
 //! trajectories, skies, render profiles, and the manifest that ties them to one version.
 //!
-//! Everything here is pure: no files, no clock, no network. The same input gives the same bytes at any
+//! The whole package is pure: no files, no clock, no network. The same input gives the same bytes at any
 //! thread count.
 //!
 //! # Coordinates

@@ -43,15 +43,15 @@ pub struct Manifest {
     /// Recorded images of the drives, if the twin has some.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub views: Option<ViewsRef>,
-    /// Where the world lies on the earth, if that is known.
+    /// The place of the world on the earth, if it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub geo: Option<GeoAnchor>,
     /// From the axes and the unit with which the capture was imported to the twin's: all alignments since then as
-    /// one. None if the twin was never aligned; older versions have it in their provenance alone
+    /// one. None if the twin was never aligned; older versions have it only in their provenance
     /// ([`Manifest::alignment`]).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub twin_from_capture: Option<Alignment>,
-    /// Where the version comes from.
+    /// The source of the version.
     pub provenance: Provenance,
 }
 
@@ -140,7 +140,7 @@ pub struct ViewsRef {
     pub image_bytes: u64,
 }
 
-/// Where a version comes from. It holds no time, so that the same import gives the same identity.
+/// The source of a version. It holds no time, so that the same import gives the same identity.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {

@@ -2,7 +2,7 @@
 //!
 //! Sections of a twin have 1 kB to 9 MB. If each is one block of the heap, sections that come and go leave holes that
 //! the next ones do not fit into: 1,024 MiB of sections took 1,590 MiB of memory. All pages of an SH degree have one
-//! size, so any page fits where another one was. Only the last page of a chunk may be smaller, so that a section of a
+//! size, so any page fits in the place of another. Only the last page of a chunk may be smaller, so that a section of a
 //! few Gaussians takes no more than it needs.
 
 use std::collections::BTreeMap;
@@ -248,7 +248,7 @@ mod tests {
             (16 * WIDTH) as f32,
             "nothing is left of the old content"
         );
-        // Pages of another size do not fit.
+        // Pages of a different size do not fit.
         let mut other = LanePages::new(14, Some(pool.clone()));
         other.extend_from_slice(&vec![Lanes([0.0; LANES]); 16 * 14]);
         assert_eq!(pool.free_bytes(), PAGE_BYTES);

@@ -101,7 +101,7 @@ pub enum ProfileError {
         field: &'static str,
         /// The refused value.
         value: f64,
-        /// What must hold instead.
+        /// The values that are accepted.
         must: &'static str,
     },
     /// An override has an unknown field or a value of the wrong type.

@@ -48,7 +48,7 @@ impl RigCamera {
         self.part(camera, at_px.map(|at| at as u32), [camera.width_px, camera.height_px])
     }
 
-    /// The camera with the same field of view and an image of another size, in pixels.
+    /// The camera with the same field of view and a different image size, in pixels.
     ///
     /// # Errors
     /// As [`Camera::scaled`].
@@ -166,7 +166,7 @@ impl Rig {
         PRESETS.into_iter().map(|(name, _)| name)
     }
 
-    /// A rig that is part of the program; `None` if there is none of this name.
+    /// A rig that is part of the program; `None` if no rig has this name.
     pub fn preset(name: &str) -> Option<Self> {
         let (_, json) = PRESETS.into_iter().find(|(preset, _)| *preset == name)?;
         // A test parses every preset, so `ok` cannot hide a broken file as an unknown name.
@@ -402,7 +402,7 @@ mod tests {
         assert!(serde_json::from_str::<Rig>(&unknown).is_err(), "a lens that is not drawn");
     }
 
-    /// Cameras are counted before any is looked at: a file of 100,000 must not cost more than reading it.
+    /// Cameras are counted before any is checked: a file with 100,000 cameras must not cost more than reading it.
     #[test]
     fn too_many_cameras_are_refused_first() {
         let camera = r#"{"name":"front","width":100,"height":80,"fx":100,"fy":100,"cx":50,"cy":40,

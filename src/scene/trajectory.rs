@@ -68,7 +68,7 @@ pub enum TrajectoryError {
         index: usize,
         /// Its time, in microseconds.
         time_us: i64,
-        /// Time of the keyframe before it, in microseconds.
+        /// Time of the previous keyframe, in microseconds.
         before_us: i64,
     },
 }

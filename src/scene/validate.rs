@@ -85,7 +85,7 @@ pub struct BadGaussian {
 pub struct BadGaussians {
     /// The first of them: at least one, at most [`NAMED_BAD_GAUSSIANS`].
     pub first: Vec<BadGaussian>,
-    /// How many there are.
+    /// Number of these.
     pub count: u64,
     /// Number of Gaussians in the file.
     pub gaussians: u64,

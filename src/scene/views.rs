@@ -24,7 +24,7 @@ use crate::geometry::{Camera, CameraError, Pose};
 pub struct RecordedView {
     /// The drive, by its name.
     pub trajectory: String,
-    /// Where along the drive it was taken, in metres from its start.
+    /// Station of the drive at which it was taken, in metres from its start.
     pub station_m: f64,
     /// Name of the camera, `[a-z0-9._-]+`.
     pub camera_name: String,

@@ -4,7 +4,7 @@ use super::record::DriveRecord;
 use super::scored::Score;
 use super::{alpasim, alpasim_plans, bench2drive, hugsim, navsim, neuroncap, own};
 
-/// The least and the greatest value that a score can have; infinite without a bound, and of a name that is none of
+/// The least and the greatest value of a score; infinite without a bound, and for a name that is not one of
 /// [`score`]'s.
 pub fn range_of(name: &str) -> [f64; 2] {
     let [deviation, collision, ades @ ..] = alpasim_plans::NAMES;
@@ -22,7 +22,7 @@ pub fn range_of(name: &str) -> [f64; 2] {
     }
 }
 
-/// Whether a lower value of a score is a better one; not so of a name that is none of [`score`]'s.
+/// Whether a lower value of a score is better; false for a name that is not one of [`score`]'s.
 pub fn lower_is_better(name: &str) -> bool {
     // Deviation of plans, their collisions, and their distances from the recorded drive.
     let of_plans = alpasim_plans::NAMES;

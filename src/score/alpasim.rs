@@ -1,4 +1,4 @@
-//! AlpaSim's scene score, with its faults; `alpasim_plans` and `alpasim_road` have its other scores.
+//! AlpaSim's scene score, including its defects; `alpasim_plans` and `alpasim_road` have its other scores.
 //!
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/aggregation/scene_score.py`, `scorers/collision.py`,
 //! `scorers/plan_deviation.py`.
@@ -20,9 +20,9 @@ pub const WRONG_LANE: &str = "alpasim.wrong_lane@3032e0c";
 
 /// Progress at which the score saturates.
 const FULL_PROGRESS: f64 = 0.8;
-/// A recording that is shorter says nothing of progress, in metres.
+/// Progress is not measured along a recording that is shorter than this, in metres.
 const SHORT_RECORDING_M: f64 = 5.0;
-/// The episode is cut where the ego is farther from the recorded drive, in metres.
+/// The episode is cut where the ego is farther than this from the recorded drive, in metres.
 const CUT_M: f64 = 4.0;
 
 /// Which side of the ego was hit.
@@ -30,22 +30,22 @@ const CUT_M: f64 = 4.0;
 pub enum Side {
     /// The front line touches the other.
     Front,
-    /// The rear line does.
+    /// The rear line touches the other.
     Rear,
-    /// Neither does.
+    /// Neither line touches the other.
     Lateral,
 }
 
 /// The contacts at one instant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Collision {
-    /// As published: that of the last track in the list. Another track after it hides a contact of the front.
+    /// As published, the side of the last track in the list. A later track hides a contact with the front.
     pub published: Option<Side>,
     /// Whether any track was hit by the front or the side.
     pub any_at_fault: bool,
 }
 
-/// The side that another box touches; front is asked first. `None` without a contact.
+/// The side that another box touches; the front is tested first. `None` without a contact.
 pub fn side(ego: &Footprint, other: &Footprint) -> Option<Side> {
     if !ego.touches(other) {
         return None;
@@ -65,14 +65,14 @@ fn side_of(ego: &RoundedBox, other: &Footprint) -> Option<Side> {
 }
 
 impl Side {
-    /// Whether it is the ego's fault.
+    /// Whether a contact on this side is the ego's fault.
     pub fn is_at_fault(self) -> bool {
         self != Self::Rear
     }
 }
 
 impl Collision {
-    /// From the sides of all tracks that are hit, in the order of the list.
+    /// The contacts by the sides of all tracks that are hit, in the order of the list.
     pub fn of(sides: &[Side]) -> Self {
         let published = sides.last().copied();
         Self { published, any_at_fault: sides.iter().any(|side| side.is_at_fault()) }
@@ -84,7 +84,7 @@ impl Collision {
     }
 }
 
-/// What the scene score depends on.
+/// The input of the scene score.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rollout {
     /// Progress along the recorded drive, as a share.

@@ -14,7 +14,7 @@ use super::record::{EgoSample, EgoShape};
 const BOX_SHARE: f64 = 0.98;
 /// Radius of its corners, as a share of the lesser side.
 const CORNER_SHARE: f64 = 0.25;
-/// Points of a corner's arc at which it is held against the lanes.
+/// Number of points of a corner's arc that are tested against the lanes.
 const ARC_POINTS: usize = 5;
 
 /// The ego as AlpaSim tests it: 2 % smaller, with rounded corners.
@@ -61,7 +61,7 @@ impl RoundedBox {
         });
         let Footprint { center_m, forward, length_m, width_m } = self.core;
         let left = self.core.left();
-        // A side's way, and how far out it is.
+        // The vector along each side, and the vector from the centre to its middle.
         let along = [length_m * forward, (0.5 * width_m + self.radius_m) * left];
         let across = [width_m * left, (0.5 * length_m + self.radius_m) * forward];
         let sides = [along, across].into_iter().flat_map(|[way_m, out_m]| {
@@ -72,17 +72,17 @@ impl RoundedBox {
         arcs.chain(sides.map(|from_center_m| center_m + from_center_m)).collect()
     }
 
-    /// No point of it is farther from its centre, in metres.
+    /// Largest distance of its points from its centre, in metres.
     pub fn reach_m(&self) -> f64 {
         0.5 * self.outline.length_m.hypot(self.outline.width_m)
     }
 
-    /// Whether a point lies in it.
+    /// Whether a point lies in the box.
     pub fn holds(&self, point_m: DVec2) -> bool {
         self.core.distance_to_m(point_m) <= self.radius_m
     }
 
-    /// Its distance from another box, in metres; 0 if they touch.
+    /// The distance from another box, in metres; 0 if they touch.
     pub fn distance_m(&self, other: &Footprint) -> f64 {
         (self.core.distance_m(other) - self.radius_m).max(0.0)
     }

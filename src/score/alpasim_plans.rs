@@ -1,12 +1,12 @@
-//! What AlpaSim scores of an agent's plans, with its faults.
+//! AlpaSim's scores of an agent's plans, including their defects.
 //!
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/plan_deviation.py`, `minADE.py`,
 //! `open_loop_collision.py`, and `src/wizard/configs/base_config.yaml` for the parameters. Distances are between
-//! centres of the ego's box, without height. What comes after a collision, off the road or 4 m off the recording is
-//! cut, as in the scene score.
+//! centres of the ego's box, without height. As in the scene score, the episode is cut after a collision, or where the
+//! ego is off the road or 4 m off the recording.
 //!
-//! A plan that AlpaSim interpolates beyond its end raises an error there; here the plan says nothing of that time. Its
-//! minimum over sampled plans is that of the one plan that an agent sends.
+//! AlpaSim raises an error if it interpolates a plan beyond its end; here such times are left out. Its minimum over
+//! sampled plans is the value of the one plan that an agent sends.
 
 use glam::DVec2;
 
@@ -27,14 +27,14 @@ pub const NAMES: [&str; 6] = [
     "alpasim.min_ade_5s@3032e0c",
 ];
 
-/// How much less each later pose weighs in the deviation of plans.
+/// Decay of the weights of later poses in the deviation of plans: exp(-0.1 k).
 const DECAY: f64 = 0.1;
-/// How far ahead plans are held against the boxes of the others, in microseconds.
+/// Time ahead for which plans are tested against the boxes of the others, in microseconds.
 const HORIZON_US: i64 = 3_000_000;
-/// How far ahead plans are held against the recorded drive, in microseconds.
+/// Times ahead for which plans are compared with the recorded drive, in microseconds.
 const TIME_DELTAS_US: [i64; 4] = [500_000, 1_000_000, 2_500_000, 5_000_000];
 
-/// The mean of distances between successive plans, weighted by exp(-decay k); `None` of none.
+/// The mean of distances between successive plans, weighted by exp(-decay k); `None` without distances.
 pub fn plan_deviation(distances_m: &[f64], decay: f64) -> Option<f64> {
     let weight = |k: usize| (-decay * k as f64).exp();
     let sum: f64 =
@@ -63,11 +63,11 @@ pub(crate) fn scores(record: &DriveRecord, cut_us: &Result<i64, Missing>) -> Vec
     scores
 }
 
-/// What the scores are made of.
+/// The input of the scores.
 struct Input<'a> {
     record: &'a DriveRecord,
     shape: EgoShape,
-    /// Those that were decided before the cut.
+    /// The plans that were decided before the cut.
     plans: Vec<&'a Plan>,
 }
 
@@ -88,7 +88,7 @@ impl<'a> Input<'a> {
         pose.origin_m + self.shape.center_x_m * DVec2::from_angle(pose.yaw_rad)
     }
 
-    /// Mean distance between each plan and the one before, at the times that both have.
+    /// Mean distance between each plan and the previous one, at the times that both have.
     ///
     /// `min_timesteps` of AlpaSim's configuration is never read there: a single common time is enough.
     fn deviation(&self) -> Measured {
@@ -105,7 +105,7 @@ impl<'a> Input<'a> {
         found.ok_or(Missing::new("needs two plans in succession that have times in common"))
     }
 
-    /// Share of the decisions whose plan meets the box of another within 3 s, at the times of the plan's poses.
+    /// Share of the decisions whose plan overlaps the box of an actor within 3 s, at the times of the plan's poses.
     fn collision(&self) -> Measured {
         let tracks = self.record.tracks.as_deref().unwrap_or_default();
         let of_plan = |plan: &&Plan| {
@@ -137,8 +137,9 @@ impl<'a> Input<'a> {
         )))
     }
 
-    /// Of one plan. The mean ends at the first step that is not before the time ahead; it is none if that step is later
-    /// than the longest of the times, the end of the episode, of the plan or of the recorded drive.
+    /// The mean distance of one plan. The mean ends at the first step that is not before the time ahead. `None` if this
+    /// step is later than the longest of [`TIME_DELTAS_US`], or than the end of the episode, of the plan or of the
+    /// recorded drive.
     fn ade_of(&self, plan: &Plan, reference: &ReferenceDrive, delta_us: i64) -> Option<f64> {
         let dt_us = self.record.dt_us;
         let now_us = plan.decided_us();
@@ -165,7 +166,7 @@ fn recorded_at(reference: &ReferenceDrive, time_us: i64) -> PlannedPose {
     PlannedPose { time_us, origin_m, yaw_rad: along.to_angle() }
 }
 
-/// The box of a track at a time, between its samples; none where it is absent.
+/// The box of a track at a time, interpolated between its samples; `None` where it is absent.
 fn box_at(track: &Track, time_us: i64, dt_us: i64) -> Option<Footprint> {
     let before = usize::try_from(time_us.div_euclid(dt_us)).ok()?;
     let from = track.samples.get(before).copied().flatten()?.footprint;

@@ -1,4 +1,4 @@
-//! What AlpaSim scores of an ego on the road, with its faults.
+//! AlpaSim's scores of the ego on the road, including their defects.
 //!
 //! Source: NVlabs/alpasim 3032e0c, `src/eval/src/eval/scorers/offroad.py`. Lanes farther than 6 m from the ego, which
 //! it leaves out, contain no part of the ego either.
@@ -20,7 +20,7 @@ const EDGE_M: f64 = 1e-3;
 pub const SEAM_M: f64 = 0.2;
 /// Half of the length of line that gives its heading, in metres.
 const HEADING_M: f64 = 0.01;
-/// Headings that differ by more are of the wrong lane, in radians.
+/// If headings differ by more, the ego is in the wrong lane, in radians.
 const WRONG_RAD: f64 = PI * 2.0 / 3.0;
 
 /// The lanes of a map, each with its bounds.
@@ -47,20 +47,20 @@ impl<'a> Road<'a> {
         Self { lanes: map.lanes.iter().map(bounded).collect() }
     }
 
-    /// Whether the ego is off the road: neither one lane nor their union contains it, and it touches their edge. An ego that
-    /// is wholly outside is not off the road: it touches nothing.
+    /// Whether the ego is off the road: neither one lane nor their union contains it, and it touches their edge. An ego
+    /// that is wholly outside is not off the road, because it does not touch an edge.
     ///
-    /// The original asks for the edge of the road, a layer of its own that our maps lack; here the edges of all lanes
-    /// are it. So a seam between two lanes must not count: an opening of at most 0.2 m ([`SEAM_M`]). The original tests
-    /// the whole polygon of the ego; here it is its outline and the surroundings of every lane's edge below it, in steps
-    /// of 0.2 m: a hole of 0.4 m by 0.4 m is always found.
+    /// The original uses a map layer with the edges of the road, which our maps lack; this function uses the edges of
+    /// all lanes. So a seam between two lanes must not count: an opening of at most 0.2 m ([`SEAM_M`]). The original
+    /// tests the whole polygon of the ego; this function tests its outline and the surroundings of every lane's edge
+    /// below it, in steps of 0.2 m: a hole of 0.4 m by 0.4 m is always found.
     pub fn is_off(&self, ego: &RoundedBox) -> bool {
         let near: Vec<&Lane> = self.near(ego.center_m(), ego.reach_m() + SEAM_M).collect();
         let touches = |edge| ego.distance_m(&edge) < EDGE_M;
         !hold(&near, ego) && near.iter().any(|lane| lane.edges().any(touches))
     }
 
-    /// The lanes whose bounds are not farther from a point than `reach_m`.
+    /// The lanes whose bounds are within `reach_m` of a point.
     fn near(&self, point_m: DVec2, reach_m: f64) -> impl Iterator<Item = &'a Lane> {
         let is_near = move |bounded: &&BoundedLane<'_>| {
             let within_m = point_m.clamp(bounded.least_m, bounded.most_m);
@@ -70,7 +70,7 @@ impl<'a> Road<'a> {
     }
 }
 
-/// Whether one lane holds the ego, or all of them together.
+/// Whether one lane contains the ego, or the union of all lanes does.
 fn hold(lanes: &[&Lane], ego: &RoundedBox) -> bool {
     let outline_m = ego.outline_m(SEAM_M);
     // A lane has no hole.
@@ -119,8 +119,8 @@ fn is_in_seam(lanes: &[&Lane], point_m: DVec2) -> bool {
 
 /// Whether the centre of the ego is in a lane of another direction; `None` if the lanes have no direction.
 ///
-/// Headings from -π to π are subtracted as they are: where a lane leads west, an ego that follows it is in the wrong
-/// lane as soon as one of the two is beyond ±π.
+/// Headings from -π to π are subtracted without wrapping: where a lane leads west, an ego that follows it is in the
+/// wrong lane as soon as one of the two is beyond ±π.
 pub fn is_in_wrong_lane(map: &LaneMap, center_m: DVec2, yaw_rad: f64) -> Option<bool> {
     let ego_rad = turn_rad(0.0, yaw_rad);
     let mut directed =

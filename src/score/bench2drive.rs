@@ -1,4 +1,4 @@
-//! Bench2Drive's driving score, success, efficiency and smoothness, with their faults.
+//! Bench2Drive's driving score, success, efficiency and smoothness, including their defects.
 //!
 //! Source: Thinklab-SJTU/Bench2Drive 7ec25d1, `leaderboard/utils/statistics_manager.py`,
 //! `tools/efficiency_smoothness_benchmark.py`.
@@ -34,10 +34,10 @@ const SAME_CONTACT_US: i64 = 5_000_000;
 const SAME_CONTACT_M: f64 = 5.0;
 /// A slower ego is not charged for a contact, in m/s.
 const STANDING_MPS: f64 = 0.1;
-/// How far a vehicle counts as traffic around the ego, in metres.
+/// Largest distance of a vehicle that counts as traffic around the ego, in metres.
 const AROUND_M: f64 = 50.0;
 
-/// What costs.
+/// Infractions, most of which reduce the driving score.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Infraction {
     /// A contact with a pedestrian.
@@ -52,9 +52,9 @@ pub enum Infraction {
     Stop,
     /// A scenario that took too long.
     ScenarioTimeout,
-    /// An emergency vehicle that was not let pass.
+    /// An emergency vehicle that was blocked.
     Yield,
-    /// Too slow; costs nothing.
+    /// Too slow; does not reduce the score.
     MinSpeed,
 }
 
@@ -106,7 +106,7 @@ pub struct MotionSample {
     pub angular_velocity_degps: f64,
 }
 
-/// Whether each whole segment of 20 samples is smooth; what is left over is dropped. Fewer than 21 samples are one
+/// Whether each whole segment of 20 samples is smooth; remaining samples are dropped. Fewer than 21 samples are one
 /// segment.
 ///
 /// As published, the yaw acceleration is the yaw rate, and both are compared in degrees with bounds in radians. `None`
@@ -229,7 +229,7 @@ fn infractions(record: &DriveRecord) -> Result<Vec<Infraction>, Missing> {
     Ok(found)
 }
 
-/// The share of the way that was driven outside of the lanes of the route.
+/// The share of the driven distance that was outside of the lanes of the route.
 fn outside_percent(record: &DriveRecord) -> Measured {
     let map = record.map.as_ref().ok_or(Missing::new("needs a map of the lanes"))?;
     let mut way_m = 0.0;

@@ -1,4 +1,4 @@
-//! HUGSIM's HD-Score, with its faults.
+//! HUGSIM's HD-Score, including its defects.
 //!
 //! Source: hyzhou404/HUGSIM 62c690d, `sim/utils/score_calculator.py`, `sim/hugsim_env/envs/hug_sim.py`. Each decision
 //! is judged by its plan: poses 0.5 s apart, behind the ego's own pose.
@@ -14,11 +14,11 @@ use super::scored::{Missing, Score};
 /// The name of the score.
 pub const NAME: &str = "hugsim.hd@62c690d";
 
-/// More Gaussians than these in the box are a collision.
+/// More Gaussians than this in the box are a collision.
 const STATIC_POINTS: usize = 100;
 /// Time between two poses of a plan, in seconds.
 const STEP_S: f64 = 0.5;
-/// A plan that ends nearer than this has no heading of its own, in metres.
+/// A plan that ends nearer than this has no heading, in metres.
 const SHORT_PLAN_M: f64 = 1.0;
 
 /// A box: its footprint, and the heights from `bottom_m` to `bottom_m + height_m`.
@@ -41,7 +41,7 @@ pub struct PlanPose {
     pub yaw_rad: f64,
 }
 
-/// What one decision is judged by.
+/// The input by which one decision is judged.
 #[derive(Clone, Copy, Debug)]
 pub struct Decision<'a> {
     /// The ego now.
@@ -52,7 +52,7 @@ pub struct Decision<'a> {
     pub plan: &'a [PlanPose],
     /// Boxes of the others now and at the times of the plan; the last ones stay.
     pub objects: &'a [Vec<Footprint>],
-    /// Centres of the twin's Gaussians that are no ground, in metres.
+    /// Centres of the twin's Gaussians that are not ground, in metres.
     pub points_m: &'a [DVec3],
     /// Points of the ground, in metres.
     pub ground_m: &'a [DVec2],
@@ -79,7 +79,7 @@ impl DecisionScore {
 }
 
 impl HugsimBox {
-    /// Number of points strictly within the box. It stands on its own height: `bottom_m` is its lower side.
+    /// Number of points strictly within the box, whose lower side is `bottom_m`.
     pub fn points_within(&self, points_m: &[DVec3]) -> usize {
         let Footprint { center_m, forward, length_m, width_m } = self.footprint;
         let is_within = |point: &&DVec3| {
@@ -169,7 +169,7 @@ pub fn drivable(ground_m: &[DVec2], plan: &[PlanPose], ego: &Footprint) -> f64 {
     1.0
 }
 
-/// C: bounds of the speed's changes and of the heading; closed. The lateral acceleration is not looked at: as
+/// C: bounds of the speed's changes and of the heading; closed. The lateral acceleration is not tested: as
 /// published it is always 0. A plan of fewer than 4 poses is comfortable.
 fn comfort(plan: &[PlanPose], ego: &PlanPose) -> f64 {
     if plan.len() < 4 {
@@ -211,7 +211,7 @@ fn within_pi(angle: f64) -> f64 {
     if angle < -PI { angle + TAU } else { angle }
 }
 
-/// Route completion: the number, from 1, of the recorded camera that is nearest, over 0.9 of their number.
+/// Route completion: the index, from 1, of the nearest recorded camera, divided by 0.9 times the number of cameras.
 pub fn route_completion(nearest_camera: usize, cameras: usize) -> f64 {
     (nearest_camera + 1) as f64 / (0.9 * cameras as f64)
 }
@@ -222,7 +222,7 @@ pub fn hd_score(pdms: &[f64], completions: &[f64]) -> f64 {
     mean * completions.iter().fold(0.0, |most: f64, &rc| most.max(rc)).min(1.0)
 }
 
-/// The score of an episode. A record has no Gaussians and no plans 0.5 s apart, so there is none.
+/// The score of an episode. It never has a value, because a record has no Gaussians and no plans 0.5 s apart.
 pub fn hd(_record: &DriveRecord) -> Score {
     let missing = "needs the twin's Gaussians, its ground, and a plan for each decision";
     Score::new(NAME, Err(Missing::new(missing)), [])

@@ -1,8 +1,8 @@
 //! Scores of driven episodes.
 //!
-//! Everything here is a pure function of a [`DriveRecord`]: no renderer, no twin, no clock. A score of another
-//! project is copied with its faults, under the name and the commit of that project; ours, under `wildcity.*@N`, are
-//! corrected. A score that lacks an input has no value but a reason, never 0.
+//! Every score is a pure function of a [`DriveRecord`]: no renderer, no twin, no clock. Scores of other projects are
+//! reproduced including their defects, and named after the project and its commit. Our own, `wildcity.*@N`, are
+//! corrected versions. A score whose input is missing has a reason in place of a value; it is never 0.
 //!
 //! | module | source |
 //! |---|---|
@@ -13,7 +13,7 @@
 //! | [`bench2drive`] | Thinklab-SJTU/Bench2Drive 7ec25d1 |
 //! | [`own`] | the verdict of this project |
 //! | [`statistics`] | rates and means over many episodes, with their confidence intervals |
-//! | `record`, `plan` | what an episode is to a score |
+//! | `record`, `plan` | the data of an episode that scores use |
 //! | `map`, `polyline` | lanes and lines on the ground |
 //! | `savgol` | the Savitzky-Golay filter of the comfort scores |
 

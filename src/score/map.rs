@@ -9,9 +9,9 @@ use super::polyline::Polyline;
 /// A lane, or an intersection, seen from above.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lane {
-    /// Its outline, without repeating the first point. An open set: what lies on the outline is not in it.
+    /// Its outline, without repeating the first point. An open set: a point on the outline is not in it.
     pub outline_m: Vec<DVec2>,
-    /// Its middle, in driving direction; `None` of an area, and if the record does not have it.
+    /// Its middle, in driving direction; `None` for an area, or if the record lacks it.
     pub center: Option<Polyline>,
     /// Whether it belongs to the ego's route.
     pub is_on_route: bool,
@@ -24,18 +24,18 @@ pub struct Lane {
 pub struct RedArea {
     /// Its outline.
     pub outline_m: Vec<DVec2>,
-    /// The first sample at which it is red, and the first at which it is no more.
+    /// The samples at which it is red.
     pub samples: std::ops::Range<usize>,
 }
 
-/// What scores know of the road. Drivable is what lies in any lane.
+/// The road as scores use it. A point in any lane is drivable.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LaneMap {
     /// Its lanes.
     pub lanes: Vec<Lane>,
     /// The middle of the lanes of the ego's route.
     pub centerline: Polyline,
-    /// What red lights close.
+    /// The areas that red lights close.
     pub red: Vec<RedArea>,
 }
 
@@ -50,7 +50,7 @@ impl Lane {
         side(&self.outline_m, point_m) != Side::Outside
     }
 
-    /// The point of its outline that is nearest to a point; `None` of a lane without points.
+    /// The point of its outline that is nearest to a point; `None` for a lane without points.
     pub(crate) fn nearest_on_outline_m(&self, point_m: DVec2) -> Option<DVec2> {
         let on_edge = |(a, b): (DVec2, DVec2)| {
             let way = b - a;
@@ -77,7 +77,7 @@ impl Lane {
 }
 
 impl LaneMap {
-    /// Where the corners of a box lie.
+    /// The position of the corners of a box.
     pub fn position(&self, ego: &Footprint) -> LanePosition {
         let corners = ego.corners_m();
         let mut lanes_with_corners = 0;
@@ -118,7 +118,7 @@ impl LaneMap {
     }
 }
 
-/// Where a point is to an outline.
+/// The position of a point relative to an outline.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Side {
     Inside,
@@ -131,7 +131,7 @@ fn contains(outline_m: &[DVec2], point_m: DVec2) -> bool {
     side(outline_m, point_m) == Side::Inside
 }
 
-/// Where a point is, by the even-odd rule.
+/// The position of a point relative to an outline, by the even-odd rule.
 fn side(outline_m: &[DVec2], point_m: DVec2) -> Side {
     let mut inside = false;
     for (a, b) in edges(outline_m) {

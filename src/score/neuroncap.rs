@@ -1,4 +1,4 @@
-//! NeuroNCAP's score, with its faults, and ours beside it.
+//! NeuroNCAP's score, including its defects.
 //!
 //! Source: atonderski/neuro-ncap ecdcf28, `neuro_ncap/components/evaluator.py`.
 
@@ -25,7 +25,7 @@ const LEFT_OUT: &str = "the first contact is with a pedestrian or an object, whi
 /// End of the recording that gives the reference speed, in microseconds.
 const REFERENCE_US: i64 = 500_000;
 
-/// The impact: speed of the ego against the other, in m/s.
+/// The impact speed: that of the ego relative to the other, in m/s.
 pub fn impact_speed_mps(ego_velocity_mps: DVec2, actor_velocity_mps: DVec2) -> f64 {
     (ego_velocity_mps - actor_velocity_mps).length()
 }
@@ -58,8 +58,8 @@ pub fn first_touching_sub_step(
 
 /// The score of an episode, by its first contact.
 ///
-/// The published check of contacts (`neuro_ncap/evaluation/collision.py`, `COLLISION_CLASSES_TO_CHECK`) looks at
-/// vehicles and bicycles alone, and gives 5 to an ego that drives through a pedestrian or a barrier. So an episode whose
+/// The published check of contacts (`neuro_ncap/evaluation/collision.py`, `COLLISION_CLASSES_TO_CHECK`) tests only
+/// vehicles and bicycles, and gives 5 to an ego that drives through a pedestrian or a barrier. So an episode whose
 /// first contact is with one of those has no value. The reference speed is that of the recording's last 0.5 s, as in
 /// the code; the paper takes the impact of an undisturbed run.
 pub fn ncap(record: &DriveRecord) -> Score {

@@ -1,8 +1,9 @@
 //! `wildcity.verdict@1`: whether an episode passed.
 //!
-//! It passes without a contact at fault (`wildcity.fault@1`), with a pedestrian, or with the twin (`wildcity.static@1`),
-//! on the drivable area, and with enough progress. What the record lacks is not judged, and the verdict says so. An
-//! episode that left the trained area before its first fault neither passes nor fails: its images were not reliable.
+//! It passes if the ego had no contact at fault (`wildcity.fault@1`), with a pedestrian, or with the twin
+//! (`wildcity.static@1`), stayed on the drivable area, and made enough progress. Rules whose input is missing in the
+//! record are not judged, and the verdict lists them. An episode that left the trained area before its first fault
+//! neither passes nor fails, because its images were not reliable.
 
 use serde::Serialize;
 
@@ -15,9 +16,9 @@ use super::scored::{Missing, Score};
 /// The name of the score: 1 passed, 0 failed.
 pub const NAME: &str = "wildcity.verdict@1";
 
-/// Least progress of a pass, unless the scenario says otherwise.
+/// Default for the progress that is required to pass.
 pub const LEAST_PROGRESS: f64 = 0.8;
-/// A recording that moves less says nothing of progress, in metres.
+/// Progress is not measured along a recording that moves less than this, in metres.
 const LEAST_WAY_M: f64 = 2.0;
 
 /// The result.
@@ -30,7 +31,7 @@ pub enum Judgement {
     Failed,
     /// The ego left the trained area before any fault.
     OffModel,
-    /// The record lacks what a verdict needs.
+    /// The record lacks the input of the verdict.
     NotJudged,
 }
 
@@ -66,22 +67,22 @@ pub struct FaultAt {
     pub actor: Option<u16>,
 }
 
-/// The verdict of an episode, with what it was made from.
+/// The verdict of an episode, with the values that it is based on.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Verdict {
     /// The result.
     pub judgement: Judgement,
     /// All faults, by time.
     pub faults: Vec<FaultAt>,
-    /// What was not judged, each with the reason.
+    /// The rules that were not judged, each with the reason.
     pub not_judged: Vec<&'static str>,
-    /// Way along the recorded drive over that of the recording in the same time.
+    /// Distance along the recorded drive divided by that of the recording in the same time.
     pub progress: Option<f64>,
-    /// Progress that it takes.
+    /// Progress that is required to pass.
     pub least_progress: f64,
-    /// The least time to contact with an actor, in seconds.
+    /// The shortest time to contact with an actor, in seconds.
     pub least_ttc_s: Option<f64>,
-    /// The greatest speed of an impact, in m/s.
+    /// The largest impact speed, in m/s.
     pub impact_mps: Option<f64>,
     /// Largest accelerations, in m/s²: along the car, and v·ω across it. Not of a teleported ego.
     pub accelerations_mps2: Option<[f64; 2]>,
@@ -179,8 +180,8 @@ fn contact_faults(record: &DriveRecord) -> Vec<FaultAt> {
         .collect()
 }
 
-/// The way along the recorded drive over that of the recording, 0 to 1; 1 if the recording stands (below 2 m, as in
-/// nuPlan).
+/// The distance along the recorded drive divided by that of the recording, 0 to 1; 1 if the recording stands (below
+/// 2 m, as in nuPlan).
 fn progress(record: &DriveRecord) -> Option<f64> {
     let stations_m = record.stations_m()?;
     let recorded_m = record.recorded_way_m()?;

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use glam::DVec2;
 
-/// Where a plan is at a time.
+/// The pose of a plan at a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlannedPose {
     /// The time, in microseconds since the start of the episode.
@@ -15,7 +15,7 @@ pub struct PlannedPose {
     pub yaw_rad: f64,
 }
 
-/// What the agent planned at a decision: the ego's own pose then, and those to come, in order of time.
+/// The plan of the agent at a decision: the ego's pose at that time and future poses, in order of time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     poses: Vec<PlannedPose>,
@@ -38,7 +38,7 @@ impl Plan {
         self.poses[self.poses.len() - 1].time_us
     }
 
-    /// The poses to come.
+    /// The future poses.
     pub fn future(&self) -> &[PlannedPose] {
         &self.poses[1..]
     }

@@ -9,14 +9,14 @@ pub struct Polyline {
     stations_m: Vec<f64>,
 }
 
-/// The point of a line that is nearest to another.
+/// The point of a line that is nearest to a given point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Projection {
     /// Its station, in metres.
     pub station_m: f64,
-    /// Its distance, in metres.
+    /// Its distance from the given point, in metres.
     pub distance_m: f64,
-    /// Unit vector along the line there; zero on a line of one point.
+    /// Unit vector along the line at this point; zero on a line of one point.
     pub along: DVec2,
     /// Distance to the left of the line, in metres: negative to its right.
     pub left_m: f64,
@@ -52,13 +52,14 @@ impl Polyline {
         self.stations_m[self.stations_m.len() - 1]
     }
 
-    /// The point at a station, and the unit vector along the line there; at its ends beyond them. The vector is zero on
-    /// a line of one point.
+    /// The point at a station, and the unit vector along the line at this point; beyond the ends, those of the end. The
+    /// vector is zero on a line of one point.
     pub fn at(&self, station_m: f64) -> (DVec2, DVec2) {
         let last = self.points_m.len() - 1;
         let after =
             self.stations_m.partition_point(|&at_m| at_m < station_m).clamp(1.min(last), last);
-        // Points that coincide have no direction between them: that of the next ones holds, or of those before.
+        // Points that coincide have no direction between them: use the direction of the next points that differ, or of
+        // the previous ones.
         let differs = |k: &usize| self.stations_m[*k] > self.stations_m[*k - 1];
         let onward = (after.max(1)..=last).find(differs);
         let Some(to) = onward.or_else(|| (1..=after).rev().find(differs)) else {

@@ -1,4 +1,4 @@
-//! What an episode is to a score: numbers alone.
+//! The data of an episode that scores use: only numbers.
 
 use glam::DVec2;
 
@@ -84,15 +84,15 @@ pub struct DriveRecord {
     pub shape: Option<EgoShape>,
     /// The ego, sample by sample; at least one.
     pub ego: Vec<EgoSample>,
-    /// Whether the ego's velocities mean something: not if it was teleported.
+    /// Whether the ego's velocities are meaningful; false if it was teleported.
     pub is_driven: bool,
-    /// The actors; `None` for an episode without a scenario, which says nothing of what was around.
+    /// The actors; `None` for an episode without a scenario, whose record has no surroundings.
     pub tracks: Option<Vec<Track>>,
     /// The agent's plans, in order of their decisions; none if it sent actions or poses.
     pub plans: Vec<Plan>,
     /// Contacts with actors, in order.
     pub contacts: Vec<Contact>,
-    /// Contacts with the twin; `None` if they were not looked for.
+    /// Contacts with the twin; `None` if they were not tested.
     pub static_contacts: Option<Vec<StaticContact>>,
     /// The recorded drive.
     pub reference: Option<ReferenceDrive>,
@@ -100,7 +100,7 @@ pub struct DriveRecord {
     pub limit_us: Option<i64>,
     /// The lanes.
     pub map: Option<LaneMap>,
-    /// Progress that a pass takes, 0 to 1.
+    /// Progress that is required to pass, 0 to 1.
     pub least_progress: f64,
     /// When the ego first left the area that the twin was trained on, in microseconds.
     pub off_model_us: Option<i64>,
@@ -147,14 +147,14 @@ impl DriveRecord {
         self.dt_us * (self.ego.len() as i64 - 1)
     }
 
-    /// The way that the recorded drive made in the time of the scenario, in metres.
+    /// Distance that the recorded drive covered in the time of the scenario, in metres.
     pub fn recorded_way_m(&self) -> Option<f64> {
         let reference = self.reference.as_ref()?;
         Some(reference.station_at_m(self.limit_us.unwrap_or(self.end_us()).max(self.end_us())))
     }
 
     /// The station of the ego along the recorded drive at each sample, in metres, and its distance from it. The
-    /// search goes on from the station before, 5 m back and 50 m ahead, so that a route which crosses itself is
+    /// search covers 5 m behind and 50 m ahead of the previous station, so that a route which crosses itself is
     /// followed in order.
     pub fn stations_m(&self) -> Option<Vec<(f64, f64)>> {
         let line = &self.reference.as_ref()?.line;

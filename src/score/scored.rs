@@ -1,17 +1,17 @@
-//! A score of an episode: its value, or why there is none.
+//! A score of an episode: its value, or the reason why it has none.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-/// Why a score has no value: what it needs and the record lacks.
+/// Why a score has no value: the input that the record lacks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Missing {
     /// As a sentence: `needs a map of the lanes`.
     pub reason: String,
 }
 
-/// A value, or why there is none.
+/// A value, or the reason why there is none.
 pub type Measured = Result<f64, Missing>;
 
 /// A score of one episode.
@@ -24,12 +24,12 @@ pub struct Score {
     /// Why it has no value.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
-    /// What it was computed from and against: sub-scores, measures, thresholds; null what it lacks.
+    /// The values that it was computed from: sub-scores, measures, thresholds; null for missing ones.
     pub parts: BTreeMap<&'static str, Option<f64>>,
 }
 
 impl Missing {
-    /// What is missing.
+    /// The missing input.
     pub fn new(reason: impl Into<String>) -> Self {
         Self { reason: reason.into() }
     }
@@ -42,7 +42,7 @@ impl Score {
         value: Measured,
         parts: impl IntoIterator<Item = (&'static str, Option<f64>)>,
     ) -> Self {
-        // JSON has no infinity, and a score is never one.
+        // JSON has no infinity, and no score is infinite.
         let value = value.and_then(|value| match value.is_finite() {
             true => Ok(value),
             false => Err(Missing::new("is not a finite number")),

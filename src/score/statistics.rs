@@ -7,7 +7,7 @@ const NORMAL: f64 = 1.959_963_984_540_054;
 
 /// The interval of a pass rate after `passed` of `runs`: Wilson's score interval (1927), 95 %.
 ///
-/// It stays within [0, 1] and says something even if all or none passed. Without runs it is [0, 1].
+/// It stays within [0, 1] and is useful even if all or none passed. Without runs it is [0, 1].
 pub fn wilson(passed: u64, runs: u64) -> [f64; 2] {
     if runs == 0 {
         return [0.0, 1.0];
@@ -23,7 +23,7 @@ pub fn wilson(passed: u64, runs: u64) -> [f64; 2] {
     [low, high]
 }
 
-/// A mean of fewer values has no interval: t is 12.7 for two, which says nothing of a score.
+/// A mean of fewer values has no interval: for two values t is 12.7, and the interval would be useless.
 pub const LEAST_VALUES: usize = 3;
 
 /// A mean, its standard deviation and half of its 95 % interval.
@@ -40,7 +40,7 @@ pub struct Mean {
 }
 
 impl Mean {
-    /// The mean of values that vary as Student's t says; `None` of none.
+    /// The mean of some values, with an interval by Student's t distribution; `None` without values.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n = values.len();
         if n == 0 {

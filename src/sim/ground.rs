@@ -34,7 +34,7 @@ impl<'a> Ground<'a> {
         Self { drives, lanes: None }
     }
 
-    /// The same, and lanes where no drive is near.
+    /// This ground, and that of lanes where no drive is near.
     pub fn and_lanes(self, lanes: Option<&'a LaneSurface>) -> Self {
         Self { lanes, ..self }
     }
@@ -223,7 +223,7 @@ mod tests {
     #[test]
     fn a_pose_high_above_a_drive_is_far_from_it() {
         let drives = drives();
-        // Beside the begin of the street.
+        // Next to the start of the street.
         let height_m = |above_m: f64| {
             let position_m = DVec3::new(45.0, -25.0, above_m);
             Ground::from_drives(&drives).place(Pose { position_m, ..Pose::IDENTITY }).position_m.z

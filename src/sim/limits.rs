@@ -34,8 +34,8 @@ pub const GROUND_NEAR_M: f64 = 25.0;
 /// Smallest z component of a ground plane's unit normal: a slope of 45 degrees, steeper than any street.
 pub const GROUND_UP: f64 = std::f64::consts::FRAC_1_SQRT_2;
 
-/// Smallest length of a unit vector's part along the ground that gives a heading. Rounding leaves about 1e-16 of a vector along the
-/// normal.
+/// Smallest length of a unit vector's part along the ground that gives a heading. Rounding leaves about 1e-16 of a
+/// vector along the normal.
 pub const GROUND_HEADING: f64 = 1e-9;
 
 /// Longest sub-step of traffic, in microseconds.
@@ -87,21 +87,21 @@ pub const LINE_POINTS: usize = 100_000;
 /// Points of the route in an observation: AlpaSim's number.
 pub const ROUTE_POINTS: u32 = 20;
 
-/// How far behind and ahead of its last place the ego is searched on its route, in metres.
+/// How far behind and ahead of its previous place the ego is searched for on its route, in metres.
 pub const ROUTE_SEARCH_M: [f64; 2] = [30.0, 100.0];
 
-/// Farther than this from that part, the ego is searched on the whole route, in metres.
+/// If the ego is farther than this from the searched part, it is searched for on the whole route, in metres.
 pub const ROUTE_LOST_M: f64 = 50.0;
 
-/// The share of a route from which on it may be done, and the distance from its end, in metres (HUGSIM).
+/// A route is done if more than this share of it was driven and the ego is within [`ROUTE_END_M`] of its end (HUGSIM).
 pub const ROUTE_DONE: f64 = 0.99;
-/// See [`ROUTE_DONE`].
+/// See [`ROUTE_DONE`], in metres.
 pub const ROUTE_END_M: f64 = 10.0;
 
 /// Slower than this is stuck, in m/s (Bench2Drive).
 pub const STUCK_M_S: f64 = 0.1;
 
-/// Commands of one route.
+/// Most commands of one route.
 pub const COMMANDS: usize = 1000;
 
 /// Longest text of a command, in bytes.

@@ -164,15 +164,15 @@ pub const LOAD_BACKOFF: Duration = Duration::from_millis(50);
 /// some seconds of driving.
 pub const LOAD_TIMES: usize = 256;
 
-/// Interval at which a load that waits for room looks again without a notification. The end of a
-/// frame does notify.
+/// Interval at which a load that waits for free memory checks again without a notification. The
+/// end of a frame does notify.
 pub const ROOM_POLL: Duration = Duration::from_secs(1);
 
 /// Length of the queue beyond which nothing more is prefetched: at 40 B each, 10 MB. A frame with a
 /// reach of 300 m has some thousands of sections.
 pub const QUEUED_SECTIONS: usize = 1 << 18;
 
-/// The most squares that the search for a twin's worst frame looks at. 20 km of road are 320 cells
+/// Most squares that the search for a twin's worst frame tests. 20 km of road are 320 cells
 /// of 64 m in a row; the larger squares above them are at most twice as many.
 pub const WORST_CASE_SQUARES: usize = 4096;
 

@@ -11,7 +11,7 @@ struct Case {
     kid: f64,
 }
 
-/// Of three images, the subsets of two are equally frequent.
+/// The subsets of two among three images are equally frequent.
 #[test]
 fn subsets_are_drawn_evenly() {
     let a = [0.0, 1.0, 3.0].map(|value| vec![value]);

@@ -5,7 +5,7 @@ use wildcity_eval::{
 };
 use wildcity_scene::RenderProfile;
 
-/// Scores of a noisy image that is off by some steps of 255 beside the noise.
+/// Scores of a noisy image that is off by some steps of 255 in addition to the noise.
 fn scores(off: u8, lpips: Option<f64>) -> PairScores {
     let truth: Vec<u8> = (0..3 * 16 * 16).map(|at| 60 + (at * 7919 % 90) as u8).collect();
     let rendered = truth.iter().enumerate().map(|(at, value)| value + off + (at * 31 % 5) as u8);

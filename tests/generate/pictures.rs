@@ -1,4 +1,4 @@
-//! What the vehicle's cameras see: daylight, houses and ground without holes, and the sky above.
+//! Images of the vehicle's cameras: daylight, houses and ground without holes, and the sky above.
 
 use std::sync::Arc;
 
@@ -56,7 +56,7 @@ fn every_camera_sees_daylight_without_holes() {
             assert!((0.15..0.8).contains(&brightness), "{what}: brightness {brightness}");
         }
     }
-    // Of two million pixels 47,000 show nothing but rather blue sky.
+    // 47,000 of two million pixels show only rather blue sky.
     assert!(seen_sky > 20_000, "{seen_sky}");
 }
 

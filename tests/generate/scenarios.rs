@@ -7,7 +7,9 @@ use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::contact::{Contact, Detector};
 use wildcity_sim::map::Map;
 use wildcity_sim::scenario::{AssetInfo, Document, EgoStart, Scenario, Surroundings};
-use wildcity_sim::traffic::{ActorState, Beside, Course, EgoMotion, EgoState, Idm, World, rolled};
+use wildcity_sim::traffic::{
+    ActorState, Course, CourseFootPoint, EgoMotion, EgoState, Idm, World, rolled,
+};
 
 /// An episode of a scenario with a driver that follows the drive and keeps behind actors on it.
 struct Driven {
@@ -84,8 +86,8 @@ impl Driven {
         self.names.iter().position(|other| other == name).unwrap()
     }
 
-    /// Where an actor is beside the ego's drive, while it is there: the ego's station, and the actor's place.
-    fn beside(&self, name: &str) -> Vec<(f64, Beside)> {
+    /// The ego's station, and the place of an actor relative to the ego's drive, while the actor is present.
+    fn beside(&self, name: &str) -> Vec<(f64, CourseFootPoint)> {
         let course = Course::from_drive(&crate::DEMO.trajectory).unwrap();
         let index = self.index(name);
         let there = self.steps.iter().map(|step| (step.0, step.2[index]));

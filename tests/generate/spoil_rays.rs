@@ -1,4 +1,4 @@
-//! What a spoil does to single Gaussians beside a straight drive: along the rays of the drive, and unseen from it.
+//! Effects of a spoil on single Gaussians next to a straight drive: along the rays of the drive, and unseen from it.
 
 use glam::{DQuat, DVec3};
 use wildcity_generate::Spoil;
@@ -162,7 +162,7 @@ fn needles_lie_along_the_ray_and_sheets_stand_on_it_before_the_gaussian() {
         if one.is_needle() {
             let [long, ..] = one.axes(0);
             let scales = one.after.ln_scales[0].map(|ln| f64::from(ln.exp()));
-            // Of a Gaussian of 5 cm in the middle, up to 4 times as long.
+            // A Gaussian of 5 cm in the middle becomes up to 4 times as long.
             let is_long = scales[0] >= 0.049 && scales[0] <= 0.21;
             assert!(is_long && scales[1] < 0.036 && scales[2] < 0.036, "{scales:?}");
             if let Some(eye_m) = eye_m(one.mean_m, long) {

@@ -55,7 +55,7 @@ fn a_correct_device_passes() {
     assert!(self_test(&*gpu(), &cpu()).unwrap() >= 80.0);
 }
 
-/// Each mutation is a fault of one kernel, as a wrong driver would cause it.
+/// Each mutation is a fault of one kernel, like that of a wrong driver.
 #[test]
 fn a_wrong_device_fails() {
     for (stage, part, mutation) in [

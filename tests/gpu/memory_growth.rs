@@ -104,7 +104,7 @@ fn three_at_once() {
     );
 }
 
-/// Draws the largest frame, and a further one from its callback, until `frames` of them are in flight.
+/// Draws the largest frame, and a second one from its callback, until `frames` of them are in flight.
 fn draw_within(gpu: &Gpu, scene: &Scene, frames: usize) {
     if frames > 0 {
         let one_more = |view: usize, _: &Target<'_>| {

@@ -138,7 +138,7 @@ fn the_least_recently_drawn_chunks_are_evicted() {
 #[test]
 fn a_scene_beyond_the_limit_is_refused_and_the_next_is_drawn() {
     let profile = RenderProfile::default();
-    // Each cell fits alone, but not all of them together.
+    // Each cell fits by itself, but not all of them together.
     let cells = route();
     let all = cells.iter().flat_map(|cell| cell.chunks.iter().cloned());
     let (small, large) = (&cells[0], &Scene { chunks: all.collect(), ..Scene::default() });

@@ -46,7 +46,7 @@ struct Truth {
 /// The same instance for all tests.
 static TRUTH: LazyLock<Truth> = LazyLock::new(|| Truth::new(&cpu(), 7_000, wide_views(), 0.0));
 
-/// The same street with every lens and with rolling shutters.
+/// A street with every lens and with rolling shutters.
 struct LensTruths {
     /// Always by six points.
     points: Truth,

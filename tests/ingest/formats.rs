@@ -416,7 +416,7 @@ fn a_listed_scene_reads_listed_files_only() {
     assert_eq!(read.hash, ingest::read_hashed(&path, &mut |_, _| {}).unwrap().1);
 }
 
-/// What is unpacked counts against the memory of the reader, and reading stops when it is told to.
+/// Unpacked bytes count against the memory of the reader, and reading stops when the flag is set.
 #[test]
 fn a_reader_has_a_budget_and_can_be_stopped() {
     let g = gaussians(2_000, 3, 20.0, 1);

@@ -369,7 +369,7 @@ fn many_empty_layers_take_no_time() {
     assert!(took.as_secs_f64() < 1.0, "{took:?}");
 }
 
-/// What follows the content is damage, or hides something.
+/// Bytes after the content are damage, or hide something.
 #[test]
 fn bytes_after_the_end_and_wrong_counts_are_refused() {
     let g = gaussians(COUNT, 0, 20.0, 1);

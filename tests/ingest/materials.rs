@@ -103,7 +103,7 @@ fn emitted_light_adds_to_the_base_colour() {
             ),
             [0.701411, 0.665185, 0.552470],
         ),
-        // A texture alone emits nothing, since the factor is 0.
+        // A texture without a factor emits nothing, since the factor is then 0.
         (
             format!(r#"{base},"emissiveTexture":{{"index":1,"texCoord":7}}"#),
             [0.484529, 0.665185, 0.247801],

@@ -140,7 +140,7 @@ fn a_streamed_sog_is_read_in_full_detail() {
     let low = [-1.033496, -1.083135, -1.039343];
     let high = [1.03509, 0.05205518, 1.042389];
     assert!(is_within(&playbot, low, high));
-    // The finest level alone, in one file, is the same.
+    // Only the finest level, in one file, gives the same.
     let finest = read("scenes/playbot/0_0/meta.json").unwrap();
     assert!(playbot == finest, "the leaves of level 0 are its whole file");
 }
@@ -191,7 +191,7 @@ fn every_component_type_of_gltf_is_read() {
         let Some(g) = read(&format!("{folder}/{file}")) else { return };
         assert_eq!((g.len(), g.sh_degree), (15, 3));
         assert!(g.means_m.iter().all(|m| *m == [1.0, 2.0, 3.0]));
-        // x alone, as f32 and as normalised i8 and i16.
+        // Only x, as f32 and as normalised i8 and i16.
         assert!(g.quats_wxyz.iter().all(|q| *q == [0.0, 1.0, 0.0, 0.0]));
         // Logarithms, of the draft that the files follow: f32, i8, normalised i8, i16, normalised
         // i16.
@@ -211,7 +211,7 @@ fn every_component_type_of_gltf_is_read() {
             }
         }
     }
-    // Without SH it has COLOR_0 alone.
+    // Without SH it has only COLOR_0.
     let fallback = read(&format!("{folder}/khr_extensible_fallback.gltf")).unwrap();
     let colour: Vec<f32> = fallback.sh.iter().map(|c| 0.282_094_8 * c + 0.5).collect();
     let wanted = [0.282_094_8, 0.564_189_6, 0.846_284_4];

@@ -147,7 +147,7 @@ fn a_section_is_read_by_itself() {
         assert!(section.bytes < 4096 || section.offset_bytes % 4096 == 0, "{section:?}");
     }
 
-    // One damaged section fails alone.
+    // Only the damaged section fails.
     let damaged = by_place[by_place.len() / 2];
     bytes[damaged.offset_bytes as usize + 9] ^= 1;
     fs::write(&path, bytes).unwrap();

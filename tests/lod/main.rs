@@ -52,7 +52,7 @@ fn stored(gaussians: &Gaussians, record: RecordFormat, levels: bool) -> Stored {
 }
 
 impl Stored {
-    /// What is read again for a frame.
+    /// The data that is read again for a frame.
     fn scene(&self, eyes: &[Viewpoint], profile: &RenderProfile) -> PinnedScene {
         self.resident.scene(eyes, profile).unwrap()
     }

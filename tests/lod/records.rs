@@ -6,7 +6,7 @@ use wildcity_twin::store::{StorageOptions, StoreError};
 
 use crate::{commit, data, decibels, eyes, scene_files, stored, streets, tau};
 
-/// What each record must keep of an image, in dB.
+/// Least PSNR of an image with each record, in dB.
 const WANTED_DB: [(RecordFormat, f64); 4] = [
     (RecordFormat::F32, f64::INFINITY),
     (RecordFormat::H52, 75.0),

@@ -228,7 +228,7 @@ fn t24_a_rolling_shutter_is_a_render_of_each_row_in_its_turn() {
             let image = render_one(&cpu(), &street, &profile, view);
             let across =
                 matches!(direction, ShutterDirection::LeftToRight | ShutterDirection::RightToLeft);
-            // Each row alone, with exact rays, from the camera's pose when the row is exposed.
+            // Each row by itself, with exact rays, from the camera's pose when the row is exposed.
             let rows: u32 = if across { 160 } else { 100 };
             let mut truth = vec![0.0_f32; 4 * 160 * 100];
             for row in (0..rows).step_by(11) {

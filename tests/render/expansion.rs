@@ -169,7 +169,7 @@ fn rig_and_pinholes(name: &str, size_px: Option<[u64; 2]>) -> (Vec<View>, Vec<Vi
     both.unzip()
 }
 
-/// The same views while the car drives at 30 m/s and their rows are exposed in 30 ms.
+/// Views while the car drives at 30 m/s and their rows are exposed in 30 ms.
 fn rolling(views: &[View]) -> Vec<View> {
     let rolled = views.iter().map(|view| {
         let mut first = view.world_from_camera;

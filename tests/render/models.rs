@@ -1,4 +1,4 @@
-//! Camera models alone: projection and its inverse, comparison with formulas written independently, and
+//! Camera models by themselves: projection and its inverse, comparison with formulas written independently, and
 //! rejected coefficients.
 
 use glam::{DVec2, DVec3};
@@ -278,7 +278,7 @@ fn opencv_lenses_neither_fold_nor_lose_what_they_see() {
             let back = camera.unproject(at_px).unwrap_or_else(|| panic!("{lens:?} lost {slope}"));
             let off = back.distance(slope.normalize());
             assert!(off < 1e-9, "{lens:?}: {slope} came back off by {off:e}");
-            // Of two directions, the one farther along their difference has its image farther along it.
+            // The difference of two images has a positive component along the difference of the directions.
             if let Some((other, other_px)) = before {
                 let apart = (slope - other).truncate();
                 assert!(apart.dot(at_px - other_px) > 0.0, "{lens:?} mirrors {slope}, {other}");

@@ -180,7 +180,7 @@ fn a_sky_too_sharp_for_any_map_is_refused_with_the_way_out() {
     render_one(&cpu(), &scene, &EXACT, view);
 }
 
-/// A sky behind a street: the two backends agree, and it adds the right colours to the street alone.
+/// A sky behind a street: the two backends agree, and it adds the right colours to those of the street without a sky.
 #[test]
 fn a_sky_behind_gaussians() {
     let mut gaussians = street(20_000, 1, 6);

@@ -1,4 +1,4 @@
-//! What lies between the stages of the cpu backend is bounded, whatever the scene, and no bound shows in the images.
+//! The intermediate buffers of the cpu backend are bounded, whatever the scene, and no bound changes the images.
 
 use glam::DVec3;
 use wildcity_render::cpu::Cpu;
@@ -74,7 +74,7 @@ fn slabs_of_lenses_and_shutters_have_the_bytes_of_the_whole() {
     assert!(images == render(&cpu(), &scene, &RenderProfile::default(), &[rolling]));
 }
 
-/// A wall that faces the camera: every splat has the same depth, so that only ids tell slabs apart.
+/// A wall that faces the camera: every splat has the same depth, so that slabs differ only by ids.
 #[test]
 fn splats_of_one_depth_are_cut_by_their_ids() {
     let n = 120_000;

@@ -1,4 +1,4 @@
-//! The runtime library: loaded when the first model is, once, and never another one. Each test has a process
+//! The runtime library: loaded when the first model is, once, and never a second one. Each test has a process
 //! of its own, since a library stays.
 
 use std::fs;
@@ -12,7 +12,7 @@ use crate::onnx_doubles as doubles;
 use crate::onnx_models::{Folder, library};
 use crate::support::maps;
 
-/// Runs `test` of this file alone in a process; `path` is what it gets.
+/// Runs `test` of this file by itself in a process, with `path` as its input.
 fn alone(test: &str, path: &std::path::Path) {
     let output = Command::new(std::env::current_exe().unwrap())
         .args([&format!("library::{test}"), "--exact", "--ignored", "--nocapture"])

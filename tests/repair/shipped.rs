@@ -10,7 +10,7 @@ use crate::onnx_models::library;
 use crate::root::root;
 use crate::support::picture;
 
-/// Of three levels of convolutions of 3 x 3 with halving and doubling between them, in pixels.
+/// Halo of three levels of convolutions of 3 x 3 with halving and doubling between them, in pixels.
 const HALO_PX: usize = 21;
 
 #[test]
@@ -38,7 +38,7 @@ fn it_takes_recorded_images_where_there_are_some() {
     let model = Model::load(&root().join("scenes/repair.json"), &LoadOptions::new(library()));
     let model = model.unwrap();
     let truth = picture(151, 93);
-    // A tint, as of a colour that training left to chance.
+    // A tint, as in a colour that training could not determine.
     let tinted = |value: &u8| value.saturating_sub(30);
     let rendered = Image { rgb8: truth.rgb8.iter().map(tinted).collect(), ..truth.clone() };
     let pixels = 151 * 93;

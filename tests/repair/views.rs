@@ -1,4 +1,4 @@
-//! What a model gets, and what becomes of its output.
+//! The input of a model, and the use of its output.
 
 use serde_json::json;
 use wildcity_repair::{Halo, Image, RepairError, View};
@@ -21,7 +21,7 @@ fn a_residual_of_a_model_that_changes_nothing_changes_no_byte() {
         assert_eq!(repaired.image, image, "{size}");
         assert_eq!(repaired.hash, repaired.rendered_hash);
     }
-    // The same by replacement loses detail, since the image is resampled there and back.
+    // A replacement of the image loses detail, since the image is resampled there and back.
     let changes = json!({"size": {"multiple_of": 16, "fit": "resize", "pixels": 4000}});
     let model = Folder::new(&doubles::identity(), changes).load().unwrap();
     assert_ne!(model.repair(&View::new(&image)).unwrap().image, image);
@@ -37,7 +37,7 @@ fn ranges_layouts_and_roles_of_the_output_mean_what_the_manifest_says() {
     // 0.4 more of a range of 1 is 102 more of 255, clamped.
     let more = repaired(doubles::arithmetic("Add", 0.4), json!({}));
     assert_eq!(more, [102, 112, 122, 202, 255, 255]);
-    // Of a range of 2 it is half of that.
+    // With a range of 2 it is half of that.
     let wide = json!({
         "inputs": [{"name": "image", "role": "rgb", "range": [-1, 1]}],
         "outputs": [{"name": "repaired", "role": "rgb", "range": [-1, 1]}],

@@ -291,7 +291,7 @@ fn nothing_comes_without_depth_or_from_far_beside() {
     assert_eq!(valid(0), 0.0, "pixels of low opacity have no depth");
     assert!(valid(1) > 8_000.0);
 
-    // Of each block of pixels one is looked at, so all have a depth here.
+    // One pixel of each block is tested, so all have a depth in this test.
     let view = WarpTarget { depth_m: &depth_m, ..view };
     assert!(overlaps(&view, &camera, &reference.world_from_camera));
     let turned = Pose { rotation: DQuat::from_rotation_y(2.0), ..target };
@@ -337,7 +337,7 @@ fn the_cache_forgets_what_was_not_used_for_longest() {
     cache.insert(key(3), reference.clone());
     assert_eq!(cache.held(), (2, 2 * bytes));
     assert!(cache.get(&key(2)).is_none() && cache.get(&key(1)).is_some());
-    // The same key again takes no room, and what is larger than the cache is not kept.
+    // An existing key takes no more memory, and a reference larger than the cache is not kept.
     cache.insert(key(1), reference.clone());
     assert_eq!(cache.held(), (2, 2 * bytes));
     let small = ReferenceCache::new(bytes - 1);

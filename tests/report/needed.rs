@@ -1,4 +1,4 @@
-//! What each feature of a scene costs on a device, and that the base scene pays for none of them.
+//! The cost of each feature of a scene on a device. The base scene pays for none of them.
 
 use std::cell::Cell;
 

@@ -1,4 +1,4 @@
-//! What repair gains and costs beside a drive, with models whose images are known.
+//! The gain and the cost of repair off the trajectory, with models whose images are known.
 
 use std::sync::Arc;
 

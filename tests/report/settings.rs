@@ -231,7 +231,7 @@ fn of_equal_settings_the_first_is_selected_and_never_one_without_effect() {
     let tried = ["as served", "stop=0.004", "stop=0.016"];
     let keep = |setting: &Setting| tried.contains(&setting.name.as_str());
     let (mut all, _) = measured(&commit(dir.path(), vec![drive()]), &rig(), &keep);
-    // Equally exact, and each faster than the one before.
+    // Equally exact, and each faster than the previous one.
     for (m, ms) in all.iter_mut().zip([30.0, 20.0, 10.0]) {
         m.cost.step_ms = ms;
         for place in &mut m.by_sample_point {
@@ -319,7 +319,7 @@ fn a_sample_point_is_as_good_as_its_worst_camera() {
 }
 
 /// Poses at which nothing was measured: station, and distance to the left of the drive, in metres. Settings
-/// are selected and verified at stations of 6.5, 19.5 and 32.5 m, on the drive and 1, 3 and 5 m beside it.
+/// are selected and verified at stations of 6.5, 19.5 and 32.5 m, on the drive and 1, 3 and 5 m off it.
 const ELSEWHERE_M: [[f64; 2]; 6] =
     [[2.0, 0.0], [11.0, 2.0], [15.0, -2.0], [24.0, 0.0], [28.0, 4.0], [36.0, -4.0]];
 

@@ -35,7 +35,7 @@ fn sessions_beyond_the_memory_are_refused_with_the_numbers() {
     assert_eq!(cache.stats().reserved_bytes, 0);
 }
 
-/// What frames hold while they are rendered counts once, their images for each session, and both are taken from the
+/// The intermediate buffers of frames count once, their images for each session, and both are taken from the
 /// sections in memory.
 #[test]
 fn frames_take_memory_from_the_sections() {
@@ -71,7 +71,7 @@ fn frames_take_memory_from_the_sections() {
     assert_eq!(cache.stats().reserved_bytes, scene_bytes + stages / 2 + images);
     drop(second);
 
-    // A small frame may be rendered beside a large one, and two small or two large ones may not.
+    // A small frame may be rendered while a large one is; two small or two large ones may not be rendered at once.
     let frames = |is_large, beside| FrameBytes { stages, beside, is_large, images: 0 };
     let reserved = |sessions: u64, frames_bytes: u64| {
         let scenes_bytes = (sessions * scene_bytes).min(resident.total_bytes());

@@ -14,7 +14,7 @@ use crate::thread_time::thread_time;
 
 const SHAPE: EgoShape = EgoShape { length_m: 5.0, width_m: 2.0, center_x_m: 1.3 };
 
-/// A drive of 10 s along x at `speed_mps`, beside a recorded one at 10 m/s, with a parked car 100 m aside.
+/// A drive of 10 s along x at `speed_mps`, along a recorded one at 10 m/s, with a parked car 100 m aside.
 fn drive(speed_mps: f64) -> DriveRecord {
     let sample = |step: i32| EgoSample {
         origin_m: DVec2::new(0.1 * f64::from(step) * speed_mps, 0.0),
@@ -66,7 +66,7 @@ fn contact(time_us: i64, ego_mps: f64, ego_at_fault: bool) -> Contact {
     }
 }
 
-/// A drive beside or behind another box.
+/// A drive next to or behind another box.
 fn drive_with(speed_mps: f64, other: Footprint, other_mps: f64) -> DriveRecord {
     let mut record = drive(speed_mps);
     let track = &mut record.tracks.as_mut().unwrap()[0];
@@ -78,7 +78,7 @@ fn drive_with(speed_mps: f64, other: Footprint, other_mps: f64) -> DriveRecord {
     record
 }
 
-/// A lane from one x to another, so far to each side of y = 0.
+/// A lane from one x to another, with a half width to each side of y = 0.
 fn lane(x_m: [f64; 2], y_m: [f64; 2], is_on_route: bool) -> Lane {
     let corner = |x: usize, y: usize| DVec2::new(x_m[x], y_m[y]);
     let outline_m = vec![corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
@@ -259,7 +259,7 @@ fn the_parts_of_epdms_are_those_of_the_drive() {
         sample.origin_m.y = 0.6;
     }
     assert_eq!(of(&hit), [Some(0.0), Some(1.0), Some(1.0), Some(0.0), Some(0.0)]);
-    // What is left of a drive after the last whole 4 s is not looked at.
+    // The rest of a drive after the last whole 4 s is not tested.
     hit.ego.truncate(44);
     for track in hit.tracks.as_mut().unwrap() {
         track.samples.truncate(44);

@@ -85,7 +85,7 @@ fn decisions_are_as_in_the_vectors() {
     }
 }
 
-/// An even acceleration has no jerk: the bounds of the acceleration alone decide.
+/// A constant acceleration has no jerk: only the bounds of the acceleration decide.
 #[test]
 fn the_comfort_of_a_plan_is_within_the_bounds_of_its_acceleration() {
     let comfort = |acceleration_mps2: f64| {

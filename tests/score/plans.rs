@@ -138,7 +138,7 @@ fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
     for (name, expected) in ADES.into_iter().zip([0.3, 0.55, 1.3, 2.55]) {
         assert_value(&record, name, expected);
     }
-    // A second decision, 1.5 s before the end of the episode, as recorded: it counts for 0.5 and 1 s alone.
+    // A second decision, 1.5 s before the end of the episode, as recorded: it counts only for 0.5 and 1 s.
     record.plans.push(straight(85, 149, 10.0));
     for (name, expected) in ADES.into_iter().zip([0.15, 0.275, 1.3, 2.55]) {
         assert_value(&record, name, expected);
@@ -149,7 +149,7 @@ fn the_mean_distance_from_the_recording_is_over_the_steps_up_to_each_horizon() {
     short.plans = vec![straight(45, 109, 9.0)];
     assert_value(&short, ADES[1], 0.55);
     assert_none(&short, ADES[2], "reach 2.5 s ahead");
-    // A plan of 2 s says nothing of 2.5 s.
+    // A plan of 2 s has no value for 2.5 s.
     record.plans = vec![straight(0, 20, 9.0)];
     assert_value(&record, ADES[1], 0.55);
     assert_none(&record, ADES[2], "reach 2.5 s ahead");
@@ -281,7 +281,7 @@ fn an_ego_is_off_the_road_where_it_crosses_the_edge_of_all_lanes() {
     assert_value(&on(vec![half([-50.0, 1.0]), half([1.0, 150.0])]), OFF_ROAD, 1.0);
     // A median of 0.9 m below the ego is, although the arcs of its corners, 0.98 m apart, are in the two lanes.
     assert_value(&on(vec![strip([-3.0, -0.45]), strip([0.45, 3.0])]), OFF_ROAD, 1.0);
-    // Wholly beside the road it touches no edge, so that it counts as on it; a millimetre is a touch.
+    // Wholly outside of the road it touches no edge, so that it counts as on the road; a millimetre is a touch.
     assert_value(&on(vec![strip([5.0, 8.0])]), OFF_ROAD, 0.0);
     assert_value(&on(vec![strip([0.9805, 8.0])]), OFF_ROAD, 1.0);
     assert_value(&on(vec![strip([0.9815, 8.0])]), OFF_ROAD, 0.0);
@@ -339,7 +339,7 @@ fn a_heading_beyond_120_degrees_is_of_the_wrong_lane() {
     assert_value(&heading(-2.10, &east), WRONG_LANE, 1.0);
     // A heading of more than a turn is that within ±π.
     assert_value(&heading(2.0 * PI, &east), WRONG_LANE, 0.0);
-    // The lane leads west, at π. An ego at 0.01 rad beside it is at -π + 0.01: 6.27 rad apart, as published.
+    // The lane leads west, at π. An ego turned by 0.01 rad from it is at -π + 0.01: 6.27 rad apart, as published.
     let west = [[150.0, 0.0], [-50.0, 0.0]];
     assert_value(&heading(PI - 0.01, &west), WRONG_LANE, 0.0);
     assert_value(&heading(PI + 0.01, &west), WRONG_LANE, 1.0);

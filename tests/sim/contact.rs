@@ -193,7 +193,7 @@ fn every_step_length_finds_the_same_contacts() {
     assert!(found[0].ego_at_fault && found[0].kind == CollisionType::ActiveFront, "{found:?}");
 }
 
-/// Two cars pass beside each other, with a nanometre less or more than nothing between them.
+/// Two cars pass each other with a lateral gap of a nanometre less or more than 0.
 #[test]
 fn every_step_length_decides_alike_about_a_nanometre() {
     for origin_m in [DVec3::ZERO, DVec3::new(450_000.25, 5_400_000.5, 30.0)] {

@@ -46,7 +46,7 @@ fn a_wall_is_met_beside_the_drive_and_not_on_it() {
     assert_eq!(solids.area_m2(&pose(15.0, 0.0, 0.0), &EGO), 0.0);
     let met_m2 = solids.area_m2(&pose(15.0, 3.5, 0.0), &EGO);
     assert!(solids.limit().is_exceeded_by(met_m2), "{met_m2}");
-    // The front alone, if the ego turns towards the wall.
+    // Only the front, if the ego turns towards the wall.
     let met_m2 = solids.area_m2(&pose(15.0, 1.9, 0.6), &EGO);
     assert!(solids.limit().is_exceeded_by(met_m2), "{met_m2}");
 }

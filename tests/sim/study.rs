@@ -1,6 +1,6 @@
 //! Error against run time of ways to integrate the same car, for BENCHMARKS.md: run by hand, as
 //! `cargo test -p wildcity-sim --test sim study -- --ignored --nocapture`. Writes
-//! `ego_integrators.csv` and the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or beside the built program.
+//! `ego_integrators.csv` and the picture `ego_integrators.svg` to `$WILDCITY_STUDY`, or next to the built program.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -35,14 +35,14 @@ const DRIVEN_S: f64 = 1.0;
 /// An error, in m or rad, that is as bad as any.
 const LOST: f64 = 1e3;
 
-/// What one way does at one speed with one step.
+/// The result of one method at one speed with one step.
 struct Sample {
     way: Way,
     speed_m_s: f64,
     step_ms: f64,
-    /// Of place (m) and heading (rad) after a second, the larger; [`LOST`] if it has none.
+    /// The larger of the errors of place (m) and heading (rad) after a second, at most [`LOST`].
     error: f64,
-    /// Of a simulated second.
+    /// Time to compute a simulated second.
     run_time: Duration,
 }
 
@@ -167,7 +167,7 @@ fn draw(samples: &[Sample], path: &std::path::Path) {
 
 type Panel<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
-/// What has no error at all is drawn at the bottom.
+/// Values without any error are drawn at the bottom.
 const LEAST: f64 = 1e-17;
 
 fn by_speed(samples: &[Sample], panel: &Panel<'_>) {

@@ -8,7 +8,7 @@ use wildcity_sim::map::{Map, MapFile};
 use wildcity_sim::scenario::{Document, Scenario, Surroundings};
 use wildcity_sim::traffic::{EgoMotion, EgoState, World};
 
-/// Uphill along x, 5 m above 0 at its begin: a rise of 1 m in 10 m.
+/// Uphill along x, 5 m above 0 at its start: a rise of 1 m in 10 m.
 fn drive() -> Trajectory {
     let rotation = DQuat::from_rotation_y(-(0.1_f64).atan());
     let keyframe = |i: i64| {
@@ -19,7 +19,7 @@ fn drive() -> Trajectory {
     Trajectory { name: "log".into(), keyframes: (0..=100).map(keyframe).collect() }
 }
 
-/// A lane beside it that falls by 1 m in 20 m, from 30 m on.
+/// A lane next to it that falls by 1 m in 20 m, from 30 m on.
 fn map() -> Map {
     let at = |x_m: f64, y_m: f64| json!([x_m, y_m, 30.0 - 0.05 * x_m]);
     let line = |y_m: f64| -> Value { (0..=20).map(|i| at(10.0 * f64::from(i), y_m)).collect() };

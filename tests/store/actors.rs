@@ -48,7 +48,7 @@ fn an_asset_is_read_as_it_was_written() {
             }
         }
     }
-    // The same again is the same object; another record is another one.
+    // An equal asset is the same object; an asset with another record is not.
     assert_eq!(catalog.put_actor(&car, RecordFormat::F32).unwrap(), stored);
     assert_eq!(catalog.actors().unwrap().actors, std::slice::from_ref(&stored));
     let small = catalog.put_actor(&car, RecordFormat::Q32).unwrap();
@@ -92,7 +92,7 @@ fn a_damaged_asset_is_refused() {
         let error = catalog.actor(&stored.hash).unwrap_err();
         assert!(matches!(error, StoreError::ActorDamaged { .. }), "byte {at}: {error}");
     }
-    // Objects whose hash is right and whose content is not: as of another program.
+    // Objects whose hash is right and whose content is not, as if another program had written them.
     let mut refused = 0;
     let mut random = crate::scene_files::Random(5);
     for _ in 0..2_000 {
@@ -112,7 +112,7 @@ fn a_damaged_asset_is_refused() {
     assert!(refused > 1_500, "{refused} of 2,000 were refused");
 }
 
-/// What a push does.
+/// The steps of a push.
 fn add(catalog: &Catalog, name: &str, seed: u64) -> Result<AddedActor, StoreError> {
     catalog.add_actor(&asset(name, seed), RecordFormat::Q32, SameName::Refused)
 }
@@ -165,7 +165,7 @@ fn damage_is_the_assets_own() {
             let other = add(&catalog, "car", 3).unwrap().actor;
             assert_eq!(catalog.find_actor("car").unwrap(), other);
             catalog.remove_actor(&other.hash, false).unwrap();
-            // The same again repairs it.
+            // Storing the same asset again repairs it.
             assert_eq!(add(&catalog, "car", 2).unwrap().actor, car);
             assert_eq!(std::fs::read(&path).unwrap(), whole);
             assert_eq!(names(&catalog.actors().unwrap().actors), ["car", "van"]);
@@ -178,7 +178,7 @@ fn damage_is_the_assets_own() {
         assert!(matches!(error, StoreError::NoActor { found: 2, .. }), "{error}");
         assert_eq!(catalog.find_actor(&van.hash[..12]).unwrap(), van);
         std::fs::remove_file(path_alike).unwrap();
-        // One that is lost is none.
+        // A lost asset does not exist.
         std::fs::remove_file(&path).unwrap();
         assert_eq!(names(&catalog.actors().unwrap().actors), ["van"]);
         let error = catalog.find_actor(&car.hash).unwrap_err();
@@ -235,7 +235,7 @@ fn a_link_a_pipe_and_a_directory_are_damaged_assets() {
     }
 }
 
-/// A folder of objects that is none, as a link to itself or a file in its place.
+/// A folder of objects that is not a folder: a link to itself or a file in its place.
 #[test]
 fn a_damaged_folder_hides_no_other() {
     let dir = tempfile::tempdir().unwrap();

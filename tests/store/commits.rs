@@ -35,7 +35,7 @@ fn from(source: &str) -> Provenance {
     Provenance { source: source.to_owned(), ..settings().provenance }
 }
 
-/// A change of cells alone, with `source` as its provenance.
+/// A change of only cells, with `source` as its provenance.
 fn change(source: &str) -> VersionChange {
     VersionChange::of(from(source))
 }

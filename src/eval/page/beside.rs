@@ -1,4 +1,4 @@
-//! Views beside the drive, as a table and a row of pictures for each distance.
+//! Off-trajectory views, as a table and a row of pictures for each distance.
 
 use data_encoding::BASE64;
 use maud::{Markup, html};
@@ -7,7 +7,7 @@ use super::numbers::{decibels, percent, share};
 use crate::evaluation::Evaluation;
 use crate::extrapolation::{Extrapolation, ViewMeans};
 
-/// The table and the pictures; nothing if no such view was asked for.
+/// The table and the pictures; empty if no such view was requested.
 pub(super) fn section(evaluation: &Evaluation) -> Markup {
     let all = &evaluation.extrapolation;
     if all.is_empty() {

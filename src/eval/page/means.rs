@@ -8,7 +8,7 @@ use crate::kid::Kid;
 use crate::lidar::{LidarMeans, NO_LIDAR_POINT};
 use crate::means::{Gain, Means, ScoreMeans};
 
-/// Which columns there are.
+/// The columns of the table.
 #[derive(Clone, Copy)]
 struct Columns {
     lpips: bool,
@@ -90,7 +90,7 @@ fn gains(gain: &Gain, columns: Columns) -> Markup {
     }
 }
 
-/// The distances of features, if there are some.
+/// The distances of features, if there are any.
 pub(super) fn kid(evaluation: &Evaluation) -> Markup {
     let Some(kid) = &evaluation.kid else { return html! {} };
     let text =

@@ -25,7 +25,7 @@ figure div.row{grid-template-columns:repeat(auto-fit,minmax(180px,1fr))}figure i
 figcaption{font-size:13px;margin-bottom:3px}.key span{display:inline-block;padding:1px 8px;font-size:12px}
 .miss{color:#b00020;font-weight:600}";
 
-/// Share of covered pixels below which the page says that the camera may look past the scene.
+/// Share of covered pixels below which the page warns that the camera may look past the scene.
 const BARELY_COVERED: f64 = 0.05;
 
 /// The whole page. Images with thumbnails are shown, the worst first.
@@ -199,7 +199,7 @@ fn caption(image: &EvaluatedImage) -> String {
     text
 }
 
-/// Which columns the table of images has.
+/// The columns of the table of images.
 #[derive(Clone, Copy)]
 struct Columns {
     lpips: bool,
@@ -247,7 +247,7 @@ fn header(name: &str, repaired: bool) -> Markup {
 
 fn image_row(image: &EvaluatedImage, columns: Columns) -> Markup {
     let [width, height] = image.size_px;
-    // Rendered, and repaired if that was asked for.
+    // Rendered, and repaired if requested.
     let both: Vec<&Scored> = std::iter::once(&image.rendered).chain(&image.repaired).collect();
     let aligned_db = |of: &Scored| of.scores.aligned.map_or(f64::NAN, |aligned| aligned.psnr_db);
     let aligned_ssim = |of: &Scored| of.scores.aligned.map_or(f64::NAN, |aligned| aligned.ssim);

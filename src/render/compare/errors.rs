@@ -27,7 +27,7 @@ pub struct ImageErrors {
     pub depth_l1_m: f64,
 }
 
-/// An image to compare with another one.
+/// An image that is compared with another.
 #[derive(Clone, Debug)]
 pub struct Image {
     /// Width and height, in pixels.
@@ -40,16 +40,16 @@ pub struct Image {
     pub opacity: Vec<f32>,
 }
 
-/// The part of each row or column of an image that one of a smaller image covers.
+/// The rows or columns of an image that one row or column of a smaller image covers.
 struct Coverage {
     /// The first one.
     first: usize,
-    /// How much of it and of those that follow is covered; the sum is 1.
+    /// Shares of it and of those that follow in the covered part; the sum is 1.
     shares: Vec<f32>,
 }
 
 impl Coverage {
-    /// Of all `count` new rows over `own` rows.
+    /// The coverage of all `count` new rows over `own` rows.
     fn of_all(count: u32, own: u32) -> Vec<Self> {
         let step = f64::from(own) / f64::from(count);
         let of_one = |i: u32| {
@@ -66,8 +66,8 @@ impl Coverage {
 }
 
 impl Image {
-    /// The image with each pixel the mean of what it covers, as an agent shrinks an image. The mean of depths is
-    /// weighted by opacity, as depths of Gaussians are within a pixel.
+    /// A smaller image in which each pixel is the mean of the pixels that it covers, as an agent shrinks an image. The
+    /// mean of depths is weighted by opacity, as depths of Gaussians are within a pixel.
     pub fn averaged(&self, [width, height]: [u32; 2]) -> Self {
         let [own_width, own_height] = self.size_px;
         let mut new = Self {
@@ -135,7 +135,7 @@ impl ErrorAccumulator {
         self.depths += other.depths;
     }
 
-    /// The errors of all pairs; `None` if there are none.
+    /// The errors of all pairs; `None` without pairs.
     pub fn errors(&self) -> Option<ImageErrors> {
         let mut sorted = self.errors.clone();
         sorted.sort_unstable_by(f32::total_cmp);

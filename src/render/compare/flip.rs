@@ -68,7 +68,7 @@ pub fn flip(image: &[f32], truth: &[f32], size_px: [u32; 2]) -> Vec<f32> {
     (0..width * height).into_par_iter().map(error).collect()
 }
 
-/// What is compared of an image.
+/// The features of an image that are compared.
 struct Perceived {
     /// Blurred colours in the Hunt-adjusted L*a*b*.
     lab: Vec<[f32; 3]>,

@@ -127,7 +127,7 @@ pub const AGREEMENT_DB: f64 = 70.0;
 /// and depths within a hundredth, on average 1e-4, where opacity is at least 1/2. Returns the PSNR in dB.
 ///
 /// # Errors
-/// Says what differs, and by how much.
+/// Describes the difference and its size.
 pub fn agree(image: &RenderedImage, truth: &RenderedImage) -> Result<f64, String> {
     let pairs = image.rgba.iter().zip(&truth.rgba);
     let db = psnr_db(pairs.map(|(a, b)| f64::from(a - b)));

@@ -1,4 +1,4 @@
-//! Test scenes, images of them, and measures of how images differ.
+//! Test scenes, images of them, and measures of the difference of images.
 //!
 //! | module | content |
 //! |---|---|

@@ -11,7 +11,7 @@ pub fn psnr_db(differences: impl Iterator<Item = f64>) -> f64 {
     -10.0 * (sum / count as f64).log10()
 }
 
-/// The same of two images in 8 bits.
+/// The PSNR of two images in 8 bits.
 pub fn psnr_db_u8<'a>(pairs: impl Iterator<Item = (&'a u8, &'a u8)>) -> f64 {
     psnr_db(pairs.map(|(a, b)| f64::from(a.abs_diff(*b)) / 255.0))
 }

@@ -1,37 +1,38 @@
 //! Structural similarity (SSIM, Wang et al. 2004) of colour images, in the two ways in which papers compute it.
 //!
 //! Windows are Gaussian, 11 px wide, with a standard deviation of 1.5 px. Variances are those of the population. The
-//! value of a pixel is the mean over the three channels, not that of luma. Implementations differ at the image's edge,
-//! and one noisy image has 0.56 or 0.59 by it alone, so that a number needs its convention.
+//! value of a pixel is the mean over the three channels, not that of luma. Implementations differ at the image's edge:
+//! one noisy image has 0.56 or 0.59 only because of that. So a number needs its convention.
 
 use rayon::prelude::*;
 
 /// Edge of a window, in pixels.
 pub const WINDOW_PX: usize = 11;
-/// Pixels of a window beside its middle.
+/// Pixels of a window on each side of its middle.
 const REACH_PX: usize = WINDOW_PX / 2;
 /// Standard deviation of a window, in pixels.
 const SIGMA_PX: f64 = 1.5;
 /// Wang et al. 2004: C1 is `(0.01 L)²` and C2 `(0.03 L)²`, for values from 0 to L = 1.
 const C1: f64 = 1e-4;
 const C2: f64 = 9e-4;
-/// Rows that one thread computes. The order of sums, and so their last bits, depends on it and on nothing else.
+/// Rows that one thread computes. The order of sums, and so their last bits, depends only on it.
 const BAND_ROWS: usize = 32;
 
 /// Mean structural similarity of two images; 1 if nothing differs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ssim {
     /// Over the windows that lie within the image: Wang et al. 2004, and scikit-image with `gaussian_weights=True,
-    /// sigma=1.5, use_sample_covariance=False, channel_axis=-1`. With a mask, over the windows that have counted pixels
-    /// alone. NaN if there is no such window.
+    /// sigma=1.5, use_sample_covariance=False, channel_axis=-1`. With a mask, over the windows that have only
+    /// pixels that count. NaN if there is no such window.
     pub within: f64,
-    /// Over all pixels, with the image mirrored at its edges: torchmetrics' default, which gsplat uses. It knows no
-    /// mask.
+    /// Over all pixels, with the image mirrored at its edges: torchmetrics' default, which gsplat uses. It does
+    /// not support a mask.
     pub mirrored: f64,
 }
 
 impl Ssim {
-    /// Compares two images of values from 0 to 1, `[height, width, 3]`. `counts` says which pixels count; all without it.
+    /// Compares two images of values from 0 to 1, `[height, width, 3]`. `counts` marks the pixels that count; all count
+    /// without it.
     ///
     /// # Panics
     /// If a length does not fit the size.
@@ -163,7 +164,7 @@ impl BlockedPixels {
         Self { sums, stride }
     }
 
-    /// Those of the window around a pixel, which lies within the image.
+    /// Number of pixels that do not count in the window around a pixel. The window lies within the image.
     fn around(&self, row: usize, column: usize) -> u32 {
         let top = (row - REACH_PX) * self.stride;
         let bottom = (row + REACH_PX + 1) * self.stride;
@@ -175,7 +176,7 @@ impl BlockedPixels {
     }
 }
 
-/// The pixel of a row of `side` pixels that stands for one beyond its ends: mirrored, without repeating the last one.
+/// The pixel of a row of `side` pixels that replaces one beyond its ends: mirrored, without repeating the last one.
 fn mirrored(at: isize, side: usize) -> usize {
     let last = side as isize - 1;
     let turns = at.rem_euclid((2 * last).max(1));

@@ -1,7 +1,7 @@
-//! The background of a frame (sky or one colour), added where it shows through the Gaussians: the first part
-//! of stage resolve, for frames that have one.
+//! The background of a frame (sky or one colour), added where it is visible through the Gaussians: the first
+//! part of stage resolve, for frames that have one.
 //!
-//! **Every backend omits the background where less than 1/255 of it shows through.** It would add at most one
+//! **Every backend omits the background where less than 1/255 of it is visible.** It would add at most one
 //! step of 8 bits, and most pixels of a street are of this kind. Alpha remains that of the Gaussians. A
 //! background of one colour is treated as a sky of one colour.
 
@@ -70,7 +70,7 @@ impl Background {
         }
     }
 
-    /// Adds the background that shows through a tile with its top left pixel at `at_px`.
+    /// Adds the background that is visible through a tile with its top left pixel at `at_px`.
     #[inline(always)]
     pub(super) fn add<S: Simd>(
         &self,
@@ -118,7 +118,7 @@ impl Background {
             }
         };
 
-        // Colours of the sky there, weighted by the transmittance that is left.
+        // Colours of the sky in these directions, weighted by the remaining transmittance.
         let rgb = match (&self.sky, scratch) {
             (DrawableSky::CubeMap(map), _) => sample_cube_map(simd, map, direction),
             (DrawableSky::Network(network), Some(scratch)) => {

@@ -12,7 +12,7 @@ use crate::constants::BLOCK_PX;
 use crate::layout::{Cutoffs, Splat};
 use wildcity_scene::chunk::LANES;
 
-/// Splats of a batch: 64 of 308 B stay in the first-level cache beside the sums, and their bits in one u64.
+/// Splats of a batch: 64 of 308 B stay in the first-level cache together with the sums, and their bits in one u64.
 pub(super) const BATCH: usize = 64;
 
 /// A splat, with the linear forms `u` and `v` of its exponent ([`Splat::factor`]) prepared for a tile: at a
@@ -33,7 +33,7 @@ pub(super) struct Matched {
     pub(super) depth_m: f32,
 }
 
-/// A batch of splats, and which of them touch each block.
+/// A batch of splats, and the blocks that each of them touches.
 #[derive(Debug)]
 pub(super) struct Batch {
     pub(super) splats: [Splat; BATCH],
@@ -42,7 +42,7 @@ pub(super) struct Batch {
     blocks: [u16; BATCH],
     /// For each block, a bit for each splat that touches it.
     pub(super) touching: [u64; BLOCKS],
-    /// The place of each splat. Only written if instances are wanted.
+    /// The place of each splat. Only written if instances are requested.
     pub(super) places: [u32; BATCH],
 }
 
@@ -59,7 +59,7 @@ impl Default for Batch {
 }
 
 impl Batch {
-    /// Finds which splats, of the first `len`, touch each block of the tile at `at_px`.
+    /// Finds the splats among the first `len` that touch each block of the tile at `at_px`.
     ///
     /// A splat's ellipse lies within three slabs: `|dx| <= extent_x`, `|dy| <= extent_y` and `|u| <= √power`,
     /// which together are tight for needles at any angle. A block is touched if its centre lies within the slabs,

@@ -16,8 +16,8 @@ use wildcity_scene::chunk::LANES;
 /// that would bring T to the stop or below.
 ///
 /// **The transmittance that decides about stopping continues to fall after a pixel has stopped.** It never
-/// rises, so that the test `after > stop` remains false without a mask, and each iteration depends on the one
-/// before by a single multiply-add. The transmittance of the image is a separate value, which changes only
+/// rises, so that the test `after > stop` remains false without a mask, and each iteration depends on the
+/// previous one by a single multiply-add. The transmittance of the image is a separate value, which changes only
 /// where the test holds.
 #[inline(always)]
 pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
@@ -33,10 +33,10 @@ pub(super) fn blend<S: Simd, const DEPTH: bool, const INSTANCES: bool>(
     let cap = splat(cutoffs.alpha_cap);
     let cut = splat(cutoffs.log2_alpha_cut);
     let stop = splat(cutoffs.stop);
-    // Below any stop, and above the denormal numbers, which multiply slowly.
+    // Less than any stop, and larger than the denormal numbers, whose multiplication is slow.
     let floor = splat(1e-20);
 
-    // All sums in registers.
+    // Keep all sums in registers.
     let mut r = load(&sums.rgb[0][block]);
     let mut g = load(&sums.rgb[1][block]);
     let mut b = load(&sums.rgb[2][block]);

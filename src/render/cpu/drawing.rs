@@ -1,5 +1,5 @@
-//! Draws a frame within the memory that it may have between its stages: all views at once, or one half of them after
-//! the other, or one view slab by slab. The images do not depend on it.
+//! Draws a frame within the limit of its intermediate buffers: all views at once, or one half of them after the other,
+//! or one view slab by slab. The images do not depend on this choice.
 
 use fearless_simd::Level;
 
@@ -17,32 +17,32 @@ use crate::{Frame, FrameStats, OnViewDone, RenderError, Target, View, limits};
 pub(super) struct Drawing<'a> {
     pub(super) level: Level,
     pub(super) cutoffs: &'a Cutoffs,
-    /// Most bytes between the stages.
+    /// Most bytes of the intermediate buffers.
     pub(super) most_bytes: u64,
     pub(super) scratch: &'a mut Scratch,
     pub(super) finished: OnViewDone<'a>,
     pub(super) stats: FrameStats,
 }
 
-/// The most that is held while such views are drawn with `most_bytes` between the stages: these, the sums of one view
-/// that is drawn in slabs, and what each thread copies of a macro tile.
+/// Most bytes that are held while such views are drawn with `most_bytes` of intermediate buffers: these, the sums of
+/// one view that is drawn in slabs, and each thread's copies of a macro tile.
 pub(super) fn most_held_bytes(most_bytes: u64, views: &[View], threads: usize) -> u64 {
     let sums = views.iter().map(UnfinishedTiles::bytes).max().unwrap_or(0);
     most_bytes.max(sums) + sums + bin::COPIES_BYTES * threads as u64
 }
 
-/// The stages project and bin of a part of a frame.
+/// Runs the stages project and bin for a part of a frame.
 pub(super) struct Stages<'a> {
     pub(super) level: Level,
     pub(super) frame: &'a Frame<'a>,
     pub(super) cutoffs: &'a Cutoffs,
-    /// Most bytes that they may leave.
+    /// Most bytes of their outputs.
     pub(super) most_bytes: u64,
 }
 
 impl Stages<'_> {
-    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part of `scratch`, so what an earlier
-    /// frame left there, even one that panicked, does not matter.
+    /// Projects, and bins if `last` is [`Stage::Bin`]. Each stage overwrites its part of `scratch`, so the data of an
+    /// earlier frame, even one that panicked, has no effect.
     pub(super) fn run(
         &self,
         scratch: &mut Scratch,
@@ -84,7 +84,7 @@ impl Drawing<'_> {
             match self.draw_at_once(part, targets, most_bytes) {
                 Ok(()) => return Ok(()),
                 Err(PartError::Render(error)) => return Err(error),
-                // Only the stages can tell how many macro tiles the splats touch.
+                // The number of macro tiles that the splats touch is known only after the stages.
                 Err(PartError::Overflow) => {}
             }
         }
@@ -137,7 +137,7 @@ impl Drawing<'_> {
             let mut slabs = Slabs::new(&clusters, most_bytes);
             let mut instances = 0;
             while let Some(cut) = slabs.next() {
-                // What cannot be cut any more is one job at one depth.
+                // A slab that cannot be cut any more is one job at one depth.
                 let is_whole = cut.halves().is_none();
                 let most_bytes = if is_whole { u64::MAX } else { most_bytes };
                 let Self { level, cutoffs, .. } = *self;
@@ -193,9 +193,9 @@ struct Slabs<'a> {
     most_bytes: u64,
     /// Halves of slabs that had too many splats, the nearest last.
     halves: Vec<Cut>,
-    /// Where the slab after those begins.
+    /// The cut at which the slab after these begins.
     next_key: u32,
-    /// What a Gaussian is expected to take, and the estimated number of Gaussians in the last slab.
+    /// Estimated bytes of a Gaussian, and estimated number of Gaussians in the last slab.
     bytes_each: f64,
     gaussians: f64,
 }
@@ -224,7 +224,7 @@ impl<'a> Slabs<'a> {
         if self.is_done() {
             return None;
         }
-        // An eighth is left for what the estimate misses.
+        // An eighth is reserved for the error of the estimate.
         let gaussians = 0.875 * self.most_bytes as f64 / self.bytes_each;
         let (cut, estimated) = self.clusters.next(self.next_key, gaussians);
         self.next_key = cut.keys.end;
@@ -232,16 +232,16 @@ impl<'a> Slabs<'a> {
         Some(cut)
     }
 
-    /// The last slab takes so many bytes.
+    /// Records the bytes that the last slab takes.
     fn drew(&mut self, bytes: u64) {
-        // A small slab tells little of the next one.
+        // A small slab is no basis for the estimate of the next one.
         if self.halves.is_empty() && self.gaussians >= 4096.0 {
             self.bytes_each =
                 (bytes as f64 / self.gaussians).max(limits::SPLAT_BYTES as f64 / 16.0);
         }
     }
 
-    /// The last slab had too many splats.
+    /// Halves the last slab, which had too many splats.
     fn halve(&mut self, cut: &Cut) {
         self.gaussians *= 0.5;
         if let Some([near, far]) = cut.halves() {

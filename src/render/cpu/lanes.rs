@@ -7,9 +7,9 @@ use fearless_simd::{f32x16, prelude::*};
 
 use wildcity_scene::chunk::{LANES, Lanes};
 
-/// Each value in every lane of a vector of its own.
+/// One vector for each value, which has the value in every lane.
 ///
-/// A loop, and not `map` of an array: `map` remains a call, and so is compiled without the instruction set.
+/// It uses a loop and not `map` of an array: `map` remains a call, and so is compiled without the instruction set.
 #[inline(always)]
 pub(super) fn splats<S: Simd, const N: usize>(simd: S, values: [f32; N]) -> [f32x16<S>; N] {
     let mut vectors = [f32x16::splat(simd, 0.0); N];
@@ -28,7 +28,7 @@ pub(super) struct Vec3x16<S: Simd> {
 }
 
 impl<S: Simd> Vec3x16<S> {
-    /// The same vector in every lane.
+    /// One vector in every lane.
     #[inline(always)]
     pub(super) fn splat(simd: S, v: [f32; 3]) -> Self {
         let [x, y, z] = v;
@@ -69,7 +69,7 @@ impl<S: Simd> Vec3x16<S> {
         }
     }
 
-    /// Each vector times a factor of its own.
+    /// Each vector times its own factor.
     #[inline(always)]
     pub(super) fn scale(self, by: f32x16<S>) -> Self {
         Self { x: self.x * by, y: self.y * by, z: self.z * by }

@@ -5,8 +5,8 @@ use fearless_simd::{f32x16, i32x16, prelude::*};
 
 /// The angle within a quarter turn of a sine and its cosine, which is not negative; within 2e-7.
 ///
-/// Of the smaller of both it is the arc sine, by a fit of `(asin x/x - 1)/x²` that leaves 5e-9; the other way it is
-/// `π/2` minus that.
+/// The arc sine of the smaller of both, by a fit of `(asin x/x - 1)/x²` with an error of 5e-9; if the cosine is the
+/// smaller one, the angle is `π/2` minus this.
 #[inline(always)]
 pub(super) fn angle_of<S: Simd>(simd: S, sine: f32x16<S>, cosine: f32x16<S>) -> f32x16<S> {
     let splat = |value: f32| f32x16::splat(simd, value);

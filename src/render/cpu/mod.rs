@@ -1,9 +1,21 @@
 //! The cpu backend, the default: f32, SIMD chosen at run time, all cores.
 //!
-//! Each file is a stage: `project`, `bin`, `sort`, `rasterize`, `resolve`. The images are
-//! deterministic: parallel work writes to places that do not depend on the schedule, and every pixel adds its
-//! splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that would
-//! exceed it together are rendered one half after the other, and one view that would in slabs of depths.
+//! | module | what it does |
+//! |---|---|
+//! | `project`, `bin`, `sort`, `rasterize`, `resolve` | the stages |
+//! | `background`, `appearance` | parts of the stage resolve |
+//! | `drawing`, `part` | run the stages within the memory limit, for all views or for parts of a frame |
+//! | `slabs`, `unfinished` | split a view that exceeds the limit into ranges of depth, and keep sums between them |
+//! | `overflow` | why a part of a frame was not drawn |
+//! | `batch`, `blend` | match the splats of a tile with its blocks, and blend them |
+//! | `lens` | lenses, windshields and rolling shutters for SIMD |
+//! | `lanes`, `math` | SIMD vectors and elementary functions |
+//! | `export` | outputs of the stages for another backend |
+//!
+//! The images are deterministic: parallel work writes to places that do not depend on the schedule, and every pixel
+//! adds its splats in one order. Scratch buffers are kept from frame to frame. Their size is bounded: views that
+//! together exceed the bound are rendered one half after the other, and a single view that exceeds it in slabs of
+//! depths.
 
 mod appearance;
 mod background;
@@ -46,10 +58,10 @@ use super::{Backend, Frame, FrameStats, OnViewDone, RenderError, Target, View};
 #[derive(Debug)]
 pub struct Cpu {
     main: Lane,
-    /// For frames that are rendered while another one is; `None` if its threads cannot be started.
+    /// For frames that are rendered while the main lane is busy; `None` if its threads cannot be started.
     side: OnceLock<Option<Lane>>,
     level: Level,
-    /// Most bytes that the main lane holds between the stages of a frame.
+    /// Most bytes of the main lane's intermediate buffers.
     lane_bytes: AtomicU64,
 }
 
@@ -65,7 +77,7 @@ struct Lane {
 struct BusyLane<'a> {
     pool: &'a ThreadPool,
     scratch: MutexGuard<'a, Scratch>,
-    /// Most bytes that it may hold between the stages.
+    /// Most bytes of its intermediate buffers.
     most_bytes: u64,
 }
 
@@ -100,8 +112,8 @@ pub enum CpuError {
     Threads(rayon::ThreadPoolBuildError),
 }
 
-/// The side lane may hold one in so many of the bytes of the main lane.
-const SIDE_SHARE: u64 = 4;
+/// The side lane may use 1/4 of the main lane's buffer memory.
+const SIDE_LANE_DIVISOR: u64 = 4;
 
 /// Buffers that each frame fills anew.
 #[derive(Debug, Default)]
@@ -146,7 +158,7 @@ impl Cpu {
         }
         let threads = self.main.pool.current_num_threads();
         let side = self.side.get_or_init(|| Lane::new(threads, "render-side").ok());
-        let side = side.as_ref().and_then(|side| side.try_take(most_bytes / SIDE_SHARE));
+        let side = side.as_ref().and_then(|side| side.try_take(most_bytes / SIDE_LANE_DIVISOR));
         side.unwrap_or_else(|| self.main.take(most_bytes))
     }
 
@@ -228,7 +240,7 @@ impl Backend for Cpu {
     }
 
     fn bytes_beside(&self, views: &[View]) -> u64 {
-        let most_bytes = self.lane_bytes.load(Relaxed) / SIDE_SHARE;
+        let most_bytes = self.lane_bytes.load(Relaxed) / SIDE_LANE_DIVISOR;
         drawing::most_held_bytes(most_bytes, views, self.threads())
     }
 
@@ -282,8 +294,8 @@ impl StageTimer {
         Self::add(name, ms, stats);
     }
 
-    /// The same of two stages that alternate, each with its time in all threads: they get their shares of the wall
-    /// time.
+    /// Adds the times of two stages that alternate, given the time of each in all threads: they share the wall time in
+    /// this proportion.
     fn finish_both(&mut self, stages: [(&'static str, u64); 2], stats: &mut FrameStats) {
         let ms = self.lap_ms();
         let total: u64 = stages.iter().map(|(_, ns)| ns).sum();

@@ -1,15 +1,15 @@
-//! Why a part of a frame is not drawn as it is: what no part may hold, and what fails the frame.
+//! Why a part of a frame is not drawn as it is: it exceeds a limit of memory, or the frame fails.
 
 use crate::RenderError;
 
-/// A part of a frame needs more memory than it may have between its stages.
+/// A part of a frame needs larger intermediate buffers than it may have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Overflow;
 
 /// Why a part of a frame was not drawn.
 #[derive(Debug)]
 pub(super) enum PartError {
-    /// It is to be drawn in smaller parts.
+    /// It must be drawn in smaller parts.
     Overflow,
     /// The frame fails.
     Render(RenderError),

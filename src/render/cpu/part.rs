@@ -1,4 +1,4 @@
-//! Parts of a frame: the views that are rendered together, so that what lies between the stages stays small.
+//! Parts of a frame: the views that are rendered together, so that the intermediate buffers stay small.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,7 @@ use wildcity_scene::chunk::{CLUSTER, Cluster};
 /// Some of a frame's views, which are rendered together.
 #[derive(Clone, Copy)]
 pub(super) struct FramePart<'a> {
-    /// The frame with these views only.
+    /// The frame with only these views.
     pub(super) frame: Frame<'a>,
     /// One per view of the part, or none.
     pub(super) backgrounds: &'a [Background],
@@ -20,7 +20,7 @@ pub(super) struct FramePart<'a> {
 }
 
 impl FramePart<'_> {
-    /// The same in two parts.
+    /// This part cut into two.
     pub(super) fn halves(&self) -> [Self; 2] {
         let middle = self.frame.views.len() / 2;
         let (first, second) = self.frame.views.split_at(middle);
@@ -39,8 +39,8 @@ impl FramePart<'_> {
         ]
     }
 
-    /// A bound of its splats: all Gaussians of actors and of the clusters that its views may see. Scenes with at most
-    /// `few` for all views are not looked at.
+    /// An upper bound of its splats: all Gaussians of actors and of the clusters that its views may see. The clusters
+    /// of scenes with at most `few` Gaussians for all views are not tested.
     pub(super) fn max_splats(&self, few: usize) -> usize {
         let Frame { scene, views, .. } = self.frame;
         let all = scene.gaussians() * views.len();

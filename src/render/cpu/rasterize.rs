@@ -30,7 +30,7 @@ use crate::{OnViewDone, Target, View};
 use wildcity_scene::appearance::Appearance;
 use wildcity_scene::chunk::LANES;
 
-/// The outputs of the stages before.
+/// The outputs of the previous stages.
 #[derive(Clone, Copy)]
 pub(super) struct Input<'a> {
     pub(super) projected: &'a Projected,
@@ -41,12 +41,12 @@ pub(super) struct Input<'a> {
     pub(super) cutoffs: &'a Cutoffs,
 }
 
-/// What threads keep from macro tile to macro tile. Not in use.
+/// Unused scratch memory, which threads keep from macro tile to macro tile.
 #[derive(Debug, Default)]
 pub(super) struct Scratches(Mutex<Vec<Box<Scratch>>>);
 
 impl Scratches {
-    /// Frees what threads keep if it is more than `most_bytes`.
+    /// Frees the scratch memory of threads if it is more than `most_bytes`.
     pub(super) fn trim(&mut self, most_bytes: u64) {
         let scratches = self.0.get_mut();
         let bytes: usize = scratches.iter().map(|scratch| scratch.macro_tile.held_bytes()).sum();
@@ -56,14 +56,14 @@ impl Scratches {
     }
 }
 
-/// Of one thread.
+/// The scratch memory of one thread.
 #[derive(Debug, Default)]
 struct Scratch {
     macro_tile: MacroTile,
     batch: Batch,
 }
 
-/// What was done.
+/// The work that was done.
 #[derive(Debug, Default)]
 pub(super) struct Work {
     /// Number of Gaussian-pixel evaluations.
@@ -86,8 +86,8 @@ struct Drawing<'a> {
     bands: Vec<Mutex<Band<'a>>>,
 }
 
-/// Sorts and draws all views, and calls `on_view_done` as each is complete. Of a slab there is one view, complete after
-/// the last one.
+/// Sorts and draws all views, and calls `on_view_done` as each is complete. A slab has one view, which is complete
+/// after the last slab.
 pub(super) fn rasterize(
     level: Level,
     input: Input<'_>,
@@ -110,7 +110,7 @@ pub(super) fn rasterize(
                 background: input.backgrounds.get(index),
                 bands: resolve::bands(target, view).into_iter().map(Mutex::new).collect(),
             };
-            // A bridge hands them out in this order.
+            // `par_bridge` hands them out in this order.
             input.bins.by_work(index).into_iter().par_bridge().for_each(|number| {
                 let mut scratch = scratches.0.lock().pop().unwrap_or_default();
                 let work = dispatch!(level, simd => {
@@ -136,14 +136,14 @@ pub(super) fn rasterize(
     }
 }
 
-/// What is accumulated beside colours and transmittance.
+/// The values that are accumulated in addition to colours and transmittance.
 #[derive(Clone, Copy)]
 struct Wants {
     depth: bool,
     instances: bool,
 }
 
-/// Where one tile is accumulated.
+/// The accumulated values of one tile.
 struct TileOutput<'a> {
     sums: &'a mut TileSums,
     /// A bit for each block in which some pixel has not stopped.
@@ -177,7 +177,7 @@ fn draw_macro_tile<S: Simd>(
     let mut sky_scratch = background.and_then(Background::scratch);
     let mut halved_by = NOT_HALVED;
     let mut evaluations = 0;
-    // Of earlier slabs.
+    // Tiles of earlier slabs.
     let has_sums = unfinished.as_ref().is_some_and(|tiles| !tiles.is_empty());
     if let (false, false, Some(tiles)) = (is_last, has_sums, &mut unfinished) {
         tiles.reserve_exact(drawing.grid.tiles_of(number).count());

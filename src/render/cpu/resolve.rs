@@ -33,7 +33,7 @@ pub(super) struct TileSums {
     pub(super) rgb: [[[f32; LANES]; BLOCKS]; 3],
     /// Depth weighted by contribution, in metres; 0 unless depth is requested.
     pub(super) depth_m: [[f32; LANES]; BLOCKS],
-    /// Share of the background that shows.
+    /// Share of the background that is visible.
     pub(super) transmittance: [[f32; LANES]; BLOCKS],
     /// Transmittance that continues to fall after a pixel has stopped (see `blend::blend`).
     pub(super) running: [[f32; LANES]; BLOCKS],
@@ -60,8 +60,8 @@ pub(super) struct Band<'a> {
 }
 
 impl Band<'_> {
-    /// Writes the instances of one tile with its left edge at column `left`. If there are some of earlier slabs, those
-    /// of pixels that were halved there stay.
+    /// Writes the instances of one tile with its left edge at column `left`. If earlier slabs wrote some,
+    /// the instances of pixels that were halved in those slabs stay.
     pub(super) fn write_instances(
         &mut self,
         halved_by: &HalvedBy,
@@ -167,7 +167,7 @@ fn resolve_block<S: Simd>(simd: S, sums: &TileSums, block: usize, left: u32, ban
             bytes[4..8].copy_from_slice(&(b >> 8 | c << 16).to_le_bytes());
             bytes[8..].copy_from_slice(&(c >> 16 | d << 8).to_le_bytes());
             let to = &mut rgb8[first..first + 3 * columns];
-            // Of a fixed length, so that the compiler makes few stores of it.
+            // A slice of a fixed length, so that the compiler makes few stores of it.
             match <&mut [u8; 3 * BLOCK_PX as usize]>::try_from(&mut *to) {
                 Ok(to) => *to = bytes,
                 Err(_) => to.copy_from_slice(&bytes[..to.len()]),

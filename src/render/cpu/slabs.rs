@@ -1,13 +1,13 @@
-//! Slabs: the splats of one view in a range of depths, drawn from the nearest slab to the farthest, so that what lies
-//! between the stages is bounded whatever the scene.
+//! Slabs: the splats of one view in a range of depths, drawn from the nearest slab to the farthest, so that the
+//! intermediate buffers are bounded whatever the scene.
 //!
 //! A pixel blends its splats in order of (depth, global id). A view that is drawn in ranges of that order therefore has
-//! the same bytes, if each tile continues from the sums of the slab before. Depth cuts a view for every camera alike:
-//! the depths of a cluster's Gaussians are bounded by their distance from the camera, whatever the lens. (Bands of rows
-//! would need no sums, but a bound on the rows of a cluster for each lens and shutter, and large splats lie in many
-//! bands.) A cluster that reaches into two slabs is projected for both, and each keeps its own splats.
+//! the same bytes, if each tile continues from the sums of the previous slab. Depth cuts a view in the same way for
+//! every camera: the depths of a cluster's Gaussians are bounded by their distance from the camera, whatever the lens.
+//! (Bands of rows would need no sums, but a bound on the rows of a cluster for each lens and shutter, and large splats
+//! lie in many bands.) A cluster that reaches into two slabs is projected for both, and each keeps its own splats.
 //!
-//! How many splats a slab has is estimated. One that turns out to have too many is cut into halves.
+//! The number of splats of a slab is estimated. A slab that has too many is cut into halves.
 
 use std::ops::Range;
 
@@ -16,13 +16,13 @@ use rayon::prelude::*;
 use crate::layout::{Cutoffs, Splat};
 use wildcity_scene::chunk::CLUSTER;
 
-/// Keys of depth are counted in so many steps.
+/// Number of steps in which keys of depth are counted.
 const STEPS: usize = 4096;
 
 /// A cluster that a view may see.
 #[derive(Clone, Copy, Debug)]
 struct DepthCluster {
-    /// Its number in the chunk.
+    /// Its index in the chunk.
     number: u32,
     /// Smallest and largest key of depth of its Gaussians, at most.
     first_key: u32,
@@ -32,14 +32,14 @@ struct DepthCluster {
 /// The clusters of one view by depth.
 #[derive(Debug)]
 pub(super) struct DepthClusters {
-    /// Job by job.
+    /// The clusters, job by job.
     clusters: Vec<DepthCluster>,
-    /// End of each job's in `clusters`.
+    /// End of each job's clusters in `clusters`.
     ends: Vec<usize>,
     first_key: u32,
-    /// Beyond the last key.
+    /// The end of the keys, exclusive.
     end_key: u32,
-    /// Keys of a step.
+    /// Number of keys per step.
     step: u32,
     /// Number of Gaussians up to the end of each step, as if each cluster's were spread evenly over its depths.
     up_to: Vec<f64>,
@@ -96,7 +96,7 @@ impl DepthClusters {
         let last_key = clusters.iter().map(|cluster| cluster.last_key).max().unwrap_or(0);
         let step = (last_key - first_key) / STEPS as u32 + 1;
         let step_of = |key: u32| ((key - first_key) / step) as usize;
-        // How many Gaussians each step has more than the one before.
+        // The number of Gaussians of each step minus that of the previous one.
         let mut up_to = vec![0.0; STEPS + 1];
         for cluster in &clusters {
             let [first, last] = [cluster.first_key, cluster.last_key].map(step_of);
@@ -120,7 +120,7 @@ impl DepthClusters {
         self.first_key..self.end_key
     }
 
-    /// The cut that begins at a key and has about so many Gaussians, and their estimated number.
+    /// The cut that begins at a key and has about the given number of Gaussians, and their estimated number.
     pub(super) fn next(&self, first_key: u32, gaussians: f64) -> (Cut, f64) {
         let first_step = (first_key.saturating_sub(self.first_key) / self.step) as usize;
         let before = first_step.checked_sub(1).map_or(0.0, |step| self.up_to[step.min(STEPS - 1)]);

@@ -21,7 +21,7 @@ const DIGITS: usize = 1 << DIGIT_BITS;
 /// Sorts keys with the depth in their upper half and an index, from 0 in this order, in the lower half. `other` is scratch
 /// memory.
 pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
-    // Below, counters cost more than comparisons.
+    // For fewer keys, counters cost more than comparisons.
     const FEW: usize = 256;
     if keys.len() < FEW {
         keys.sort_unstable();
@@ -61,7 +61,7 @@ pub(super) fn sort_by_depth(keys: &mut Vec<u64>, other: &mut Vec<u64>) {
 mod tests {
     use super::*;
 
-    /// Of depths that differ in no bit, in few and in all, in lists on both sides of the change of method.
+    /// Sorts depths that differ in no bit, in few and in all, in lists on both sides of the change of method.
     #[test]
     fn keys_are_sorted_by_depth_and_then_by_index() {
         let mut state = 1_u64;

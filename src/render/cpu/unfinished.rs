@@ -6,7 +6,7 @@ use super::bin::Grid;
 use super::resolve::TileSums;
 use crate::View;
 
-/// A slab of a view: its tiles continue from the slab before.
+/// A slab of a view: its tiles continue from the previous slab.
 #[derive(Clone, Copy)]
 pub(super) struct Continued<'a> {
     pub(super) tiles: &'a UnfinishedTiles,
@@ -14,7 +14,7 @@ pub(super) struct Continued<'a> {
     pub(super) is_last: bool,
 }
 
-/// What the tiles of a view have accumulated in the slabs so far, by macro tile; nothing before its first splat.
+/// The sums of a view's tiles after the previous slabs, by macro tile; none before its first splat.
 #[derive(Debug)]
 pub(super) struct UnfinishedTiles(pub(super) Vec<Mutex<Vec<UnfinishedTile>>>);
 
@@ -26,18 +26,18 @@ pub(super) struct UnfinishedTile {
 }
 
 impl UnfinishedTiles {
-    /// Most bytes of those of a view.
+    /// Most bytes of the sums of a view.
     pub(super) fn bytes(view: &View) -> u64 {
         (Grid::new(view).tiles() * size_of::<UnfinishedTile>()) as u64
     }
 
-    /// Bytes so far.
+    /// Bytes of the present sums.
     pub(super) fn held_bytes(&self) -> u64 {
         let tiles: usize = self.0.iter().map(|tiles| tiles.lock().capacity()).sum();
         (tiles * size_of::<UnfinishedTile>()) as u64
     }
 
-    /// Of a view, before the first slab.
+    /// The sums of a view before the first slab.
     pub(super) fn new(view: &View) -> Self {
         Self((0..Grid::new(view).macro_tiles()).map(|_| Mutex::default()).collect())
     }

@@ -40,7 +40,7 @@ pub struct FrameCounts {
 }
 
 impl FrameCounts {
-    /// The counts of a frame of which nothing is drawn yet.
+    /// The counts of a frame before its first region is drawn.
     pub(super) fn new(frame: &Frame<'_>, planes: Planes, gpu_frame: &GpuFrame) -> Self {
         Self {
             sh_degree: frame.scene.sh_degree(),
@@ -115,9 +115,9 @@ impl FrameCounts {
         ]
     }
 
-    /// About how many multiply-adds, or instructions of the same cost, stage rasterize takes: 18 for four evaluations,
-    /// of which six are shared by the four pixels. Pixels that have stopped are counted although they take none, and the
-    /// ten more of each blended pixel are not: an estimate, not a bound.
+    /// Estimated number of multiply-adds, or instructions of the same cost, in stage rasterize: 18 for four
+    /// evaluations, of which six are shared by the four pixels. It is not a bound: pixels that have stopped are counted
+    /// although they take none, and the ten additional ones of each blended pixel are not counted.
     pub fn rasterize_operations(&self) -> u64 {
         self.evaluations * 9 / 2
     }

@@ -54,7 +54,7 @@ pub(super) struct Bin {
     pub(super) instances: GrowableBuffer,
 }
 
-/// What the stage needs room for.
+/// The sizes for which the stage needs room.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BinSizes {
     /// Splats of a region.
@@ -69,7 +69,7 @@ pub(super) struct BinSizes {
     pub(super) instances: u64,
 }
 
-/// How many touches and instances the buffers can hold.
+/// Number of touches and instances that the buffers can hold.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BinCapacity {
     pub(super) touches: u32,
@@ -104,7 +104,7 @@ impl Bin {
         MAX_INSTANCES.min(device.binding_bytes() / 4)
     }
 
-    /// Makes room. Returns what the buffers can hold then.
+    /// Makes room. Returns the capacity of the buffers afterwards.
     pub(super) fn reserve(
         &mut self,
         device: &Device,
@@ -131,7 +131,7 @@ impl Bin {
         BinCapacity { touches, instances: capacity(&self.instances) }
     }
 
-    /// Lists the touches of all splats; `sorted` tells which of their buffers are in order.
+    /// Lists the touches of all splats; `sorted` is the index of their buffers that are in order.
     pub(super) fn list_touches(
         &self,
         device: &Device,
@@ -173,7 +173,7 @@ impl Bin {
         }
     }
 
-    /// Lists the splats of all tiles; `sorted` tells which buffers of the touches are in order.
+    /// Lists the splats of all tiles; `sorted` is the index of the buffers of the touches that are in order.
     pub(super) fn list_instances(
         &self,
         device: &Device,

@@ -202,7 +202,7 @@ pub(super) struct Device {
     binding_limit: u64,
     /// The first error since the last [`Device::check`].
     fault: Arc<Mutex<Option<String>>>,
-    /// What was created and run, so that the cost of each feature can be reported.
+    /// Counts of created objects and dispatches, so that the cost of each feature can be reported.
     totals: AtomicTotals,
 }
 
@@ -214,7 +214,7 @@ struct AtomicTotals {
     dispatches: AtomicU64,
 }
 
-/// What was created and run on a device since it was opened.
+/// Counts of created objects and dispatches on a device since it was opened.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DeviceTotals {
     /// Kernels that were compiled.
@@ -348,7 +348,7 @@ impl Device {
         has_clock.then(|| self.queue.get_timestamp_period())
     }
 
-    /// What was created and run since the device was opened.
+    /// Counts of created objects and dispatches since the device was opened.
     pub(super) fn totals(&self) -> DeviceTotals {
         let AtomicTotals { pipelines, buffers, dispatches } = &self.totals;
         let [pipelines, buffers, dispatches] =

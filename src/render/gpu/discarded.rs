@@ -1,5 +1,5 @@
-//! Devices that have failed. A driver that hangs would block the thread that drops its device, so each is dropped in a
-//! thread of its own.
+//! Devices that have failed. A driver that hangs would block the thread that drops its device, so each is dropped in
+//! its own thread.
 
 use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
@@ -18,7 +18,7 @@ impl Discarded {
     pub(super) fn add(&self, chain: Chain) {
         let mut threads = self.0.lock();
         threads.retain(|thread| !thread.is_finished());
-        // Without a thread it is dropped here.
+        // If no thread can be started, the device is dropped on this one.
         let dropping = Builder::new().name("discard".to_owned()).spawn(move || drop(chain));
         threads.extend(dropping);
     }

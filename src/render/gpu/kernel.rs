@@ -19,7 +19,7 @@ pub(super) struct Kernel {
     layout: BindGroupLayout,
 }
 
-/// How many workgroups of a kernel run.
+/// Number of workgroups of a kernel.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Groups<'a> {
     /// A number that the host knows.

@@ -29,7 +29,7 @@ pub const MAX_GROUPS: u32 = 65_535;
 pub const MACRO_COLUMNS: u32 = 8;
 /// Rows of tiles of a macro tile: 8 x 4 tiles are one bit each of a 32-bit word.
 pub const MACRO_ROWS: u32 = 4;
-/// A splat that touches more macro tiles than this is emitted by a whole workgroup. One thread alone
+/// A splat that touches more macro tiles than this is emitted by a whole workgroup. A single thread
 /// writes at most 16 macro tiles of 4 rows of tiles, 64 row masks, while the 255 other threads wait;
 /// beyond that, all 256 threads share the work.
 pub const LARGE_SPLAT_MACRO_TILES: u32 = 16;
@@ -162,21 +162,21 @@ impl Frame {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Background {
-    /// Of a cube map: width of a face, in texels, ...
+    /// Cube map: width of a face, in texels.
     pub scale: f32,
-    /// ... position of the first texel, in texels, ...
+    /// Cube map: position of the first texel, in texels.
     pub offset: f32,
-    /// ... and texels along an edge.
+    /// Cube map: number of texels along an edge.
     pub edge: u32,
-    /// Of a network: outputs of a hidden layer, ...
+    /// Network: outputs of a hidden layer.
     pub width: u32,
-    /// ... octaves of the frequency encoding, ...
+    /// Network: octaves of the frequency encoding.
     pub octaves: u32,
-    /// ... values of an encoded direction, ...
+    /// Network: values of an encoded direction.
     pub encoded: u32,
-    /// ... 1 if the direction itself is among them, else 0, ...
+    /// Network: 1 if the direction itself is among these values, else 0.
     pub identity: u32,
-    /// ... and 1 if the second layer also reads them (a skip connection), else 0.
+    /// Network: 1 if the second layer also reads these values (a skip connection), else 0.
     pub skip: u32,
     /// For each view, the rows of a matrix to a direction (of any length) in the sky's axes. It
     /// transforms `(x, y, 1)` in pixels or, for a lens or a rolling shutter, a direction in the camera's
@@ -244,14 +244,14 @@ impl ChunkView {
         }
     }
 
-    /// The same with depth as distance from a centre in the chunk's frame, in metres.
+    /// This view with depth as distance from a centre in the chunk's frame, in metres.
     pub(super) fn with_distance_from(self, center_m: DVec3) -> Self {
         let exact = center_m.extend(0.0).to_array();
         Self { depth_high: exact.map(|high| high as f32), depth_low: exact.map(low), ..self }
     }
 }
 
-/// What changes the colours of a chunk's Gaussians in a frame with actors (32 bytes).
+/// The changes to the colours of a chunk's Gaussians in a frame with actors (32 bytes).
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct ChunkLight {
@@ -293,12 +293,12 @@ fn low(exact: f64) -> f32 {
     (exact - f64::from(exact as f32)) as f32
 }
 
-/// Lens, windshield, and rolling shutter of a view that is no static pinhole (368 bytes). Read by
+/// Lens, windshield, and rolling shutter of a view that is not a static pinhole (368 bytes). Read by
 /// `shaders/lens.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Lens {
-    /// Where the optical axis lands, in pixels.
+    /// Image of the optical axis, in pixels.
     pub center_px: [f32; 2],
     /// Lens model. 0: pinhole; 1: OpenCV; 2: a polynomial from the angle off the axis to the radius on
     /// the image; 3: a polynomial from the radius to the angle.
@@ -337,17 +337,18 @@ pub struct Lens {
     pub moved_m: [f32; 3],
     /// Zero.
     pub pad1: u32,
-    /// The same in world axes.
+    /// This translation in world axes.
     pub moved_world_m: [f32; 3],
     /// Zero.
     pub pad2: u32,
     /// The camera's rotation during the exposure: unit axis, and angle in radians.
     pub axis_angle: [f32; 4],
-    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all zero for six points of every Gaussian.
+    /// The fields of [`ExpansionBound`](crate::expansion::ExpansionBound) in order, then zero; all zero for six points
+    /// of every Gaussian.
     pub expansion: [f32; 4],
 }
 
-/// Whose splats begin with a cluster view (8 bytes). The first record of a list holds its length as `instance`.
+/// The owner of the splats from a cluster view on (8 bytes). The first record of a list holds its length as `instance`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 pub struct Owner {
@@ -404,7 +405,7 @@ pub struct JobSlot {
 pub struct Counters {
     /// (Gaussian, view) pairs that survived culling, whether or not the buffers can hold them.
     pub splats: u32,
-    /// (Splat, macro tile) pairs, likewise. 2^32 - 1 means that or more.
+    /// (Splat, macro tile) pairs, likewise. 2^32 - 1 means 2^32 - 1 or more.
     pub touches: u32,
     /// (Splat, tile) pairs, likewise; 0 if the touches did not fit.
     pub instances: u32,

@@ -1,5 +1,5 @@
 //! Parameters of lenses, windshields, and rolling shutters on the device, uploaded from the first frame
-//! on that has one of them. Frames with static pinhole cameras only have no such buffer or binding, and
+//! on that has one of them. Frames with only static pinhole cameras have no such buffer or binding, and
 //! their shaders have no test for them.
 //!
 //! f32 suffices, since no large numbers cancel: polynomials take fractions of the lens' field, those of a
@@ -66,7 +66,7 @@ impl Lenses {
     }
 }
 
-/// The index of each actor's lens in each view: of its own after those of all views, or that of the view.
+/// The index of each actor's lens in each view: its own, which follows those of all views, or that of the view.
 #[derive(Debug, Default)]
 pub(super) struct LensIndices(Vec<Vec<u32>>);
 
@@ -100,7 +100,7 @@ fn has_own_lens(view: &View, relative: &View) -> bool {
 }
 
 impl Lens {
-    /// The parameters of a view that is no static pinhole.
+    /// The parameters of a view that is not a static pinhole.
     fn of(view: &View, profile: &RenderProfile) -> Self {
         let camera = &view.camera;
         let pinhole = &camera.pinhole;
@@ -135,7 +135,7 @@ impl Lens {
         lens
     }
 
-    /// Where the extrapolation starts, as a slope.
+    /// Start of the extrapolation, as a slope.
     fn set_end(&mut self, slope: f64) {
         self.end = slope as f32;
         self.end_rad = slope.atan() as f32;

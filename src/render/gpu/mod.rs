@@ -69,7 +69,7 @@ pub struct Gpu {
     limits: MemoryLimits,
     /// Copies images to their targets, and runs the callbacks of finished views.
     deliver: ThreadPool,
-    /// Culls clusters. A pool of its own, so that a frame that is drawn does not wait for one that is
+    /// Culls clusters. It has its own pool, so that a frame that is drawn does not wait for one that is
     /// encoded.
     cull: ThreadPool,
     queue: TicketQueue,
@@ -78,7 +78,7 @@ pub struct Gpu {
     discarded: Discarded,
 }
 
-/// How much of a device's memory is used, if that is less than all of it.
+/// Limits of the use of a device's memory, if less than all of it may be used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MemoryLimits {
     /// Most bytes of resident Gaussians; the least recently drawn chunks are evicted beyond it.
@@ -89,13 +89,13 @@ pub struct MemoryLimits {
 }
 
 impl Default for MemoryLimits {
-    /// No limits but the device's own.
+    /// No limits except the device's own.
     fn default() -> Self {
         Self { mirror_bytes: u64::MAX, binding_bytes: u64::MAX }
     }
 }
 
-/// What a device holds, and what it has done since it was opened.
+/// The memory of a device, and the counts of its work since it was opened.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GpuUsage {
     /// The adapter's name.
@@ -182,7 +182,7 @@ impl Gpu {
         })
     }
 
-    /// What the device holds; `None` while it is lost.
+    /// The memory and the counts of the device; `None` while it is lost.
     pub fn usage(&self) -> Option<GpuUsage> {
         self.chain.lock().as_ref().map(|chain| GpuUsage {
             name: chain.device.info.name.clone(),

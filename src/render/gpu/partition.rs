@@ -125,8 +125,8 @@ pub(super) struct PartitionCache {
     entries: Vec<(PartitionKey, Vec<Region>)>,
 }
 
-/// What two frames must have in common to be drawn in the same regions: the number of Gaussians and the
-/// sizes of the images.
+/// The properties that two frames must share to be drawn in the same regions: the number of Gaussians and
+/// the sizes of the images.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct PartitionKey {
     gaussians: usize,

@@ -51,7 +51,7 @@ pub(super) struct ProjectWork {
     /// One per chunk view if the frame has actors; empty otherwise.
     lights: Vec<ChunkLight>,
     shadows: Vec<ChunkShadow>,
-    /// Whose cluster views they are, in order.
+    /// The owners (twin or actor) of the cluster views, as ranges in order of cluster views.
     owners: Vec<super::layout::Owner>,
 }
 
@@ -65,7 +65,7 @@ struct ProjectDispatch {
     span: Span,
 }
 
-/// Which kernels project a chunk in a view.
+/// The kernels that project a chunk in a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Variant {
     projection: Projection,
@@ -94,7 +94,7 @@ struct ChunkInView<'a> {
     of: Owner<'a>,
 }
 
-/// Whose Gaussians a chunk has.
+/// The owner of a chunk's Gaussians.
 #[derive(Clone, Copy, Debug)]
 enum Owner<'a> {
     /// The twin, with the contact shadows that may fall on the chunk.
@@ -141,7 +141,7 @@ impl ProjectWork {
         };
         let pairs: Vec<ChunkInView<'_>> = views.flat_map(in_view).collect();
 
-        // What each of them shows.
+        // The visible clusters of each.
         let unscented: Vec<Option<UnscentedView<'_>>> =
             frame.views.iter().map(|view| UnscentedView::new(view, frame.profile)).collect();
         let visible: Vec<Vec<ClusterPlace>> = pairs
@@ -188,12 +188,12 @@ impl ProjectWork {
         self.cluster_views.len() as u32
     }
 
-    /// Whose cluster views they are, in order.
+    /// The owners (twin or actor) of the cluster views, as ranges in order of cluster views.
     pub(super) fn owners(&self) -> &[super::layout::Owner] {
         &self.owners
     }
 
-    /// Adds the owner of the next cluster view, if it is another one than that of the last.
+    /// Adds the owner of the next cluster view if it differs from that of the last one.
     fn add_owner(&mut self, pair: &ChunkInView<'_>) {
         let instance = match pair.of {
             Owner::Twin { .. } => TWIN_INSTANCE.into(),
@@ -360,7 +360,7 @@ pub(super) struct Project {
     offsets: GrowableBuffer,
 }
 
-/// What changes the colours of Gaussians in frames with actors.
+/// Lights and shadows, which change the colours of Gaussians in frames with actors.
 #[derive(Debug)]
 struct Lights {
     /// One per chunk view.
@@ -442,7 +442,7 @@ impl Project {
         &self.offsets
     }
 
-    /// Sets those indices, for splats that another backend projected.
+    /// Sets these indices for splats that another backend projected.
     pub(super) fn set_first_splats(&mut self, device: &Device, first_splats: &[u32]) {
         self.offsets.fill(device, bytemuck::cast_slice(first_splats));
     }
@@ -535,7 +535,7 @@ impl Project {
     }
 }
 
-/// What [`Project::run`] reads, besides the work.
+/// The input of [`Project::run`] in addition to the work.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ProjectInputs<'a> {
     pub(super) plan: &'a Plan,

@@ -88,14 +88,14 @@ pub(super) struct TileOutput {
     pub(super) tiles_per_page: u32,
 }
 
-/// What [`Rasterize::run`] reads.
+/// The input of [`Rasterize::run`].
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RasterizeInputs<'a> {
     pub(super) plan: &'a Plan,
     pub(super) splats: &'a SplatBuffers,
     pub(super) bin: &'a Bin,
     pub(super) lenses: &'a Lenses,
-    /// Whose splats they are, in order of cluster views.
+    /// The owners of the splats, in order of cluster views.
     pub(super) owners: &'a [Owner],
     /// For each cluster view, the index of its first splat.
     pub(super) first_splats: &'a GrowableBuffer,

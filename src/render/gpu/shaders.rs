@@ -135,7 +135,7 @@ impl Shaders {
         self.linked.iter().map(|linked| (linked.name, linked.source.as_str()))
     }
 
-    /// The same shaders with the first `original` text of a variant replaced, or `None` if the variant
+    /// These shaders with the first `original` text of a variant replaced, or `None` if the variant
     /// does not contain it. Tests break a shader with it and check that the fault is detected.
     pub fn with_mutation(
         mut self,

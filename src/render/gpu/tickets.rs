@@ -1,4 +1,4 @@
-//! A fair queue: callers are served in the order in which they called. A mutex alone does not
+//! A fair queue: callers are served in the order in which they called. A mutex by itself does not
 //! guarantee any order.
 
 use parking_lot::{Condvar, Mutex};

@@ -10,11 +10,11 @@ use wildcity_scene::RenderProfile;
 pub(super) struct Pixel {
     /// Linear premultiplied colour on black.
     pub(super) rgb: DVec3,
-    /// Share of the background that still shows.
+    /// Share of the background that is visible.
     pub(super) transmittance: f64,
     /// Depth weighted by contribution, in metres.
     pub(super) depth_m: f64,
-    /// Whose splat brought the transmittance to a half or less; 0 if none has.
+    /// The owner of the splat that brought the transmittance to a half or less; 0 if none has.
     pub(super) instance: u16,
 }
 

@@ -60,7 +60,7 @@ impl Backend for Reference {
             project_ms += start.elapsed().as_secs_f64() * 1e3;
             stats.visible_pairs += splats.len() as u64;
 
-            // Blend row by row, then add the background and what the camera does to colours.
+            // Blend row by row, then add the background, and apply exposure and overlay of the camera.
             let start = Instant::now();
             let width = view.camera.width_px as usize;
             let appearance = target.appearance;

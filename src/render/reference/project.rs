@@ -20,7 +20,7 @@ pub struct Splat {
     /// The Gaussian: index of its chunk, counting through those of the twin and then through those of actors, and
     /// index within the chunk.
     pub gaussian: [usize; 2],
-    /// Whose Gaussian it is, as in [`Target::instances`](crate::Target::instances).
+    /// The owner of the Gaussian, as in [`Target::instances`](crate::Target::instances).
     pub instance: u16,
     /// Depth of the centre, in metres, by which splats are sorted.
     pub depth_m: f64,
@@ -36,8 +36,8 @@ pub struct Splat {
     pub reach_px: DVec2,
 }
 
-/// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image or beside
-/// it, in order of global ids.
+/// Projects every Gaussian between near and far with an opacity of at least alpha_cut, on the image or outside
+/// of it, in order of global ids.
 pub fn project(scene: &Scene, profile: &RenderProfile, view: &View) -> Vec<Splat> {
     let twin = scene.chunks.par_iter().enumerate().flat_map_iter(|(number, chunk)| {
         let splat = move |i| {
@@ -118,7 +118,7 @@ pub(super) fn mean_and_axes(chunk: &Chunk, index: usize) -> (DVec3, DMat3) {
     (chunk.origin_m() + vector(column::MEAN), axes_m)
 }
 
-/// A Gaussian's place and shape on the image, before the blur.
+/// Position and shape of a Gaussian on the image, before the blur.
 struct Footprint {
     depth_m: f64,
     mean_px: DVec2,

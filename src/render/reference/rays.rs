@@ -3,8 +3,8 @@
 //!
 //! A Gaussian's alpha on a ray is its response at the point of the ray that is closest in standard deviations
 //! (Wu et al. 2024, 3DGUT). This is a 2D Gaussian of the distances across the ray. The blur of the profile is
-//! a Gaussian of distances on the image, so it is added in the pixels around this very ray, where the one
-//! distance is proportional to the other.
+//! a Gaussian of distances on the image. It is added in the pixels around this ray, where the two distances are
+//! proportional to each other.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -90,7 +90,7 @@ struct Ray {
     px_per_rad: [DVec3; 2],
     /// A lower bound of the Jacobian's smaller singular value.
     least_px_per_rad: f64,
-    /// What is added to screen covariances.
+    /// The variances that are added to screen covariances.
     filter: PixelFilter,
 }
 
@@ -127,7 +127,7 @@ impl Ray {
         Some(Self { origin_m, direction, px_per_rad: [x, y], least_px_per_rad, filter })
     }
 
-    /// Alpha before the cap; 0 where it surely is below the cut, or the closest point lies behind the camera.
+    /// Alpha before the cap; 0 where it is certainly below the cut, or the closest point lies behind the camera.
     fn alpha(&self, gaussian: &UnprojectedGaussian, profile: &RenderProfile) -> f64 {
         let to_mean_m = gaussian.mean_m - self.origin_m;
         let along_m = to_mean_m.dot(self.direction);

@@ -1,4 +1,4 @@
-//! References in memory, up to a number of bytes: the least recently used go first.
+//! References in memory, up to a number of bytes. Eviction is least recently used.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -7,10 +7,10 @@ use parking_lot::Mutex;
 
 use super::Reference;
 
-/// Bytes of references in memory unless a program says otherwise: 80 images of 1440 x 928 px.
+/// Default size of the cache, in bytes: 80 images of 1440 x 928 px.
 pub const DEFAULT_BYTES: u64 = 512 << 20;
 
-/// A hash of all that a reference depends on.
+/// A hash of everything that a reference depends on.
 pub type ReferenceKey = [u8; 32];
 
 /// References that sessions share. A reference that is in use stays in memory until its last user drops it.
@@ -41,7 +41,7 @@ impl Default for ReferenceCache {
 }
 
 impl ReferenceCache {
-    /// A cache of at most so many bytes.
+    /// A cache of at most `limit_bytes`.
     pub fn new(limit_bytes: u64) -> Self {
         Self { limit_bytes, state: Mutex::default() }
     }
@@ -56,7 +56,7 @@ impl ReferenceCache {
         Some(Arc::clone(&entry.reference))
     }
 
-    /// Keeps a reference, and forgets others until all fit. One that is larger than the cache is not kept.
+    /// Keeps a reference, and evicts others until all fit. A reference larger than the cache is not kept.
     pub fn insert(&self, key: ReferenceKey, reference: Arc<Reference>) {
         let bytes = reference.bytes();
         if bytes > self.limit_bytes {

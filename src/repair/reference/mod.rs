@@ -1,11 +1,11 @@
-//! Recorded images beside a view: brought into it by depth (roles `reference_warped`, `reference_valid`).
+//! Warps recorded images into a view by depth (roles `reference_warped`, `reference_valid`).
 //!
-//! A pixel of the view goes by its rendered depth to a point, and the point into each reference. The reference fits if
-//! the point is within its image and the depth that was rendered there is the point's, within 0.2 m + 5 %. Of
-//! those that fit, the one that sees the point from the most similar direction gives the colour. What no reference
-//! has seen stays black, and is not valid.
+//! A pixel of the view is unprojected by its rendered depth to a point, and the point is projected into each reference.
+//! The reference fits if the point is within its image and the depth that was rendered there equals that of the point
+//! to within 0.2 m + 5 %. Of the references that fit, the one that sees the point from the most similar direction gives
+//! the colour. Pixels that no reference has seen stay black, and are not valid.
 //!
-//! Nothing here knows where references come from. All of it is f32 after the poses were subtracted, without
+//! The source of the references does not matter. All arithmetic is f32 after the poses were subtracted, without
 //! fused operations, so the same input gives the same bytes on every processor.
 
 mod cache;
@@ -26,7 +26,7 @@ use crate::roles;
 /// Pixels with less opacity than this have no depth.
 pub const LEAST_OPACITY: f32 = 0.5;
 
-/// An image in another size, by Lanczos 3, as the role `reference` needs it.
+/// Resamples an image to another size by Lanczos 3, for the role `reference`.
 pub fn resized(image: &Image, width: usize, height: usize) -> Image {
     if [image.width, image.height] == [width, height] {
         return image.clone();

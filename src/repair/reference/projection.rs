@@ -13,13 +13,13 @@ use super::lanes::LANES;
 /// Cells of a table along each axis.
 const CELLS: usize = 512;
 
-/// How far a table reaches beyond the image, in radians: what a windshield may deflect.
+/// Margin of a table around the image, in radians: the largest deflection by a windshield.
 const MARGIN_RAD: f64 = 0.1;
 
 /// Largest angle of a table, in radians off the axis.
 const WIDEST_RAD: f64 = 2.9;
 
-/// A camera as [`super::warp`] projects with it.
+/// The projection of a camera, for [`super::warp`].
 #[derive(Debug)]
 pub struct Projection {
     /// In pixels.
@@ -41,7 +41,7 @@ enum Lens {
 /// Pixels of directions.
 #[derive(Debug)]
 struct Table {
-    /// Of the stereographic plane: `CELLS` / 2 cells in each direction.
+    /// Cells per unit of the stereographic plane, which has `CELLS` / 2 cells in each direction.
     cells_per_unit: f32,
     /// `CELLS + 1` rows of as many positions, in pixels.
     at_px: Vec<[f32; 2]>,
@@ -63,7 +63,8 @@ pub(super) struct Positions {
 }
 
 impl Projection {
-    /// Of a camera. With a bent lens this projects 263,169 directions, which takes some ten milliseconds.
+    /// The projection of a camera. For a non-pinhole camera, this fills a table of 513 x 513 directions, in about
+    /// 10 ms.
     pub fn of(camera: &Camera) -> Self {
         let pinhole = &camera.pinhole;
         let lens = match camera.is_pinhole() {
@@ -80,7 +81,7 @@ impl Projection {
         }
     }
 
-    /// The positions of the points that are wanted. A table has none of the others.
+    /// Projects points. With a table, only the points that are wanted get a position.
     #[inline(always)]
     pub(super) fn project(&self, points: &Points, is_wanted: &[bool; LANES]) -> Positions {
         let mut at = Positions { u: [f32::NAN; LANES], v: [f32::NAN; LANES] };
@@ -125,7 +126,7 @@ impl Table {
             let column = points.x[lane] * by + middle;
             let row = points.y[lane] * by + middle;
             let last = CELLS as f32;
-            // A NaN is in no cell.
+            // A NaN lies in no cell.
             let is_within = column >= 0.0 && row >= 0.0 && column < last && row < last;
             if !is_within || !is_wanted {
                 continue;
@@ -151,7 +152,7 @@ mod tests {
     use super::*;
     use wildcity_scene::geometry::camera::{Fisheye, Lens as SceneLens, OpenCv, Pinhole};
 
-    fn bent(lens: SceneLens) -> Camera {
+    fn non_pinhole(lens: SceneLens) -> Camera {
         let pinhole = Pinhole { fx: 420.0, fy: 430.0, cx: 400.0, cy: 240.0 };
         Camera { lens, ..Camera::from_pinhole(800, 480, pinhole) }
     }
@@ -164,7 +165,7 @@ mod tests {
             [1e-3, -2e-3],
             [0.0; 4],
         ));
-        for camera in [bent(fisheye), bent(opencv), bent(SceneLens::Pinhole)] {
+        for camera in [non_pinhole(fisheye), non_pinhole(opencv), non_pinhole(SceneLens::Pinhole)] {
             let projection = Projection::of(&camera);
             let mut seen = 0;
             for step in 0..400 {

@@ -26,8 +26,8 @@ pub(super) struct RayPoints {
 }
 
 impl Rays {
-    /// Of a camera. With a bent lens this is a table of 12 bytes per pixel, which takes a microsecond per
-    /// pixel to fill.
+    /// The rays of a camera. For a non-pinhole camera, this fills a table of 12 bytes per pixel, in a microsecond
+    /// per pixel.
     pub fn of(camera: &Camera) -> Self {
         let pinhole = &camera.pinhole;
         if camera.is_pinhole() {

@@ -13,16 +13,16 @@ use super::projection::{Points, Projection};
 use super::rays::Rays;
 use crate::image::Image;
 
-/// A reference fits where its depth is within this of the point's, in metres, ..
+/// A reference fits where its depth differs from the point's by at most this, in metres, plus [`DEPTH_SHARE`].
 const DEPTH_M: f32 = 0.2;
 
-/// .. and this share of the point's depth.
+/// See [`DEPTH_M`], as a share of the point's depth.
 const DEPTH_SHARE: f32 = 0.05;
 
-/// Distance of the pixels of the view that [`overlaps`] looks at.
+/// Distance between the pixels of the view that [`overlaps`] tests.
 const OVERLAP_STRIDE: usize = 16;
 
-/// A recorded image, or one that stands for it.
+/// A recorded image, or a rendered image that replaces it.
 #[derive(Debug)]
 pub struct Reference {
     /// Its pixels.
@@ -31,7 +31,7 @@ pub struct Reference {
     pub depth_m: Vec<f32>,
     /// Its camera.
     pub projection: Arc<Projection>,
-    /// Where it was taken.
+    /// The pose at which it was recorded.
     pub world_from_camera: Pose,
 }
 
@@ -42,7 +42,7 @@ impl Reference {
     }
 }
 
-/// The view that references are brought into.
+/// The view into which references are warped.
 #[derive(Clone, Copy, Debug)]
 pub struct WarpTarget<'a> {
     /// Its camera.
@@ -58,32 +58,32 @@ pub struct WarpTarget<'a> {
     pub depth_m: &'a [f32],
 }
 
-/// References as a view sees them.
+/// References that are warped into a view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Warped {
     /// Black where nothing is valid.
     pub image: Image,
     /// 1 where a reference fits, else 0.
     pub valid: Vec<f32>,
-    /// How many pixels each reference gave.
+    /// Number of pixels from each reference.
     pub pixels: Vec<usize>,
 }
 
-/// A reference with what leads there from the view: per group of pixels of one pose, rows of a rotation and a
-/// translation in metres.
+/// A reference, and the transforms from the view to it: per group of pixels of one pose, rows of a rotation and
+/// a translation in metres.
 struct Prepared<'a> {
-    /// In the caller's list.
+    /// Index in the caller's list.
     index: usize,
     reference: &'a Reference,
     from_target: Vec<[f32; 12]>,
 }
 
-/// Which groups of pixels have a pose of their own.
+/// The groups of pixels that have their own pose.
 #[derive(Clone, Copy)]
 enum Groups {
     All,
     Rows,
-    /// Of [`LANES`] pixels of a row. A camera at 30 m/s moves by 2 mm meanwhile.
+    /// [`LANES`] pixels of a row. During their exposure, a camera at 30 m/s moves by 2 mm.
     Columns,
 }
 
@@ -114,8 +114,9 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
         .enumerate()
         .map(|(index, reference)| Prepared { index, reference, from_target: prepare(reference) })
         .collect();
-    // Far ones first. Most are behind the view, and the farther they are, the smaller the angle: then most pixels have
-    // their best reference soon, and the others need no look at their depth. Of equals the last one counts, the nearest.
+    // Test far references first. Most are behind the view, and the farther away they are, the smaller is the angle.
+    // So most pixels soon have their best reference, and later references are rejected without reading their depth.
+    // Of equal angles the last reference counts, which is the nearest.
     let distance_m = |one: &Prepared<'_>| {
         one.reference.world_from_camera.position_m.distance(target.world_from_camera.position_m)
     };
@@ -125,8 +126,8 @@ pub fn warp(target: &WarpTarget<'_>, references: &[Arc<Reference>]) -> Warped {
     warped
 }
 
-/// Whether a reference can show something of a view: whether a point of a coarse grid of the view's pixels is within the
-/// image of a camera at a pose. So only what can help is rendered.
+/// Whether a reference can show a part of a view: whether a point of a coarse grid of the view's pixels is within the
+/// image of a camera at a pose. Only such references are rendered.
 pub fn overlaps(target: &WarpTarget<'_>, camera: &Camera, world_from_camera: &Pose) -> bool {
     let width = target.camera.width_px as usize;
     let height = target.camera.height_px as usize;
@@ -183,7 +184,7 @@ fn relative(reference: &Pose, target: &Pose) -> [f32; 12] {
     values
 }
 
-/// The best reference of each lane so far.
+/// The best reference of each lane until now.
 struct Best {
     /// Cosine of the angle between the rays, times the distance from the view's camera.
     similarity: [f32; LANES],

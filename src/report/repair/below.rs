@@ -1,66 +1,66 @@
-//! The trust at which the repair by a model should begin: where it begins to gain.
+//! The trust below which a model should repair: the threshold with the largest gain.
 //!
 //! Each threshold in hundredths is tried at every other station. The one with the largest total gain is the
-//! recommendation, if images of the other stations gain by it as well. Of equal thresholds the least is taken: no image
-//! is repaired whose gain was not measured.
+//! recommendation, if images of the other stations gain by it as well. Of thresholds with equal gains the least is
+//! taken, so that no image is repaired whose gain was not measured.
 
 use serde::Serialize;
 
 use wildcity_repair::Selection;
 
-/// What repair gained in one image, and the trust by which it would be selected.
+/// The gain of repair in one image, and the trust by which the image is selected.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gains {
-    /// Of the rendered image.
+    /// Trust in the rendered image.
     pub trust: f64,
-    /// More PSNR than the rendered image has.
+    /// PSNR of the repaired image minus that of the rendered one, in dB.
     pub gain_db: f64,
 }
 
-/// What a threshold does to some images.
+/// The effect of a threshold on some images.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Below {
     /// The threshold.
     pub below: f64,
-    /// How many images there are.
+    /// Number of images.
     pub images: usize,
-    /// Those that it repairs: their trust is less.
+    /// Number of images that it repairs: their trust is less.
     pub repaired: usize,
-    /// Mean gain of those, in dB; none if it repairs none.
+    /// Mean gain of the repaired images, in dB; `None` if it repairs none.
     pub gain_db: Option<f64>,
-    /// Those of them that are worse than rendered.
+    /// Number of repaired images that are worse than rendered.
     pub worse: usize,
     /// Gain summed over all images, in dB.
     #[serde(skip)]
     pub total_db: f64,
 }
 
-/// Where the repair by a model should begin.
+/// The recommended thresholds for a model.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RecommendedBelow {
     /// Name of the model.
     pub model: String,
-    /// For `repair.below` of a session; none if it is not recommended.
+    /// Value for `repair.below` of a session; `None` if repair is not recommended.
     pub below: Option<f64>,
-    /// For `repair.above`.
+    /// Value for `repair.above`.
     pub above: Option<f64>,
-    /// Why there is none.
+    /// Why no threshold is recommended.
     #[serde(rename = "unmet")]
     pub unmet_reason: Option<String>,
-    /// At the stations that it was selected by.
+    /// Its effect at the stations by which it was selected.
     #[serde(rename = "chosen_by")]
     pub selection: Option<Below>,
-    /// At the others.
+    /// Its effect at the other stations.
     #[serde(rename = "verified")]
     pub verification: Option<Below>,
-    /// The default threshold, at those.
+    /// The effect of the default threshold at the other stations.
     pub default: Below,
 }
 
 /// Why no threshold is recommended.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum BelowError {
-    /// There is no image, or none with a true one.
+    /// There is no image, or none with ground truth.
     #[error("no image has a true one to compare with")]
     NoImages,
     /// No threshold gains.
@@ -85,11 +85,11 @@ pub enum BelowError {
     },
 }
 
-/// Between the thresholds at which repair begins and ends, as in the default.
+/// Difference between the thresholds at which repair begins and ends, as in the default.
 const HYSTERESIS: f64 = 0.1;
 
 impl Below {
-    /// Of a threshold in some images. Under the default `at_least` none is repaired.
+    /// The effect of a threshold on some images. None is repaired whose trust is below the default `at_least`.
     pub fn new(below: f64, images: &[Gains]) -> Self {
         let Selection { at_least, .. } = Selection::default();
         let is_repaired = |image: &&Gains| image.trust < below && image.trust >= at_least;
@@ -107,7 +107,7 @@ impl Below {
     }
 }
 
-/// The threshold for a model: selected by some images, and verified by others.
+/// Recommends a threshold for a model: selected by some images, and verified by others.
 pub fn recommend_below(
     model: String,
     selection: &[Gains],

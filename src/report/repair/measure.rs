@@ -1,4 +1,4 @@
-//! Renders views beside the drive, repairs them, and compares them with the true ones.
+//! Renders views on and off the recorded drive, repairs them, and compares them with ground truth.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -32,15 +32,15 @@ const RENDERED: usize = 0;
 const WARPED: usize = 1;
 const FIRST_MODEL: usize = 2;
 
-/// What is measured.
+/// The twin, models and poses that are measured.
 pub struct RepairBenchmark<'a> {
     /// The twin.
     pub resident: &'a Arc<Resident>,
     /// Where it is stored, with its recorded images.
     pub catalog: &'a Catalog,
-    /// The twin that shows what is true; none if it is unknown.
+    /// The twin that is the ground truth; `None` if there is none.
     pub truth: Option<&'a Arc<Resident>>,
-    /// What renders.
+    /// The backend that renders.
     pub backend: &'a dyn Backend,
     /// The cameras.
     pub cameras: &'a [RigCamera],
@@ -52,7 +52,7 @@ pub struct RepairBenchmark<'a> {
     pub sampling: RepairSampling,
 }
 
-/// What was measured.
+/// The twin, models and images that were measured.
 #[derive(Clone, Debug, Serialize)]
 pub struct RepairSubject {
     /// The poses, and the size of the images.
@@ -61,19 +61,19 @@ pub struct RepairSubject {
     pub cameras: usize,
     /// Width and height of the first camera's images.
     pub size_px: [u32; 2],
-    /// What models compare with: `recorded` images, or the twin `rendered` on its drive.
+    /// Source of the reference images: `recorded` images, or the twin `rendered` on its drive.
     pub references: &'static str,
-    /// How many of them were read and drawn, and the mean time of one in milliseconds. They stay in memory.
+    /// Number of reference images that were read, and whose depth was rendered. They stay in memory.
     pub read: usize,
-    /// See `read`.
+    /// Mean time to read one of them, in milliseconds.
     pub read_ms: f64,
-    /// What is true; none if it is unknown.
+    /// The ground truth; `None` if there is none.
     pub truth: Option<Truth>,
     /// The models, in the order of the rows.
     pub models: Vec<RepairedModel>,
 }
 
-/// The twin that shows what is true.
+/// The twin that is the ground truth.
 #[derive(Clone, Debug, Serialize)]
 pub struct Truth {
     /// Its name.
@@ -95,9 +95,9 @@ pub fn measure(
     let drive = benchmark.resident.version.manifest.trajectories.first();
     let drive = drive.ok_or(ReportError::NoDrive)?;
     let cameras = benchmark.sampling.cameras(benchmark.cameras)?;
-    let mut bench = Bench::new(benchmark, &cameras)?;
-    let samples = bench.samples(drive, progress)?;
-    let subject = bench.subject();
+    let mut measurement = RepairMeasurement::new(benchmark, &cameras)?;
+    let samples = measurement.samples(drive, progress)?;
+    let subject = measurement.subject();
 
     let models = subject.models.iter().map(|model| (ImageKind::Model, model.name.clone()));
     let mut kinds = vec![
@@ -131,39 +131,43 @@ pub fn measure(
     Ok(RepairReport { subject, rows, below })
 }
 
-/// What stays the same from pose to pose.
-struct Bench<'a> {
-    given: &'a RepairBenchmark<'a>,
+/// A measurement of repair: its input, and the state that is shared by all poses.
+struct RepairMeasurement<'a> {
+    benchmark: &'a RepairBenchmark<'a>,
     cameras: &'a [RigCamera],
     offline: OfflineReferences,
     coverage: TrainingCoverage,
-    /// By camera.
+    /// The projection and the rays of each camera.
     optics: Vec<(Arc<Projection>, Rays)>,
     read: usize,
     read_ms: f64,
 }
 
 /// The images of a camera in one frame.
-struct Shown {
-    /// By kind.
+struct KindImages {
+    /// Pixels, by kind.
     rgb8: Vec<Vec<u8>>,
-    /// By kind.
+    /// Times of the repair, by kind.
     repair_ms: Vec<RepairMs>,
+    /// Share of the pixels that recorded images cover.
     covered: f64,
 }
 
-impl<'a> Bench<'a> {
-    fn new(given: &'a RepairBenchmark<'a>, cameras: &'a [RigCamera]) -> Result<Self, ReportError> {
-        let RepairBenchmark { resident, catalog, .. } = *given;
+impl<'a> RepairMeasurement<'a> {
+    fn new(
+        benchmark: &'a RepairBenchmark<'a>,
+        cameras: &'a [RigCamera],
+    ) -> Result<Self, ReportError> {
+        let RepairBenchmark { resident, catalog, .. } = *benchmark;
         let coverage = TrainingCoverage::new(&resident.version.manifest);
         let coverage = coverage.ok_or(ReportError::NoDrive)?;
         let offline = OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
-        given.models.iter().try_for_each(|model| offline.check(model, cameras))?;
+        benchmark.models.iter().try_for_each(|model| offline.check(model, cameras))?;
         let optics = |camera: &RigCamera| {
             (Arc::new(Projection::of(&camera.camera)), Rays::of(&camera.camera))
         };
         let optics = cameras.iter().map(optics).collect();
-        Ok(Self { given, cameras, offline, coverage, optics, read: 0, read_ms: 0.0 })
+        Ok(Self { benchmark, cameras, offline, coverage, optics, read: 0, read_ms: 0.0 })
     }
 
     fn subject(&self) -> RepairSubject {
@@ -185,7 +189,7 @@ impl<'a> Bench<'a> {
         };
         let size_px = self.cameras.first().map(|camera| camera.camera);
         RepairSubject {
-            sampling: self.given.sampling.clone(),
+            sampling: self.benchmark.sampling.clone(),
             cameras: self.cameras.len(),
             size_px: size_px.map_or([0; 2], |camera| [camera.width_px, camera.height_px]),
             references: match self.offline.source() {
@@ -194,8 +198,8 @@ impl<'a> Bench<'a> {
             },
             read: self.read,
             read_ms: self.read_ms / self.read.max(1) as f64,
-            truth: self.given.truth.map(truth),
-            models: self.given.models.iter().map(model).collect(),
+            truth: self.benchmark.truth.map(truth),
+            models: self.benchmark.models.iter().map(model).collect(),
         }
     }
 
@@ -204,7 +208,7 @@ impl<'a> Bench<'a> {
         drive: &Trajectory,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Vec<Sample>, ReportError> {
-        let stations = self.given.sampling.stations(drive, self.cameras);
+        let stations = self.benchmark.sampling.stations(drive, self.cameras);
         let mut samples = Vec::new();
         for (done, station) in stations.iter().enumerate() {
             progress(done, stations.len());
@@ -218,14 +222,15 @@ impl<'a> Bench<'a> {
         station: &RepairStation,
         samples: &mut Vec<Sample>,
     ) -> Result<(), ReportError> {
-        let resident = self.given.resident;
-        // The earlier frame first: it reads what the other one needs, and that is timed.
-        let (mut before, _) = self.rendered(resident, &station.views[1])?;
-        let (mut now, render_ms) = self.rendered(resident, &station.views[0])?;
+        let resident = self.benchmark.resident;
+        // Render the earlier frame first: it loads the sections, so that the timed render of the current frame does not
+        // wait for the disk.
+        let (mut before, _) = self.render_cameras(resident, &station.views[1])?;
+        let (mut now, render_ms) = self.render_cameras(resident, &station.views[0])?;
         let mut truths = [Vec::new(), Vec::new()];
-        if let Some(truth) = self.given.truth {
+        if let Some(truth) = self.benchmark.truth {
             for (images, views) in truths.iter_mut().zip(&station.views) {
-                *images = self.rendered(truth, views)?.0;
+                *images = self.render_cameras(truth, views)?.0;
             }
         }
         let [true_now, true_before] = truths;
@@ -237,8 +242,8 @@ impl<'a> Bench<'a> {
                 image.trust = self.coverage.trust(pose, view, &image.opacity).value;
             }
             let [now, before] = [&now[camera], &before[camera]];
-            let shown = self.shown(station, 0, camera, now)?;
-            let shown_before = self.shown(station, 1, camera, before)?;
+            let images = self.repair_all_kinds(station, 0, camera, now)?;
+            let images_before = self.repair_all_kinds(station, 1, camera, before)?;
             let views = [0, 1].map(|frame| &station.views[frame][camera]);
             let flicker = |images: [&RenderedImage; 2], pixels: [&[u8]; 2]| {
                 let depth_m = images.map(|image| opaque_depth(&image.depth_m, &image.opacity));
@@ -252,21 +257,21 @@ impl<'a> Bench<'a> {
             let true_rgb8 = truth.map(|(now, _)| &now.rgb8[..]);
             let size_px = [views[0].camera.width_px, views[0].camera.height_px];
             let rendered_db = true_rgb8.map(|truth| psnr_db(&now.rgb8, truth));
-            for kind in 0..shown.rgb8.len() {
-                let pixels = &shown.rgb8[kind];
+            for kind in 0..images.rgb8.len() {
+                let pixels = &images.rgb8[kind];
                 let psnr_db = true_rgb8.map(|truth| psnr_db(pixels, truth));
                 samples.push(Sample {
                     offset: station.offset,
                     kind,
                     for_selection: station.for_selection,
                     trust: now.trust,
-                    covered: shown.covered,
+                    covered: images.covered,
                     render_ms: render_ms / self.cameras.len() as f64,
-                    repair_ms: shown.repair_ms[kind],
+                    repair_ms: images.repair_ms[kind],
                     psnr_db,
                     gain_db: psnr_db.zip(rendered_db).map(|(own, rendered)| own - rendered),
                     flip: true_rgb8.map(|truth| mean_flip(pixels, truth, size_px)),
-                    flicker: flicker([now, before], [pixels, &shown_before.rgb8[kind]]),
+                    flicker: flicker([now, before], [pixels, &images_before.rgb8[kind]]),
                     true_flicker,
                 });
             }
@@ -274,14 +279,14 @@ impl<'a> Bench<'a> {
         Ok(())
     }
 
-    /// Renders all cameras of a twin, and tells how many milliseconds that took.
-    fn rendered(
+    /// Renders all cameras of a twin. Returns the images, and the time in milliseconds.
+    fn render_cameras(
         &self,
         resident: &Arc<Resident>,
         views: &[View],
     ) -> Result<(Vec<RenderedImage>, f64), ReportError> {
         let needs_normals = |model: &Arc<Model>| model.needs(InputRole::Normals);
-        let needs_normals = self.given.models.iter().any(needs_normals);
+        let needs_normals = self.benchmark.models.iter().any(needs_normals);
         let profile = &resident.version.manifest.profile;
         let scene = resident.scene(&wildcity_session::viewpoints(views), profile)?;
         let empty = |view: &View| {
@@ -309,23 +314,23 @@ impl<'a> Bench<'a> {
         let mut targets: Vec<Target<'_>> = targets.collect();
         let frame = Frame { scene: &scene, profile, views };
         let started = Instant::now();
-        self.given.backend.render(&frame, &mut targets, &|_, _| {})?;
+        self.benchmark.backend.render(&frame, &mut targets, &|_, _| {})?;
         let ms = 1e3 * started.elapsed().as_secs_f64();
         drop(targets);
         Ok((images, ms))
     }
 
-    /// An image of all kinds.
-    fn shown(
+    /// The image of a camera in all kinds: rendered, warped, and repaired by each model.
+    fn repair_all_kinds(
         &mut self,
         station: &RepairStation,
         frame: usize,
         camera: usize,
         rendered: &RenderedImage,
-    ) -> Result<Shown, ReportError> {
+    ) -> Result<KindImages, ReportError> {
         let view = &station.views[frame][camera];
         let world_from_rig = &station.world_from_rig[frame];
-        let RepairBenchmark { resident, backend, references, models, .. } = *self.given;
+        let RepairBenchmark { resident, backend, references, models, .. } = *self.benchmark;
         let mounted = &self.cameras[camera];
         let (_, rays) = &self.optics[camera];
         let of = OfflineView { camera: mounted, rays, view, world_from_rig, rendered, kept: None };
@@ -337,7 +342,7 @@ impl<'a> Bench<'a> {
         self.read += beside.read_count;
         self.read_ms += 1e3 * beside.read.as_secs_f64();
         let warp = 1e3 * beside.warp.as_secs_f64();
-        let (warped, covered) = over(rendered, &beside);
+        let (warped, covered) = overlay_warped(rendered, &beside);
         let mut rgb8 = vec![rendered.rgb8.clone(), warped];
         debug_assert_eq!((RENDERED, WARPED, FIRST_MODEL), (0, 1, rgb8.len()));
         let mut repair_ms = vec![RepairMs::default(), RepairMs { warp, ..RepairMs::default() }];
@@ -357,12 +362,12 @@ impl<'a> Bench<'a> {
             });
             rgb8.push(pixels);
         }
-        Ok(Shown { rgb8, repair_ms, covered })
+        Ok(KindImages { rgb8, repair_ms, covered })
     }
 }
 
-/// The recorded images where they cover a rendered one, else that; and the share that they cover.
-fn over(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>, f64) {
+/// Overlays the warped recorded images on a rendered image. Returns the image, and the share that they cover.
+fn overlay_warped(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>, f64) {
     let mut rgb8 = rendered.rgb8.clone();
     let Some((warped, valid)) = beside.warped() else { return (rgb8, 0.0) };
     let pixels = rgb8.chunks_exact_mut(3).zip(warped.rgb8.chunks_exact(3)).zip(valid);
@@ -374,7 +379,7 @@ fn over(rendered: &RenderedImage, beside: &ViewReferences) -> (Vec<u8>, f64) {
     (rgb8, f64::from(covered) / valid.len().max(1) as f64)
 }
 
-/// In dB, and at most [`EXACT_DB`].
+/// PSNR in dB, at most [`EXACT_DB`].
 fn psnr_db(rgb8: &[u8], truth: &[u8]) -> f64 {
     psnr_db_u8(rgb8.iter().zip(truth)).min(EXACT_DB)
 }

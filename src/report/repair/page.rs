@@ -143,7 +143,7 @@ impl RecommendedBelow {
 }
 
 impl Below {
-    /// What it repairs, in words.
+    /// The images that it repairs, in words.
     fn text(&self) -> String {
         let Self { images, repaired, worse, .. } = self;
         match self.gain_db {

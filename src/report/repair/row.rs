@@ -1,4 +1,4 @@
-//! A row of the repair section: what a kind of image has at one distance from the drive.
+//! A row of the repair section: the means of one kind of image at one distance from the drive.
 
 use serde::Serialize;
 
@@ -6,13 +6,13 @@ use wildcity_render::compare::json_numbers::serialize_number;
 
 use crate::statistics::quantile;
 
-/// What is shown of a view.
+/// The kinds of images of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ImageKind {
     /// The twin as it is rendered.
     Rendered,
-    /// The recorded images in the view where there are some, else the rendered one; no model.
+    /// The warped recorded images where they cover the view, else the rendered image; no model.
     Warped,
     /// The rendered image, repaired by a model.
     Model,
@@ -21,11 +21,11 @@ pub enum ImageKind {
 /// Times of one image, in milliseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct RepairMs {
-    /// To choose recorded images and bring them into the view.
+    /// To choose recorded images and warp them into the view.
     pub warp: f64,
     /// The model: its inputs, and its graph.
     pub model: f64,
-    /// From its output to an image of 8 bits.
+    /// To convert its output to an image of 8 bits.
     pub merge: f64,
 }
 
@@ -41,11 +41,11 @@ impl RepairMs {
 pub struct Sample {
     /// Index of the distance from the drive.
     pub offset: usize,
-    /// 0 rendered, 1 warped, then the models.
+    /// Index of the kind: 0 rendered, 1 warped, then the models.
     pub kind: usize,
-    /// Whether thresholds are selected by it; others verify them.
+    /// Whether it is used to select thresholds; the other samples verify them.
     pub for_selection: bool,
-    /// Of the rendered image.
+    /// Trust in the rendered image.
     pub trust: f64,
     /// Share of the pixels that recorded images cover.
     pub covered: f64,
@@ -53,15 +53,15 @@ pub struct Sample {
     pub render_ms: f64,
     /// Time to repair it.
     pub repair_ms: RepairMs,
-    /// In dB, against the true image; 110 at most.
+    /// PSNR against ground truth, in dB; 110 at most.
     pub psnr_db: Option<f64>,
-    /// More PSNR than the rendered image has.
+    /// PSNR minus that of the rendered image, in dB.
     pub gain_db: Option<f64>,
     /// Mean FLIP.
     pub flip: Option<f64>,
-    /// [`wildcity_render::compare::flicker::flicker`]; none if the earlier image shows nothing of this one.
+    /// [`wildcity_render::compare::flicker::flicker`]; `None` if the previous image shows nothing of this one.
     pub flicker: Option<f64>,
-    /// That of the true images.
+    /// Flicker of the ground truth.
     pub true_flicker: Option<f64>,
 }
 
@@ -72,17 +72,17 @@ pub(super) const EXACT_DB: f64 = 110.0;
 /// A model of the section.
 #[derive(Clone, Debug, Serialize)]
 pub struct RepairedModel {
-    /// Of its manifest.
+    /// The name in its manifest.
     pub name: String,
-    /// Of its manifest.
+    /// The version in its manifest.
     pub version: String,
-    /// Of its manifest.
+    /// The licence in its manifest.
     pub licence: String,
-    /// BLAKE3 of all that decides its bytes.
+    /// BLAKE3 of everything that its output depends on, except the images.
     pub repair_hash: String,
-    /// What computes.
+    /// The execution provider.
     pub provider: &'static str,
-    /// Whether it repeats its bytes.
+    /// Whether equal inputs give equal bytes.
     pub deterministic: bool,
 }
 
@@ -91,39 +91,39 @@ pub struct RepairedModel {
 pub struct RepairRow {
     /// Lateral distance from the drive, in metres.
     pub offset_m: f64,
-    /// What is shown.
+    /// The kind of the images.
     pub kind: ImageKind,
     /// `rendered`, `warped`, or the model's name.
     pub name: String,
-    /// How many images.
+    /// Number of images.
     pub images: usize,
-    /// Of the rendered images.
+    /// Mean trust in the rendered images.
     pub trust: f64,
     /// Share of pixels that recorded images cover.
     pub covered: f64,
     /// Time to render an image.
     pub render_ms: f64,
-    /// Time to repair it, in parts.
+    /// Parts of the time to repair an image.
     pub repair_parts_ms: RepairMs,
-    /// Time to repair it.
+    /// Time to repair an image.
     pub repair_ms: f64,
-    /// Against the true images; none without them.
+    /// PSNR against ground truth, in dB; `None` without it.
     pub psnr_db: Option<f64>,
-    /// More than the rendered images. Below 0: it loses.
+    /// PSNR minus that of the rendered images, in dB: negative for a loss.
     pub gain_db: Option<f64>,
-    /// Images that are worse than rendered.
+    /// Number of images that are worse than rendered.
     pub worse: Option<usize>,
     /// FLIP, from 0 to 1.
     pub flip: Option<f64>,
-    /// Difference between an image and the one before it, brought into its view.
+    /// Mean absolute difference between an image and the previous one, warped into its view.
     #[serde(serialize_with = "serialize_number")]
     pub flicker: f64,
-    /// That, over the rendered images'. Stable below 1.1.
+    /// Flicker divided by that of the rendered images. Below 1.1 the images are stable.
     #[serde(serialize_with = "serialize_number")]
     pub flicker_ratio: f64,
-    /// That of the true images.
+    /// Flicker of the ground truth.
     pub true_flicker: Option<f64>,
-    /// Gain for 100 ms of repair; none for rendered images.
+    /// Gain per 100 ms of repair, in dB; `None` for rendered images.
     pub db_per_100_ms: Option<f64>,
 }
 
@@ -173,7 +173,7 @@ impl RepairRow {
     }
 }
 
-/// The mean of the values that there are; `None` without any.
+/// The mean of the values that are present; `None` without any.
 fn mean(samples: &[&Sample], of: &dyn Fn(&Sample) -> Option<f64>) -> Option<f64> {
     let values: Vec<f64> = samples.iter().filter_map(|sample| of(sample)).collect();
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)

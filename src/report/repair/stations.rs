@@ -1,4 +1,4 @@
-//! The poses of the repair section: on the drive and beside it.
+//! The poses of the repair section: on the drive and at lateral offsets from it.
 
 use glam::DVec3;
 use serde::Serialize;
@@ -10,13 +10,13 @@ use wildcity_scene::rig::{RigCamera, RigError};
 
 use crate::sample_points::mean_speed_m_per_us;
 
-/// Distance along the drive between a frame and the one before it, in metres: 8 m/s and ten frames a second.
+/// Distance along the drive between a frame and the previous one, in metres: 8 m/s and ten frames a second.
 pub const FRAME_M: f64 = 0.8;
 
-/// Which poses are measured, and in which size.
+/// The poses that are measured, and the size of the images.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RepairSampling {
-    /// Stations along the drive.
+    /// Number of stations along the drive.
     pub stations: u32,
     /// Lateral distances from the drive in metres, ascending. The first is 0.
     pub offsets_m: Vec<f64>,
@@ -24,20 +24,20 @@ pub struct RepairSampling {
     pub side_px: u32,
 }
 
-/// A pose beside the drive.
+/// A pose on or off the drive, and that of the previous frame.
 pub(super) struct RepairStation {
-    /// Index of the distance.
+    /// Index of its distance from the drive.
     pub(super) offset: usize,
-    /// Whether a threshold is selected by it; others verify it.
+    /// Whether it is used to select thresholds; the other poses verify them.
     pub(super) for_selection: bool,
-    /// The rig, in this frame and in the one before it.
+    /// The rig in this frame and in the previous one.
     pub(super) world_from_rig: [Pose; 2],
-    /// The cameras, in both.
+    /// The cameras in this frame and in the previous one.
     pub(super) views: [Vec<View>; 2],
 }
 
 impl RepairSampling {
-    /// The drive itself and some distances from it, which may be in any order.
+    /// Samples the drive itself and lateral distances from it, which may be in any order.
     pub fn new(stations: u32, beside_m: &[f64], side_px: u32) -> Self {
         let mut offsets_m = vec![0.0];
         offsets_m.extend(beside_m.iter().copied().filter(|offset_m| *offset_m != 0.0));
@@ -46,14 +46,14 @@ impl RepairSampling {
         Self { stations, offsets_m, side_px }
     }
 
-    /// The cameras at this size, without their overlays: a model does not repair the own vehicle.
+    /// The cameras at this size, without their overlays, because a model does not repair the ego vehicle.
     ///
     /// # Errors
-    /// A camera cannot be so small.
+    /// A camera cannot be that small.
     pub(super) fn cameras(&self, cameras: &[RigCamera]) -> Result<Vec<RigCamera>, RigError> {
         let sides = |camera: &RigCamera| camera.camera.width_px.max(camera.camera.height_px);
         let longest_px = cameras.iter().map(sides).max().unwrap_or(1);
-        // All by the same factor, as a session with smaller images has them.
+        // Scale all cameras by one factor, as a session with smaller images does.
         let factor = (f64::from(self.side_px) / f64::from(longest_px)).min(1.0);
         let scaled = |camera: &RigCamera| {
             let mut bare = camera.clone();
@@ -67,8 +67,8 @@ impl RepairSampling {
         cameras.iter().map(scaled).collect()
     }
 
-    /// Every other station is for selection. Two stations have their offsets to the left, the next two to the right, and
-    /// so on. Stations are a frame from the start at least.
+    /// The poses of all stations. Every other station is for selection. Two stations have their offsets to the left,
+    /// the next two to the right, and so on. All stations are at least one frame from the start.
     pub(super) fn stations(&self, drive: &Trajectory, cameras: &[RigCamera]) -> Vec<RepairStation> {
         let speed_m_per_us = mean_speed_m_per_us(drive);
         let length_m = drive.length_m();

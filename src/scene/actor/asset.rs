@@ -10,34 +10,34 @@ use crate::{Chunk, Gaussians, Scene, lod};
 
 use super::{ActorBox, ActorClass};
 
-/// What all actors of one kind are drawn from.
+/// The Gaussians from which all actors of one kind are rendered.
 #[derive(Clone, Debug)]
 pub struct ActorAsset {
-    /// What it is.
+    /// Its description.
     pub description: AssetDescription,
     /// The levels of detail: level 0 without error, then fewer and fewer Gaussians with rising errors.
     pub levels: Vec<AssetLevel>,
 }
 
-/// What an asset is, without its Gaussians.
+/// The description of an asset: everything except its Gaussians.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AssetDescription {
-    /// A name for people, `[a-z0-9._-]+`. Several assets may have one name; the hash is the identity.
+    /// A readable name, `[a-z0-9._-]+`. Several assets may have one name; the hash is the identity.
     pub name: String,
     /// Its kind.
     pub class: ActorClass,
     /// Its box.
     #[serde(rename = "box")]
     pub box_: ActorBox,
-    /// What it was made from.
+    /// The source from which it was made.
     pub provenance: Provenance,
 }
 
 /// One level of detail of an asset.
 #[derive(Clone, Debug)]
 pub struct AssetLevel {
-    /// Upper bound of the geometric error, in metres, as of [`lod::Level::error_m`].
+    /// Upper bound of the geometric error, in metres, as in [`lod::Level::error_m`].
     pub error_m: f32,
     /// The Gaussians in the actor's axes, with the actor's origin.
     pub chunk: Arc<Chunk>,

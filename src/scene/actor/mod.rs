@@ -1,4 +1,4 @@
-//! Actors: what moves in a twin beside the ego.
+//! Actors: the moving objects in a twin, apart from the ego.
 
 mod asset;
 mod placed;

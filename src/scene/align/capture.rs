@@ -70,7 +70,7 @@ pub enum CapturedDriveError {
     Folder {
         /// The folder.
         folder: String,
-        /// Those that have images.
+        /// The folders that have images.
         known: Vec<String>,
     },
     /// The camera is below the ground.

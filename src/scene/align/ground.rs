@@ -63,13 +63,13 @@ const TOLERANCE: f64 = 0.01;
 const REFINEMENTS: i32 = 5;
 /// Share of the first round's places that a round must have: below it the tolerance is less than the ground is rough.
 const LEAST_SHARE: f64 = 0.2;
-/// Gaussians with less opacity before the sigmoid do not count: 0.3 after it.
+/// Least logit of the opacity of a Gaussian that counts: an opacity of 0.3.
 const LEAST_LOGIT: f32 = -0.85;
 /// A Gaussian is flat if its thinnest axis has at most this share of the middle one: `ln 0.4`.
 const FLAT_LN: f32 = -0.92;
 /// Least cosine between the normals of the plane and of a flat Gaussian on it.
 const LEAST_COSINE: f64 = 0.8;
-/// Most places that hypotheses are compared with.
+/// Largest number of places with which hypotheses are compared.
 const COMPARED: usize = 12_000;
 const LEAST_PLACES: usize = 50;
 const LEAST_PERCENT: u32 = 4;
@@ -80,15 +80,15 @@ impl Default for GroundSearch {
     }
 }
 
-/// A visible place of the scene.
+/// A visible point of the scene.
 #[derive(Clone, Copy, Debug)]
-struct Place {
+struct SurfaceSample {
     at: DVec3,
     /// Unit normal of its Gaussian, if that is flat.
     normal: Option<DVec3>,
 }
 
-/// Where most of a scene is.
+/// The extent of the main part of a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SceneExtent {
     /// Median of the opaque Gaussians' means, by axis.
@@ -97,7 +97,7 @@ pub struct SceneExtent {
     pub radius: f64,
 }
 
-/// Where most of a scene is; at the origin, with a radius of 0, if nothing is opaque.
+/// The extent of the main part of a scene; at the origin, with a radius of 0, if nothing is opaque.
 pub fn scene_extent(gaussians: &Gaussians) -> SceneExtent {
     extent(gaussians, &opaque(gaussians))
 }
@@ -122,7 +122,7 @@ pub fn find_ground(
     }
     let tolerance = TOLERANCE * radius;
     let stride = places.len().div_ceil(COMPARED);
-    let compared: Vec<Place> = places.iter().copied().step_by(stride).collect();
+    let compared: Vec<SurfaceSample> = places.iter().copied().step_by(stride).collect();
     let mut random = Random::new(search.seed, "ground", 0);
     let mut best: Option<(f64, GroundPlane)> = None;
     for at in 0..search.hypotheses {
@@ -151,14 +151,14 @@ fn extent(gaussians: &Gaussians, opaque: &[usize]) -> SceneExtent {
 }
 
 /// The first Gaussian of each occupied cube, in the order of the Gaussians.
-fn places(gaussians: &Gaussians, opaque: &[usize], cube: f64) -> Vec<Place> {
+fn places(gaussians: &Gaussians, opaque: &[usize], cube: f64) -> Vec<SurfaceSample> {
     let mut taken = HashSet::new();
     let mut places = Vec::new();
     for &i in opaque {
         let at = DVec3::from_array(gaussians.means_m[i]);
         let key = (at / cube.max(f64::MIN_POSITIVE)).floor().as_i64vec3();
         if taken.insert(key) {
-            places.push(Place { at, normal: normal(gaussians, i) });
+            places.push(SurfaceSample { at, normal: normal(gaussians, i) });
         }
     }
     places
@@ -176,7 +176,7 @@ fn normal(gaussians: &Gaussians, i: usize) -> Option<DVec3> {
 }
 
 /// A plane through three random places, or through one along its Gaussian.
-fn hypothesis(places: &[Place], at: usize, random: &mut Random) -> Option<GroundPlane> {
+fn hypothesis(places: &[SurfaceSample], at: usize, random: &mut Random) -> Option<GroundPlane> {
     let mut pick = || places[random.below(places.len())];
     let [a, b, c] = [pick(), pick(), pick()];
     if at.is_multiple_of(2) {
@@ -187,7 +187,7 @@ fn hypothesis(places: &[Place], at: usize, random: &mut Random) -> Option<Ground
 }
 
 /// Counts places on the plane, less those below it; up is the side with more of the scene.
-fn judge(places: &[Place], plane: GroundPlane, tolerance: f64) -> (f64, GroundPlane) {
+fn judge(places: &[SurfaceSample], plane: GroundPlane, tolerance: f64) -> (f64, GroundPlane) {
     let mut on = 0.0;
     let mut above = 0.0_f64;
     let mut below = 0.0_f64;
@@ -197,7 +197,7 @@ fn judge(places: &[Place], plane: GroundPlane, tolerance: f64) -> (f64, GroundPl
             on += match place.normal {
                 Some(normal) if normal.dot(plane.up).abs() >= LEAST_COSINE => 1.0,
                 Some(_) => 0.0,
-                // A round Gaussian says nothing about the direction of its surface.
+                // A round Gaussian has no information about the direction of its surface.
                 None => 0.5,
             };
         } else if height > 3.0 * tolerance {
@@ -211,13 +211,13 @@ fn judge(places: &[Place], plane: GroundPlane, tolerance: f64) -> (f64, GroundPl
 }
 
 /// Fits the plane with a falling tolerance. Each round first moves the plane to the height that has most of the places
-/// near it: a road beside pavements and lawns is not the mean of the three.
-fn refine(places: &[Place], mut plane: GroundPlane, tolerance: f64) -> GroundPlane {
+/// near it, because a road is not the mean of itself and the pavements and lawns next to it.
+fn refine(places: &[SurfaceSample], mut plane: GroundPlane, tolerance: f64) -> GroundPlane {
     let mut first = 0;
     for round in 0..=REFINEMENTS {
         let tolerance = tolerance * 0.5_f64.powi(round);
         let near = |plane: &GroundPlane, reach: f64| -> Vec<DVec3> {
-            let is_near = |place: &&Place| {
+            let is_near = |place: &&SurfaceSample| {
                 let is_level = place.normal.is_none_or(|n| n.dot(plane.up).abs() >= LEAST_COSINE);
                 is_level && plane.up.dot(place.at - plane.point).abs() <= reach
             };

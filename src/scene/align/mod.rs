@@ -77,7 +77,7 @@ impl Alignment {
         Self { new_from_old, ..Self::IDENTITY }
     }
 
-    /// The same axes with another unit.
+    /// These axes with a different unit.
     ///
     /// # Errors
     /// [`AlignmentError::Scale`].
@@ -88,7 +88,7 @@ impl Alignment {
         Ok(Self { metres_per_unit, ..self })
     }
 
-    /// Checks that an alignment, for example one after another, can be stored and read again.
+    /// Checks that an alignment, for example a product of two, can be stored and read again.
     ///
     /// # Errors
     /// [`AlignmentError::Scale`], [`AlignmentError::Pose`].
@@ -134,7 +134,7 @@ impl Alignment {
         self.new_from_old.rotation_matrix().transpose()
     }
 
-    /// This alignment after another one.
+    /// The alignment that applies `first` and then this one.
     pub fn after(&self, first: &Self) -> Self {
         // s2 (T2 (s1 (T1 p))) = s1 s2 (T2' (T1 p)), where T2' moves by 1 / s1 of what T2 moves.
         let mut second = self.new_from_old;

@@ -19,7 +19,7 @@ const MOST_POINTS: usize = 1_000;
 /// Points that are closer together than this are one, in metres.
 const SAME_M: f64 = 1e-3;
 
-/// Why there is no drive through the points.
+/// Why no drive through the points can be made.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PathError {
     /// Too few or too many points.

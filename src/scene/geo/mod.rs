@@ -1,9 +1,9 @@
-//! Where a twin lies on the earth: latitude, longitude and heading of poses in its world.
+//! The place of a twin on the earth: latitude, longitude and heading of poses in its world.
 //!
-//! A twin's world is flat: x east, y north, z up, in metres. An anchor says which flat world. With a WGS84 origin it
-//! is the tangent plane there (ENU): a point is `X0 + E (x, y, z)` in earth-centred coordinates, which is exact at any
-//! distance, and "up" is that of the origin. With a UTM zone, x and y are differences of easting and northing: grid
-//! metres, 0.04 % shorter than metres on the ground in the zone's middle, and north is the grid's.
+//! A twin's world is flat: x east, y north, z up, in metres. An anchor defines this flat world. With a WGS84 origin
+//! it is the tangent plane at the origin (ENU): a point is `X0 + E (x, y, z)` in earth-centred coordinates, which is
+//! exact at any distance, and "up" is that of the origin. With a UTM zone, x and y are differences of easting and
+//! northing: grid metres, 0.04 % shorter than metres on the ground in the zone's middle, and north is the grid's.
 //!
 //! Tests compare both with values from PROJ.
 
@@ -21,7 +21,7 @@ use crate::geometry::Pose;
 
 use ellipsoid::{enu_axes, to_ecef, to_geodetic};
 use utm::UtmZone;
-/// Where the origin of a twin's world lies.
+/// The place of the origin of a twin's world on the earth.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum GeoAnchor {
@@ -181,7 +181,7 @@ fn heading_deg(east: f64, north: f64) -> f64 {
     within_turn(east.atan2(north).to_degrees())
 }
 
-/// The same angle from 0 to below 360 degrees.
+/// An angle as a value from 0 to below 360 degrees.
 fn within_turn(angle_deg: f64) -> f64 {
     // The remainder of a tiny negative angle rounds to 360.
     Some(angle_deg.rem_euclid(360.0)).filter(|angle_deg| *angle_deg < 360.0).unwrap_or(0.0)

@@ -22,7 +22,7 @@ pub(super) struct UtmZone {
     is_south: bool,
 }
 
-/// The same longitude from -180 to below 180 degrees.
+/// A longitude as a value from -180 to below 180 degrees.
 fn wrapped_deg(longitude_deg: f64) -> f64 {
     (longitude_deg + 180.0).rem_euclid(360.0) - 180.0
 }

@@ -50,7 +50,7 @@ const MOST_COST: f64 = 0.02;
 /// Variance that the renderer adds on the screen, in px²: differences that this blur hides have no cost.
 const BLUR_PX2: f64 = 0.3;
 
-/// The levels of a block above level 0, each coarser than the one before; none if merging reduces the number of
+/// The levels of a block above level 0, each coarser than the previous one; none if merging reduces the number of
 /// Gaussians too little.
 pub fn levels(block: &Chunk) -> Vec<Level> {
     let mut merging = Merging::new(block);
@@ -120,7 +120,7 @@ impl Merging {
     fn merge_within(&mut self, limit_m: f64) {
         for round in 0..ROUNDS {
             let before = self.nodes.len();
-            // Every other round shifts the groups by half, so that pairs cross the borders of the round before.
+            // Every other round shifts the groups by half, so that pairs cross the borders of the previous round.
             let first = if round % 2 == 0 { GROUP } else { GROUP / 2 };
             let mut partner = vec![None; before];
             let mut start = 0;

@@ -164,7 +164,7 @@ impl StoredColumn<'_> {
         let mut codes = [0; LANES];
         for byte in 0..BYTES {
             let own = &self.planes[byte * self.count..][start..end];
-            // Of a fixed length, so that the compiler makes one load of it.
+            // A slice of a fixed length, so that the compiler makes one load of it.
             let mut lanes = [0; LANES];
             match <&[u8; LANES]>::try_from(own) {
                 Ok(own) => lanes = *own,

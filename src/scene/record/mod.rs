@@ -4,7 +4,7 @@
 //! the table. A part of a section, up to [`PART_GAUSSIANS`] Gaussians, begins with the grids of its quantised
 //! fields (index of the first step as i32 and the step as f32, little-endian, in the order of the table). Byte
 //! planes follow: for each column, first the lowest byte of all values, then the next. Slowly changing bytes end
-//! up side by side, where zstd compresses them. No value shares a byte with another one, so decoding needs no
+//! up side by side, where zstd compresses them. No two values share a byte, so decoding needs no
 //! shifts: the 32 bytes of a Q32 record become 47 whole bytes, of which 19 remain on disk, since zstd finds the
 //! empty high bits.
 //!
@@ -92,7 +92,7 @@ impl RecordFormat {
     /// | Q32 | 3x23 | 2+3x10 | 3x10 | 10 | 3x11 | 9x9 | 15x8 | 21x8 | 174 | 255 | 375 | 543 |
     /// | Q24 | 3x20 | 2+3x8 | 3x8 | 7 | 3x7 | 9x6 | 15x5 | 21x5 | 138 | 192 | 267 | 372 |
     ///
-    /// Bits are spent where they affect an image most: each field alone has 60 dB or more. Means get the most,
+    /// Bits are spent where they affect an image most: each field by itself has 60 dB or more. Means get the most,
     /// since the first visible artefact are surfels of one plane that change their order in depth: with 20 bits
     /// (15 µm) instead of 23, the demo street had 61 dB, all of it from surfels of one facade. The three more
     /// bits per axis are taken from the colour. A record has no bits for a level of detail or for flags,

@@ -1,4 +1,4 @@
-//! Routes: quantities that follow from the keyframes of a recorded drive alone.
+//! Stations of a recorded drive: arc length at each keyframe, and quantities that follow only from the keyframes.
 //!
 //! The *station* of a keyframe is its distance along the polyline through the keyframes, in metres:
 //! `s_0 = 0` and `s_k = s_{k-1} + |p_k - p_{k-1}|`.
@@ -74,7 +74,7 @@ pub enum RouteError {
         field: &'static str,
         /// The refused value.
         value: f64,
-        /// What must hold instead.
+        /// The values that are accepted.
         must: &'static str,
     },
     /// A time before the first or after the last keyframe.
@@ -101,7 +101,7 @@ pub enum RouteError {
         index: usize,
         /// That time, in microseconds.
         time_us: i64,
-        /// The time before it, in microseconds.
+        /// The time of the previous keyframe, in microseconds.
         before_us: i64,
     },
 }

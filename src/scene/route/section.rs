@@ -19,7 +19,7 @@ pub struct RoutePose {
 pub struct RouteSection {
     /// The first station, in metres; 0 if absent.
     pub from_m: Option<f64>,
-    /// The last station, in metres. The end of the route if absent, or if the route ends before.
+    /// The last station, in metres. The end of the route if absent, or if the route is shorter.
     pub to_m: Option<f64>,
     /// Distance between two poses along the route, in metres. The recorded keyframes if absent.
     pub every_m: Option<f64>,

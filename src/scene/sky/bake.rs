@@ -27,7 +27,7 @@ use crate::chunk::LANES;
 /// Number of values along an edge of the first grid.
 const FIRST_EDGE: usize = 129;
 
-/// The maps of a network that were baked so far, and the error bounds of its levels.
+/// The maps of a network that have been baked, and the error bounds of its levels.
 #[derive(Debug, Default)]
 pub(super) struct Maps {
     /// The coarsest first. Locked only briefly, so that frames whose map exists never wait for a bake.

@@ -3,7 +3,7 @@
 //! A pixel is `C = C_gaussians + T C_sky(direction)`, where T is the transmittance of its Gaussians. A sky is a
 //! network, as street reconstructions train it, or a cube map of six images.
 //!
-//! Since a sky depends on the direction alone, a network of 12,000 multiplications per pixel is baked into a
+//! Since a sky depends only on the direction, a network of 12,000 multiplications per pixel is baked into a
 //! cube map of at most 50 MB when a twin is opened (`bake.rs`). The field `sky_error` of the render profile
 //! bounds the error of the map in any direction; 0 evaluates the network for every pixel, in f32. The
 //! reference backend always evaluates the network, in f64. A sky has at most four maps, one per resolution,
@@ -12,7 +12,7 @@
 //!
 //! Images become the faces of a cube map at import and are not baked. Baked grids have values on the very
 //! edges of the faces, which neighbouring faces share; images have a border of one value that is looked up
-//! from the neighbouring faces. Both use one formula with another scale and offset, so no look-up needs to
+//! from the neighbouring faces. Both use one formula with different scales and offsets, so no look-up needs to
 //! test where a face ends.
 
 mod bake;
@@ -41,7 +41,7 @@ pub struct Sky {
     model: SkyModel,
     /// Takes world axes to the axes of the model: orthonormal, possibly a reflection.
     sky_from_world: DMat3,
-    /// The maps that were baked so far.
+    /// The maps that have been baked.
     baked: Maps,
 }
 
@@ -92,7 +92,7 @@ pub enum SkyError {
         tensor: &'static str,
         /// Shape of the tensor.
         shape: Vec<usize>,
-        /// What must hold instead.
+        /// The values that are accepted.
         must: String,
     },
     /// A weight is not finite or too large.

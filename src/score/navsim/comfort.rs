@@ -1,4 +1,4 @@
-//! Comfort, as nuPlan and NAVSIM compute it, with their faults.
+//! Comfort, as nuPlan and NAVSIM compute it, including their defects.
 //!
 //! Source: NAVSIM 0a380a9 `pdm_comfort_metrics.py`. The acceleration of the rear axle is moved to the centre of the box
 //! by + d (ω² + dω/dt) along the car and by nothing across it, where d is the distance of the two. A rigid body has

@@ -1,4 +1,4 @@
-//! NAVSIM's extended predictive driver model score (EPDMS), with its faults.
+//! NAVSIM's extended predictive driver model score (EPDMS), including its defects.
 //!
 //! Source: autonomousvision/navsim 0a380a9, `pdm_scorer.py`, `pdm_score.py`, `run_pdm_score.py`; comfort is nuPlan's.
 //! A score is of 4 s: 41 states 0.1 s apart.
@@ -34,7 +34,7 @@ pub const STEP_S: f64 = 0.1;
 /// States of a score.
 pub const STATES: usize = 41;
 
-/// What the rules look at.
+/// The input of the rules.
 #[derive(Clone, Copy, Debug)]
 pub struct Scene<'a> {
     /// The ego's size.
@@ -45,7 +45,7 @@ pub struct Scene<'a> {
     pub tracks: &'a [Track],
     /// The lanes.
     pub map: &'a LaneMap,
-    /// The way of the reference (PDM-Closed) along the centre line, in metres.
+    /// Progress of the reference (PDM-Closed) along the centre line, in metres.
     pub reference_progress_m: f64,
 }
 
@@ -60,7 +60,7 @@ pub struct Rules {
     pub driving_direction_compliance: f64,
     /// TLC: 0 if the ego touched a red connector.
     pub traffic_light_compliance: f64,
-    /// EP: its way over the reference's.
+    /// EP: its progress divided by the reference's.
     pub ego_progress: f64,
     /// TTC: 0 if it would have touched a track within 0.9 s.
     pub time_to_collision_within_bound: f64,
@@ -114,7 +114,7 @@ impl Submetrics {
 
 /// The score: the product of the rules that must hold, times the weighted mean of the others.
 ///
-/// What the human driver scored exactly 0 on counts as 1, except for the extended comfort.
+/// A sub-score in which the human driver scored exactly 0 counts as 1, except for the extended comfort.
 pub fn epdms(agent: &Submetrics, human: Option<&Submetrics>) -> f64 {
     let human = human.unwrap_or(&Submetrics::PERFECT);
     let filtered = |agent: f64, human: f64| if human == 0.0 { 1.0 } else { agent };
@@ -135,9 +135,10 @@ fn is_agent(class: ActorClass) -> bool {
     class != ActorClass::Object
 }
 
-/// The score of an episode. There is none: the published score divides by the way of the planner PDM-Closed, which
-/// this project does not have, and compares successive plans, which an episode as driven has not. Its parts are the
-/// sub-metrics that need neither, as driven: the least of all whole 4 s. A record has no traffic lights.
+/// The score of an episode. It has no value: the published score divides by the progress of the planner PDM-Closed,
+/// which this project does not have, and compares successive plans, which a driven episode does not have. Its parts are
+/// the sub-metrics that need neither, for the driven path: the minimum over all whole 4 s. A record has no traffic
+/// lights.
 pub fn pdm(record: &DriveRecord) -> Score {
     let map = match record.map {
         None => "a map of the lanes, ",

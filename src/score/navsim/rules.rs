@@ -1,4 +1,4 @@
-//! The rules of NAVSIM's `PDMScorer`, with their faults.
+//! The rules of NAVSIM's `PDMScorer`, including their defects.
 
 use glam::DVec2;
 
@@ -9,11 +9,11 @@ use crate::record::{EgoSample, Track};
 
 /// Samples of a second, plus one: the published window has 11 increments and not 10.
 const DIRECTION_WINDOW: usize = 11;
-/// Way against the traffic in that window, in metres, that costs half, and all.
+/// Distances against the traffic in that window that cost half of the score and all of it, in metres.
 const DIRECTION_LIMITS_M: [f64; 2] = [2.0, 6.0];
-/// A reference that is not longer than this says nothing of progress, in metres.
+/// Progress is not measured against a reference that is not longer than this, in metres.
 const SHORT_REFERENCE_M: f64 = 5.0;
-/// Samples ahead at which a time to collision is looked for: 0, 0.3, 0.6 and 0.9 s.
+/// Samples ahead that are tested for the time to collision: 0, 0.3, 0.6 and 0.9 s.
 const AHEAD: [usize; 4] = [0, 3, 6, 9];
 /// A slower ego has no time to collision, in m/s.
 const TTC_STANDING_MPS: f64 = 5e-3;
@@ -92,7 +92,7 @@ fn first_velocity_mps(track: &Track) -> DVec2 {
     track.samples.iter().flatten().next().map_or(DVec2::ZERO, |sample| sample.velocity_mps)
 }
 
-/// DDC: the most way of the box's centre against the traffic within the window.
+/// DDC: the largest distance of the box's centre against the traffic within the window.
 fn direction(scene: &Scene<'_>, boxes: &[Footprint]) -> f64 {
     let steps_m = |i: usize| match i {
         0 => 0.0,
@@ -112,8 +112,8 @@ fn direction(scene: &Scene<'_>, boxes: &[Footprint]) -> f64 {
     }
 }
 
-/// EP: the way along the centre line over the longer of the reference's and the ego's own, which counts only
-/// as far as the rules hold.
+/// EP: progress along the centre line, divided by the larger of the reference's and the ego's own. The ego's own
+/// counts only as far as the rules hold.
 fn progress(scene: &Scene<'_>, boxes: &[Footprint], gate: f64) -> f64 {
     let station_m = |ego: &Footprint| scene.map.centerline.project(ego.center_m).station_m;
     let way_m = (station_m(&boxes[boxes.len() - 1]) - station_m(&boxes[0])).max(0.0);
@@ -121,8 +121,8 @@ fn progress(scene: &Scene<'_>, boxes: &[Footprint], gate: f64) -> f64 {
     if longest_m > SHORT_REFERENCE_M { (way_m / longest_m).clamp(0.0, 1.0) } else { 1.0 }
 }
 
-/// TTC: the first sample at which the ego, moved on at its speed, touches a track where that will be. A track that is
-/// met otherwise is ignored from then on.
+/// TTC: the first sample at which the ego, moved on at its speed, touches the future box of a track. A track that is
+/// touched in another way is ignored from then on.
 fn time_to_collision(scene: &Scene<'_>, lanes: &[LanePosition]) -> Option<usize> {
     let mut first = None;
     let mut ignored = vec![false; scene.tracks.len()];
@@ -142,8 +142,8 @@ fn time_to_collision(scene: &Scene<'_>, lanes: &[LanePosition]) -> Option<usize>
                 if ignored[k] || !moved_box.touches(&then.footprint) {
                     continue;
                 }
-                // As published: where the track will be, seen from where the ego is now. A car that closes in from
-                // behind may be ahead by then.
+                // As published: the future position of the track relative to the current position of the ego. A car
+                // that closes in from behind may be ahead by then.
                 let bearing_rad = bearing_rad(ego, then.footprint.center_m);
                 let spread = lanes[step].in_multiple_lanes
                     || lanes[step].off_drivable

@@ -9,10 +9,10 @@ use super::fault::{CollisionType, FaultInput, LanePosition, is_ego_at_fault};
 use super::sweep::{Moving, overlap_s};
 use crate::traffic::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 
-/// A faster motion within a sub-step is a teleport, in m/s: it is not swept, only its end is looked at.
+/// A faster motion within a sub-step is a teleport, in m/s: it is not swept, and only its end is tested.
 pub const MAX_SWEPT_SPEED_MPS: f64 = 60.0;
 
-/// The begin of a contact.
+/// The start of a contact.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
     /// Index of the actor's [`ActorSpec`].
@@ -28,7 +28,7 @@ pub struct Contact {
     pub ego_at_fault: bool,
     /// Unit vector from the ego to the actor, along the axis on which they met.
     pub normal: DVec2,
-    /// Speed against each other, in m/s.
+    /// Relative speed, in m/s.
     pub impact_mps: f64,
     /// The ego's velocity at the end of the sub-step, in m/s.
     pub ego_velocity_mps: DVec2,
@@ -38,7 +38,7 @@ pub struct Contact {
 
 /// Finds where contacts begin.
 ///
-/// A contact begins when two boxes touch that did not touch at the end of the sub-step before. While they stay in
+/// A contact begins when two boxes touch that did not touch at the end of the previous sub-step. While they stay in
 /// contact, nothing more is reported.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Detector {
@@ -57,7 +57,7 @@ struct Pair<'a> {
 }
 
 impl Detector {
-    /// A detector at the begin of an episode, and the contacts of boxes that overlap already.
+    /// A detector at the start of an episode, and the contacts of boxes that overlap already.
     pub fn at_start(
         ego_box: EgoBox,
         specs: &[ActorSpec],
@@ -78,8 +78,8 @@ impl Detector {
     /// The contacts that begin in a sub-step, in the order of the actors. `lanes` is where the ego's corners lie at
     /// its end, if there is a map.
     ///
-    /// Within a sub-step centres move straight; the headings are those of its end. So every sub-step decides by
-    /// itself, and a finer recording of the same motion at the same sub-steps decides alike.
+    /// Within a sub-step, centres move on straight lines and the headings are those at its end. So every sub-step is
+    /// decided by itself, and a finer recording of the same motion gives the same decisions at the same sub-steps.
     pub fn advance(
         &mut self,
         sub_step: &SubStep<'_>,
@@ -135,7 +135,7 @@ impl Pair<'_> {
         self.touches_at_end().then_some(step_s)
     }
 
-    /// When the boxes touch within a sub-step, in seconds since its begin; `None` if they do not.
+    /// When the boxes touch within a sub-step, in seconds since its start; `None` if they do not.
     fn touch_s(&self, step_s: f64) -> Option<f64> {
         let at_end = self.touch_at_end_s(step_s);
         let way_m = |[from, to]: [Body; 2]| to.footprint.center_m - from.footprint.center_m;

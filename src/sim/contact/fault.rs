@@ -7,7 +7,7 @@ use super::footprint::Footprint;
 /// A speed up to this is standing, in m/s (NAVSIM, `stopped_speed_threshold`).
 pub const STANDING_MPS: f64 = 0.05;
 
-/// What is more than this off the heading is behind, in radians: 150°, as in NAVSIM.
+/// A direction that is more than this off the heading is behind, in radians: 150°, as in NAVSIM.
 pub const BEHIND_RAD: f64 = 150.0 * std::f64::consts::PI / 180.0;
 
 /// Kinds of contact, in the order in which they are asked for (nuPlan's and NAVSIM's names).
@@ -25,7 +25,7 @@ pub enum CollisionType {
     ActiveLateral,
 }
 
-/// What the fault depends on, at the contact.
+/// The state at the contact, on which the fault depends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FaultInput {
     /// The ego's box.

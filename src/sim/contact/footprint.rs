@@ -68,7 +68,7 @@ impl Footprint {
         Self { center_m, length_m: 0.0, ..*self }
     }
 
-    /// The same box elsewhere.
+    /// The box moved by a vector, in metres.
     pub fn shifted(&self, by_m: DVec2) -> Self {
         Self { center_m: self.center_m + by_m, ..*self }
     }

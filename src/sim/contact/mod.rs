@@ -3,12 +3,12 @@
 //! | file | what it computes |
 //! |---|---|
 //! | `footprint.rs` | a box seen from above: corners, gap and distance to another |
-//! | `body.rs` | a footprint with its heights: what a pose and a size make of it |
+//! | `body.rs` | a footprint with its heights, from a pose and a size |
 //! | `sweep.rs` | when two footprints at constant velocity overlap; time to contact |
 //! | `detector.rs` | the contacts of the ego, sub-step by sub-step |
 //! | `fault.rs` | which side of the ego was hit, and the fault |
 //! | `solid.rs` | contact with the twin's own Gaussians |
-//! | `solids.rs` | these Gaussians by place, and what the recorded drive meets of them |
+//! | `solids.rs` | these Gaussians in a grid, and the area that recorded drives overlap |
 //!
 //! All of it is f64 and relative to the ego, so that a decision is the same at any distance from the world's
 //! origin. Boxes are closed sets: boxes that touch are in contact.

@@ -9,7 +9,8 @@ use glam::DVec3;
 
 /// Least opacity of a Gaussian that counts.
 pub const SOLID_OPACITY: f64 = 0.5;
-/// How much narrower than the ego the tested box is on each side, in metres: blur of a surface's edge.
+/// How much smaller than the ego's box the tested box is on each side, in metres, because the edge of a surface is
+/// blurred.
 pub const SIDE_MARGIN_M: f64 = 0.1;
 /// Height above the ground from which Gaussians count, in metres: kerbs are driven over.
 pub const GROUND_MARGIN_M: f64 = 0.3;
@@ -27,10 +28,11 @@ pub struct SolidPoint {
     pub opacity: f64,
 }
 
-/// What area in the box is a contact.
+/// The area of Gaussians in the ego's box that counts as a contact.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StaticLimit {
-    /// The most area that the recorded drive met, in m². What was driven through is free by evidence.
+    /// The largest area of Gaussians inside the ego's box anywhere on the recorded drives, in m². The recorded car
+    /// drove there, so this much area is no obstacle.
     pub most_on_drive_m2: f64,
 }
 
@@ -45,12 +47,12 @@ impl SolidPoint {
 
     /// Whether it counts for a box of length, width and height, in metres.
     pub fn is_in(&self, size_m: DVec3) -> bool {
-        self.opacity >= SOLID_OPACITY && is_met(self.mean_m, size_m)
+        self.opacity >= SOLID_OPACITY && is_in_tested_box(self.mean_m, size_m)
     }
 }
 
 /// Whether a centre in the axes of the ego's box lies in the part of the box that is tested.
-pub(super) fn is_met(mean_m: DVec3, size_m: DVec3) -> bool {
+pub(super) fn is_in_tested_box(mean_m: DVec3, size_m: DVec3) -> bool {
     let DVec3 { x, y, z } = mean_m;
     let within_length = x.abs() <= 0.5 * size_m.x - SIDE_MARGIN_M;
     let within_width = y.abs() <= 0.5 * size_m.y - SIDE_MARGIN_M;

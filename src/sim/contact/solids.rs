@@ -1,4 +1,4 @@
-//! The solid Gaussians of a twin by place, so that the box of the ego finds those that it meets.
+//! The solid Gaussians of a twin in a grid, in which the ego's box finds those that it overlaps.
 
 use std::collections::BTreeMap;
 
@@ -8,15 +8,15 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 
 use super::body::Body;
-use super::solid::{SOLID_OPACITY, SolidPoint, StaticLimit, is_met};
+use super::solid::{SOLID_OPACITY, SolidPoint, StaticLimit, is_in_tested_box};
 use crate::traffic::EgoBox;
 
 /// Edge of a cell, in metres: a car lies in 4 to 9 of them.
 const CELL_M: f64 = 4.0;
-/// Distance between two places at which a recorded drive is measured, in metres.
+/// Largest distance between two places at which the area is measured along a recorded drive, in metres.
 const MEASURED_M: f64 = 0.5;
 
-/// The solid Gaussians of a part of a twin, and the area that is no contact.
+/// The solid Gaussians of a part of a twin, and the area above which they are a contact.
 ///
 /// The sum of areas is in a fixed order, so that a decision does not depend on threads.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,8 +35,8 @@ struct Solid {
 }
 
 impl Solids {
-    /// The Gaussians among `points` that are solid, each in world axes. Nothing that recorded drives meet is a contact:
-    /// the limit is twice the most that the ego's box meets on them.
+    /// The Gaussians among `points` that are solid, each in world axes. The contact threshold is at least twice the
+    /// largest area that the ego's box overlaps along the recorded drives, so that the drives have no contact.
     pub fn new(
         points: impl IntoIterator<Item = SolidPoint>,
         drives: &[Trajectory],
@@ -68,12 +68,12 @@ impl Solids {
         solids
     }
 
-    /// The area that the box of the ego meets at a pose, in m².
+    /// The area that the ego's box overlaps at a pose, in m².
     pub fn area_m2(&self, world_from_rig: &Pose, ego: &EgoBox) -> f64 {
         area_m2(&self.cells, world_from_rig, ego)
     }
 
-    /// What area is a contact.
+    /// The area above which there is a contact.
     pub fn limit(&self) -> StaticLimit {
         self.limit
     }
@@ -98,7 +98,7 @@ fn area_m2(cells: &BTreeMap<[i32; 2], Vec<Solid>>, world_from_rig: &Pose, ego: &
                     from_center_m.dot(left),
                     z_m - bottom_m,
                 );
-                if is_met(in_box_m, size_m) {
+                if is_in_tested_box(in_box_m, size_m) {
                     area_m2 += f64::from(solid.area_m2);
                 }
             }

@@ -168,7 +168,7 @@ pub enum EgoError {
         index: usize,
         /// Its time, in microseconds.
         time_us: i64,
-        /// Time of the pose before it, in microseconds.
+        /// Time of the previous pose, in microseconds.
         before_us: i64,
         /// The latest accepted, in microseconds.
         limit_us: i64,
@@ -221,7 +221,7 @@ impl Dynamics {
         Ok(dynamics)
     }
 
-    /// The same dynamics with another speed at the start, from the field `field` of a request.
+    /// These dynamics with a different speed at the start, from the field `field` of a request.
     ///
     /// # Errors
     /// As [`Dynamics::checked`].

@@ -51,7 +51,7 @@ const MAX_INTERVAL_LAGS: f64 = 0.25;
 const MIN_INTERVAL_SPEED_M_S: f64 = 1e-3;
 
 impl SingleTrackState {
-    /// The same state in the frame of the place of another one.
+    /// This state relative to the pose of another state.
     #[must_use]
     pub(super) fn relative_to(&self, other: &Self) -> Self {
         Self {

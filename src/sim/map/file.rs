@@ -33,7 +33,7 @@ pub struct MapFile {
 pub struct Lane {
     /// Id within the map.
     pub id: String,
-    /// What drives on it. If absent, vehicles.
+    /// Its users. If absent, vehicles.
     #[serde(default, skip_serializing_if = "LaneKind::is_driving")]
     pub kind: LaneKind,
     /// The middle, in driving direction.
@@ -53,7 +53,7 @@ pub struct Lane {
     pub limit_mps: Option<f64>,
 }
 
-/// What drives on a lane.
+/// Users of a lane.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
@@ -76,7 +76,7 @@ pub enum LaneKind {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Area {
-    /// What it is.
+    /// Its kind.
     pub kind: AreaKind,
     /// Its outline, without repeating the first point.
     pub outline: Vec<[f64; 3]>,

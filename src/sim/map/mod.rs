@@ -3,9 +3,10 @@
 //! | module | what it holds |
 //! |---|---|
 //! | `file` | `wildcity.map/1` |
-//! | `strips` | areas beside recorded drives, for twins without a map |
+//! | `strips` | areas along recorded drives, for twins without a map |
 //! | `surface` | the road under lanes |
-//! | `geojson`, `opendrive` | import |
+//!
+//! `wildcity_convert` reads OpenDRIVE and GeoJSON.
 
 mod file;
 mod strips;

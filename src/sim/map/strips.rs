@@ -1,4 +1,4 @@
-//! Drivable areas beside recorded drives, for a twin without a map.
+//! Drivable areas along recorded drives, for a twin without a map.
 
 use glam::DVec3;
 

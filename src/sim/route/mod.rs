@@ -12,14 +12,14 @@ use crate::traffic::Course;
 /// AlpaSim.
 const POINT_SPACING_M: f64 = 80.0 / 19.0;
 
-/// How far ahead a command looks, in seconds, and the least speed for it, in m/s (NeuroNCAP, `model_api.py`).
+/// Time for which a command looks ahead, in seconds, and the least speed for it, in m/s (NeuroNCAP, `model_api.py`).
 const COMMAND_AHEAD_S: f64 = 3.0;
 const COMMAND_SPEED_MPS: f64 = 2.0;
 
-/// A route that leads so far to a side is a turn, in metres (NeuroNCAP).
+/// Lateral distance from which on the route ahead counts as a turn, in metres (NeuroNCAP).
 const TURN_M: f64 = 2.0;
 
-/// How far ahead of its place a command is given, unless it says otherwise, in metres.
+/// Default distance before its place at which a command is given, in metres.
 pub const COMMAND_AHEAD_M: f64 = 50.0;
 
 /// A route with its navigation commands.
@@ -34,42 +34,42 @@ pub struct NavigationRoute {
 /// A command at its place.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RouteCommand {
-    /// Where it is to be carried out, in metres along the route.
+    /// Where it must be carried out, in metres along the route.
     pub station_m: f64,
     /// The command.
     pub command: NavigationCommand,
     /// Its text; `{m}` stands for the distance in metres.
     pub text: Option<String>,
-    /// How long before its place it is given, in metres.
+    /// Distance before its place at which it is given, in metres.
     pub ahead_m: f64,
 }
 
-/// Where the ego is on its route.
+/// The progress of the ego on its route.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RouteProgress {
     /// The nearest place, in metres along the route.
     pub station_m: f64,
     /// Distance from the route, in metres.
     pub off_m: f64,
-    /// The largest station so far, in metres.
+    /// The largest station that the ego has reached, in metres.
     pub farthest_m: f64,
     /// Where the episode began, in metres.
     pub begin_m: f64,
 }
 
-/// What an observation tells about the route.
+/// The route in an observation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RouteView {
-    /// Up to 20 points in the rig's frame, in metres: from the place beside the ego, 80/19 m apart.
+    /// Up to 20 points in the rig's frame, in metres: from the route's nearest point to the ego on, 80/19 m apart.
     pub points_m: Vec<DVec3>,
-    /// What to do.
+    /// The command.
     pub command: NavigationCommand,
-    /// The same in words, where the route has them.
+    /// The text of the command, if the route has one.
     pub text: Option<String>,
 }
 
 impl NavigationRoute {
-    /// The ego's place at the begin of an episode.
+    /// The ego's place at the start of an episode.
     pub fn begin(&self, world_from_rig: &Pose) -> RouteProgress {
         let beside = self.course.nearest(world_from_rig.position_m);
         RouteProgress {
@@ -80,8 +80,8 @@ impl NavigationRoute {
         }
     }
 
-    /// The ego's place after it moved. The search stays near the place before, so that a route that crosses itself
-    /// is not cut short; an ego that is far from there is searched on the whole route.
+    /// The ego's place after it moved. The search stays near the previous place, so that no part of a route that
+    /// crosses itself is skipped. Only an ego that is far from this part is searched for on the whole route.
     pub fn after(&self, before: &RouteProgress, world_from_rig: &Pose) -> RouteProgress {
         let point_m = world_from_rig.position_m;
         let [back_m, ahead_m] = limits::ROUTE_SEARCH_M;
@@ -128,7 +128,7 @@ impl NavigationRoute {
         RouteView { points_m, command, text }
     }
 
-    /// The share of the route that was driven since the begin, 0 to 1.
+    /// The share of the route that was driven since the start, 0 to 1.
     pub fn share(&self, progress: &RouteProgress) -> f64 {
         let whole_m = self.course.length_m() - progress.begin_m;
         let driven_m = progress.farthest_m - progress.begin_m;
@@ -204,7 +204,7 @@ mod tests {
     #[test]
     fn commands_are_given_before_their_place() {
         let route = corner(Vec::new());
-        // Beside the route by 2.1 m, and on it: the place beside the point 15 m ahead decides.
+        // 2.1 m off the route, and on it: the lateral offset of the point 15 m ahead decides.
         for (y_m, command) in [
             (-2.1, NavigationCommand::Left),
             (0.0, NavigationCommand::Straight),

@@ -23,7 +23,7 @@ pub struct ActorSection {
     /// Length, width and height, in metres. If absent, those of its asset; without an asset, of its kind.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub size: Option<[f64; 3]>,
-    /// Whether it is there from the begin; otherwise its script spawns it. If absent, true.
+    /// Whether it is present from the start; otherwise its script spawns it. If absent, true.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub present: Option<bool>,
     /// Repeats a track of the tracks file.
@@ -35,7 +35,7 @@ pub struct ActorSection {
     /// Follows a course by the Intelligent Driver Model.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub idm: Option<IdmSection>,
-    /// Moves through timed positions, blind to others, as in NeuroNCAP.
+    /// Moves through timed positions and ignores all others, as in NeuroNCAP.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub collide: Option<CollideSection>,
     /// Plans its way towards the ego, as in HUGSIM.
@@ -44,10 +44,10 @@ pub struct ActorSection {
     /// Stands.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stand: Option<PoseSection>,
-    /// What it does when a condition holds; for `path` and `idm`, and `spawn` and `remove` for all.
+    /// Conditions and their actions: all actions for `path` and `idm`, only `spawn` and `remove` for the others.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub script: Vec<TriggerSection>,
-    /// Random displacement of its begin.
+    /// Random displacement of its starting pose.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub jitter: Option<JitterSection>,
 }
@@ -97,12 +97,12 @@ pub struct PathSection {
     /// Whether to follow it from its end to its start. If absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reverse: Option<bool>,
-    /// Where it begins, in metres along the line.
+    /// Where it starts, in metres along the line.
     pub station_m: f64,
-    /// How far to the left of the line it drives, in metres. If absent, 0.
+    /// Its offset to the left of the line, in metres. If absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub offset_m: Option<f64>,
-    /// Its speed at the begin, in m/s.
+    /// Its speed at the start, in m/s.
     pub speed: f64,
     /// Whether it disappears at the end of the line. Otherwise it stands there.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -126,12 +126,12 @@ pub struct IdmSection {
     /// Whether to follow it from its end to its start. If absent, false.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reverse: Option<bool>,
-    /// Where it begins, in metres along the line.
+    /// Where it starts, in metres along the line.
     pub station_m: f64,
-    /// How far to the left of the line it drives, in metres. If absent, 0.
+    /// Its offset to the left of the line, in metres. If absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub offset_m: Option<f64>,
-    /// Its speed at the begin, in m/s.
+    /// Its speed at the start, in m/s.
     pub speed: f64,
     /// Whether it disappears at the end of the line. Otherwise it stands there.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -216,14 +216,14 @@ pub struct TimedPosition {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct AttackSection {
-    /// Where it begins.
+    /// Where it starts.
     pub pose: PoseSection,
     /// Its speed then, in m/s.
     pub speed: f64,
     /// Ticks of 0.25 s between two plans. If absent, 3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ticks: Option<u32>,
-    /// The plan is drawn from so many of the best: 1, 2 or 10 in HUGSIM. If absent, 1.
+    /// Number of best plans from which one is sampled: 1, 2 or 10 in HUGSIM. If absent, 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub best_k: Option<u32>,
 }
@@ -243,7 +243,7 @@ pub struct TriggerSection {
     pub then: Vec<ActionSection>,
 }
 
-/// A condition: every given part must hold. One without parts holds at the begin.
+/// A condition: every given part must hold. A condition without parts holds at the start.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
@@ -263,19 +263,19 @@ pub struct ConditionSection {
     /// The ego has reached this station of the actor's course, in metres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ego_station_m: Option<f64>,
-    /// The actor drives at least so fast, in m/s.
+    /// The actor's speed is at least this, in m/s.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub speed_above: Option<f64>,
-    /// The actor drives at most so fast, in m/s.
+    /// The actor's speed is at most this, in m/s.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub speed_below: Option<f64>,
-    /// The ego drives at least so fast, in m/s.
+    /// The ego's speed is at least this, in m/s.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ego_speed_above: Option<f64>,
-    /// A trigger that fired before, by its name: `TRIGGER` of this actor, or `ACTOR/TRIGGER`.
+    /// A trigger that has fired, by its name: `TRIGGER` of this actor, or `ACTOR/TRIGGER`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub after: Option<String>,
-    /// How long before, in seconds. If absent, 0.
+    /// Least time since `after` fired, in seconds. If absent, 0.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub delay_s: Option<f64>,
 }
@@ -327,7 +327,7 @@ pub struct JitterSection {
     /// absent, the actor's heading.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub along_rad: Option<f64>,
-    /// What was drawn: only in the resolved scenario of a record.
+    /// The sampled displacement: only in the resolved scenario of a record.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub drawn: Option<JitterDraw>,
 }

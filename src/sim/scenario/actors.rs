@@ -19,7 +19,9 @@ use super::pose::pose_of;
 use super::script::{References, script_of};
 use super::tracks::{TrackSection, box_of};
 use crate::limits;
-use crate::traffic::{Actor, ActorSpec, Attack, Behaviour, Follow, Idm, Track, TrackKeyframe};
+use crate::traffic::{
+    Actor, ActorSpec, Attack, Behaviour, CourseFollower, Idm, Track, TrackKeyframe,
+};
 
 /// Time between two ticks of HUGSIM, in microseconds, and the number of ticks between two plans.
 const TICK_US: i64 = 250_000;
@@ -251,7 +253,7 @@ fn follow_of(
     drawn: &JitterDraw,
     idm: Option<Idm>,
     courses: &mut Courses<'_>,
-) -> Result<Follow, FileError> {
+) -> Result<CourseFollower, FileError> {
     let course = courses
         .line(
             "along",
@@ -267,7 +269,7 @@ fn follow_of(
     let offset_m = in_range(&format!("{field}.offset_m"), offset_m, [-100.0, 100.0])?;
     let most_mps = limits::ACTOR_SPEED_M_S;
     let speed_mps = in_range(&format!("{field}.speed"), path.speed, [0.0, most_mps])?;
-    Ok(Follow {
+    Ok(CourseFollower {
         courses: vec![course],
         station_m: (station_m + drawn.longitudinal_m).clamp(0.0, length_m),
         // Jitter is to the right, offsets are to the left.

@@ -10,7 +10,7 @@ use super::tracks::TracksFile;
 use crate::map::Map;
 use crate::{Ground, limits};
 
-/// What a scenario refers to.
+/// The objects that a scenario refers to.
 #[derive(Clone, Copy)]
 pub struct Surroundings<'a> {
     /// Recorded drives of the twin.
@@ -19,11 +19,11 @@ pub struct Surroundings<'a> {
     pub tracks: Option<&'a TracksFile>,
     /// The map that the scenario names.
     pub map: Option<&'a Map>,
-    /// Looks up an asset by its hash or its name. The error says why there is none.
+    /// Looks up an asset by its hash or its name. The error is the reason if it cannot be used.
     pub asset: &'a dyn Fn(&str) -> Result<AssetInfo, String>,
 }
 
-/// What a scenario needs to know about an asset.
+/// The properties of an asset that a scenario needs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AssetInfo {
     /// Its hash, 64 lower-case hex digits.

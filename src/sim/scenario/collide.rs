@@ -71,7 +71,7 @@ fn through_positions(
     track_of(keyframes.collect())
 }
 
-/// The direction of the motion at a point: towards the next, at the last from the one before.
+/// The direction of the motion at a point: towards the next point; at the last, from the previous one.
 fn facing_rad(points_m: &[DVec3], index: usize) -> Option<f64> {
     let last = points_m.len() - 1;
     let way_m = match index == last {

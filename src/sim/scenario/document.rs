@@ -33,7 +33,7 @@ impl Document {
         Self::from_json(json(bytes, "scenario", limits::SCENARIO_BYTES)?)
     }
 
-    /// The same from JSON that is parsed already.
+    /// Reads a document from JSON that is parsed already.
     ///
     /// # Errors
     /// As [`Self::parse`].

@@ -35,7 +35,7 @@ pub enum EndReason {
     RouteDone,
 }
 
-/// What the rules look at after a step.
+/// The values that the rules test after a step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EndInput {
     /// Time since the episode's start, in microseconds.

@@ -6,7 +6,7 @@
 pub struct FileError {
     /// The place in the file, such as `actors[2].idm.speed`; a line for XML.
     pub path: String,
-    /// What is wrong, and what is accepted.
+    /// The error, and the accepted values.
     pub message: String,
 }
 
@@ -16,7 +16,7 @@ impl FileError {
         Self { path: path.into(), message: message.into() }
     }
 
-    /// The same mistake within an outer object.
+    /// This mistake within an outer object.
     pub(crate) fn within(self, outer: &str) -> Self {
         let separator = if self.path.starts_with('[') || self.path.is_empty() { "" } else { "." };
         Self { path: format!("{outer}{separator}{}", self.path), message: self.message }
@@ -93,7 +93,7 @@ pub(crate) fn hashed(path: &str, hash: &str) -> Result<(), FileError> {
     Err(FileError::new(path, format!("{hash:?} is no BLAKE3 hash: write 64 lower-case hex digits")))
 }
 
-/// What is known, for a message: the names, or `none`.
+/// The known names for a message, or `none`.
 pub(crate) fn listed<'a>(names: impl Iterator<Item = &'a str>) -> String {
     let names: Vec<&str> = names.take(20).collect();
     if names.is_empty() { "none".to_owned() } else { names.join(", ") }

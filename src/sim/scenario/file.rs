@@ -28,7 +28,7 @@ pub struct ScenarioFile {
     /// The ego.
     #[serde(default)]
     pub ego: EgoSection,
-    /// Where the ego should drive. If absent, along the trajectory that `ego.start` names; else there is no route.
+    /// Where the ego should drive. If absent, along the trajectory that `ego.start` names, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub route: Option<RouteSection>,
     /// Recorded actors.
@@ -40,10 +40,10 @@ pub struct ScenarioFile {
     /// Values that are tried one after the other.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sweep: Option<SweepSection>,
-    /// When an episode ends, beside the agent's own end.
+    /// When an episode ends, unless the agent ends it before.
     #[serde(default)]
     pub end: EndSection,
-    /// What an episode must reach.
+    /// The requirements that an episode must meet.
     #[serde(default)]
     pub verdict: VerdictSection,
     /// The seed that jitter was drawn with: only in the resolved scenario of a record.
@@ -63,7 +63,7 @@ pub struct TwinPin {
     pub version_hash: Option<String>,
 }
 
-/// A file beside the scenario, and its hash.
+/// A file in the scenario's directory, and its hash.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
@@ -80,7 +80,7 @@ pub struct FilePin {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoSection {
-    /// Where it starts. If absent, as of the request `open`: the start of the twin's first trajectory.
+    /// Where it starts. If absent, as in the request `open`: the start of the twin's first trajectory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub start: Option<StartSection>,
     /// How it moves. If absent, by teleport.
@@ -92,7 +92,7 @@ pub struct EgoSection {
     /// Its box. If absent, 5.393 m x 2.109 m x 1.503 m, its centre 1.3 m before the rear axle.
     #[serde(rename = "box", skip_serializing_if = "Option::is_none")]
     pub box_: Option<EgoBoxSection>,
-    /// The start shifts by up to so many frames of 0.5 s, earlier or later.
+    /// Largest shift of the start, in frames of 0.5 s, earlier or later.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub jitter_frames: Option<u32>,
 }
@@ -176,14 +176,14 @@ pub struct RouteSection {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct CommandSection {
-    /// Where it is to be carried out, in metres along the route.
+    /// Where it must be carried out, in metres along the route.
     pub station_m: f64,
     /// The command.
     pub command: NavigationCommand,
     /// Text for language models; `{m}` is replaced by the distance in whole metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text: Option<String>,
-    /// How long before its place it is given, in metres. If absent, 50.
+    /// Distance before its place at which it is given, in metres. If absent, 50.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ahead_m: Option<f64>,
 }
@@ -266,11 +266,11 @@ pub enum ContactRule {
     AtFault,
     /// One with a pedestrian.
     Pedestrian,
-    /// One with the twin's Gaussians beside the route. They are looked at in no other case.
+    /// One with the twin's Gaussians near the route. Only this rule tests them.
     Static,
 }
 
-/// What an episode must reach.
+/// The requirements that an episode must meet.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]

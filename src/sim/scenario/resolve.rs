@@ -164,7 +164,7 @@ fn ego_start(
     }
 }
 
-/// A station that is earlier or later by up to so many frames of 0.5 s of the recorded drive.
+/// A station that is earlier or later by up to `frames` frames of 0.5 s of the recorded drive.
 fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result<f64, String> {
     if frames == 0 {
         return Ok(station_m);

@@ -8,7 +8,7 @@ use super::error::{FileError, in_range, listed, named};
 use crate::limits;
 use crate::traffic::{Action, Actor, After, Behaviour, Condition, Near, Trigger};
 
-/// What scripts may refer to.
+/// The names that scripts may refer to.
 pub(super) struct References<'a> {
     /// The index of each actor, by name.
     pub(super) indices: &'a BTreeMap<String, usize>,

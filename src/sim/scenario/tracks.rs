@@ -38,7 +38,7 @@ pub struct TrackSection {
     /// BLAKE3 of its asset. Without one it is not drawn.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub asset: Option<String>,
-    /// Where it was, by rising time. It is absent before the first and after the last.
+    /// Its poses, by rising time. It is absent before the first and after the last.
     pub keyframes: Vec<KeyframeSection>,
 }
 

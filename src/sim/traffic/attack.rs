@@ -3,12 +3,12 @@
 //! Every few ticks of 0.25 s the attacker considers 150 cubic splines of 2 s: five offsets to the side, ten
 //! accelerations, and three headings at the end. Those that no vehicle could drive are dropped. The cost of one is
 //! the least distance to the predicted ego, plus 0.1 for each neighbour that comes nearer than 2 m. One of the best
-//! is drawn. HUGSIM predicts the ego at 0.25 s a point and the attacker at 0.1 s a point; here both are predicted at
+//! is sampled. HUGSIM predicts the ego at 0.25 s a point and the attacker at 0.1 s a point; here both are predicted at
 //! the same times.
 
 use glam::DVec2;
 
-/// Points of a plan after its begin, 0.1 s apart: 2 s.
+/// Points of a plan after its start, 0.1 s apart: 2 s.
 pub const PLAN_POINTS: usize = 20;
 /// Time between two points, in seconds.
 const POINT_S: f64 = 0.1;
@@ -21,7 +21,7 @@ const ACCELERATIONS: u8 = 10;
 const ACCELERATIONS_MPS2: [f64; 2] = [-2.0, 5.0];
 /// Headings at the end relative to the direction towards it, in radians: 30° to either side.
 const HEADINGS_RAD: [f64; 3] = [-std::f64::consts::FRAC_PI_6, 0.0, std::f64::consts::FRAC_PI_6];
-/// What a vehicle can drive: accelerations (m/s²), speeds (m/s), largest yaw rate (rad/s).
+/// Limits of a drivable motion: accelerations (m/s²), speeds (m/s), largest yaw rate (rad/s).
 const DRIVABLE_MPS2: [f64; 2] = [-6.0, 5.0];
 const DRIVABLE_MPS: [f64; 2] = [-2.0, 50.0];
 const DRIVABLE_RADPS: f64 = 8.0;
@@ -35,14 +35,14 @@ const NEIGHBOUR_COST_M: f64 = 0.1;
 pub struct Attack {
     /// Time between two plans, in microseconds: 3 ticks of 0.25 s in HUGSIM's fast mode, 10 in its slow mode.
     pub plan_us: i64,
-    /// The plan is drawn from so many of the best: 1, 2 and 10 in HUGSIM's modes.
+    /// Number of best plans from which one is sampled: 1, 2 and 10 in HUGSIM's modes.
     pub best: usize,
 }
 
-/// A cubic spline in the plane, in the axes of the attacker at its begin: x ahead, y to the left.
+/// A cubic spline in the plane, in the axes of the attacker at the start of the plan: x ahead, y to the left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spline {
-    /// Speed at the begin, in m/s.
+    /// Speed at the start, in m/s.
     begin_mps: f64,
     end_m: DVec2,
     end_mps: DVec2,
@@ -83,12 +83,12 @@ impl Spline {
             + (3.0 * t * t - 2.0 * t) * self.end_mps
     }
 
-    /// The points of the plan, without the begin.
+    /// The points of the plan, without its start.
     pub fn points_m(&self) -> [DVec2; PLAN_POINTS] {
         std::array::from_fn(|at| self.position_m((at + 1) as f64 * POINT_S))
     }
 
-    /// Whether a vehicle could drive it: speeds along the own heading, accelerations and yaw rates between points.
+    /// Whether a vehicle could drive it: speeds along its heading, accelerations and yaw rates between points.
     fn is_drivable(&self) -> bool {
         let velocities: [DVec2; PLAN_POINTS + 1] =
             std::array::from_fn(|at| self.velocity_mps(at as f64 * POINT_S));

@@ -7,8 +7,8 @@ use wildcity_scene::geometry::Pose;
 
 use crate::Ground;
 
-/// Points of a course that are nearer to the point before them are left out, in metres: a recording has thousands of
-/// keyframes at one place while the vehicle stood.
+/// Points of a course that are nearer than this to the previous point are left out, in metres: a recording has
+/// thousands of keyframes at one place while the vehicle stood.
 const SPACING_M: f64 = 0.01;
 
 /// A line of poses: x along the line, z up from the ground. Beyond both ends it continues straight.
@@ -19,9 +19,9 @@ pub struct Course {
     stations_m: Vec<f64>,
 }
 
-/// A place beside a course.
+/// The nearest place of a course to a point, and the point's offset from it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Beside {
+pub struct CourseFootPoint {
     /// Distance along the course, in metres.
     pub station_m: f64,
     /// Distance to the left of the course, in metres.
@@ -80,7 +80,7 @@ impl Course {
         Self::from_poses(poses)
     }
 
-    /// The same line in the opposite direction.
+    /// This line in the opposite direction.
     pub fn reversed(&self) -> Self {
         let half_turn = DQuat::from_rotation_z(std::f64::consts::PI);
         let length_m = self.length_m();
@@ -127,15 +127,16 @@ impl Course {
     }
 
     /// The nearest place of the whole course to a point, in the horizontal plane.
-    pub fn nearest(&self, point_m: DVec3) -> Beside {
+    pub fn nearest(&self, point_m: DVec3) -> CourseFootPoint {
         self.nearest_between(point_m, 0.0, self.length_m())
     }
 
     /// The nearest place to a point between two stations.
-    pub fn nearest_between(&self, point_m: DVec3, from_m: f64, to_m: f64) -> Beside {
+    pub fn nearest_between(&self, point_m: DVec3, from_m: f64, to_m: f64) -> CourseFootPoint {
         let (first, _) = self.segment(from_m);
         let (last, _) = self.segment(to_m);
-        let mut best = Beside { station_m: from_m, left_m: 0.0, distance_m: f64::INFINITY };
+        let mut best =
+            CourseFootPoint { station_m: from_m, left_m: 0.0, distance_m: f64::INFINITY };
         for segment in first..=last {
             let from = self.poses[segment].position_m;
             let way = flat(self.poses[segment + 1].position_m - from);
@@ -151,7 +152,7 @@ impl Course {
                 let station_m = self.stations_m[segment]
                     + t * (self.stations_m[segment + 1] - self.stations_m[segment]);
                 let left_m = (way.x * aside.y - way.y * aside.x) / length_m2.sqrt();
-                best = Beside { station_m, left_m, distance_m };
+                best = CourseFootPoint { station_m, left_m, distance_m };
             }
         }
         best

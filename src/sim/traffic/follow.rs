@@ -10,94 +10,105 @@ use wildcity_scene::geometry::Pose;
 use super::course::{Course, turned_rad};
 use super::idm::{Idm, rolled};
 use super::lateral::Lateral;
-use super::lead::{Body, Corridor, Lead, lead_ahead};
+use super::lead::{Corridor, Lead, LeadCandidate, lead_ahead};
 use super::script::Action;
 use super::state::ActorState;
 use crate::limits;
 
-/// An actor on a course.
+/// An actor that follows a course: its parameters.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Follow {
+pub struct CourseFollower {
     /// The courses of the actor: it begins on the first, and actions name the others.
     pub courses: Vec<Arc<Course>>,
-    /// Where it begins, in metres along the first course.
+    /// Where it starts, in metres along the first course.
     pub station_m: f64,
-    /// How far to the left of the course it drives, in metres.
+    /// Its offset to the left of the course, in metres.
     pub offset_m: f64,
-    /// Its speed at the begin, in m/s.
+    /// Its speed at the start, in m/s.
     pub speed_mps: f64,
-    /// The model that keeps it behind others; without one it drives at its speed through everything.
+    /// Car-following model. Without it, the actor keeps its own speed and ignores all others.
     pub idm: Option<Idm>,
-    /// Whether it disappears at the end of its course. Otherwise it stands there.
+    /// Whether it disappears at the end of its course. Otherwise it stops at the end.
     pub leaves: bool,
 }
 
-/// Where an actor is on its course.
+/// The state of an actor on its course.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Following {
+pub(super) struct CourseFollowerState {
     course: usize,
     pub(super) station_m: f64,
     pub(super) speed_mps: f64,
-    /// The speed of a free road, in m/s.
-    free_mps: f64,
-    order: Option<SpeedOrder>,
+    /// Desired speed on a free road, in m/s.
+    free_flow_speed_mps: f64,
+    /// The change of speed that a script has commanded and that is not complete.
+    speed_command: Option<SpeedCommand>,
     lateral: Lateral,
 }
 
-/// A change of speed that a script orders.
+/// A change of speed that a script commands.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct SpeedOrder {
+struct SpeedCommand {
     to_mps: f64,
     rate_mps2: f64,
 }
 
-impl Follow {
-    /// At the begin.
-    pub(super) fn begin(&self) -> Following {
-        Following {
+impl CourseFollower {
+    /// The state at the start of the episode.
+    pub(super) fn begin(&self) -> CourseFollowerState {
+        CourseFollowerState {
             course: 0,
             station_m: self.station_m,
             speed_mps: self.speed_mps,
-            free_mps: self.idm.map_or(self.speed_mps, |idm| idm.free_speed_mps),
-            order: None,
+            free_flow_speed_mps: self.idm.map_or(self.speed_mps, |idm| idm.free_speed_mps),
+            speed_command: None,
             lateral: Lateral::at(self.offset_m),
         }
     }
 
     /// The course that the actor is on.
-    pub(super) fn course(&self, now: &Following) -> &Course {
+    pub(super) fn course(&self, now: &CourseFollowerState) -> &Course {
         &self.courses[now.course]
     }
 
-    /// After an action of its script.
-    pub(super) fn ordered(&self, now: &Following, action: Action) -> Following {
+    /// The state after an action of the actor's script.
+    pub(super) fn with_action(
+        &self,
+        now: &CourseFollowerState,
+        action: Action,
+    ) -> CourseFollowerState {
         match action {
             Action::Speed { to_mps, rate_mps2 } => {
-                let free_mps = if to_mps > 0.0 { to_mps } else { now.free_mps };
-                Following { order: Some(SpeedOrder { to_mps, rate_mps2 }), free_mps, ..*now }
+                let free_flow_speed_mps =
+                    if to_mps > 0.0 { to_mps } else { now.free_flow_speed_mps };
+                CourseFollowerState {
+                    speed_command: Some(SpeedCommand { to_mps, rate_mps2 }),
+                    free_flow_speed_mps,
+                    ..*now
+                }
             }
-            Action::Offset { to_m, over_s } => {
-                Following { lateral: now.lateral.moving_to(to_m, over_s, now.speed_mps), ..*now }
-            }
+            Action::Offset { to_m, over_s } => CourseFollowerState {
+                lateral: now.lateral.moving_to(to_m, over_s, now.speed_mps),
+                ..*now
+            },
             Action::Course { course } => {
                 let place_m = self.pose(now).position_m;
                 let beside = self.courses[course].nearest(place_m);
                 let lateral = Lateral::at(beside.left_m);
-                Following { course, station_m: beside.station_m, lateral, ..*now }
+                CourseFollowerState { course, station_m: beside.station_m, lateral, ..*now }
             }
             Action::Spawn | Action::Remove => *now,
         }
     }
 
-    /// After a sub-step. `None` if the actor has left.
+    /// The state after a sub-step. `None` if the actor has left.
     pub(super) fn after(
         &self,
-        now: &Following,
+        now: &CourseFollowerState,
         box_: &ActorBox,
         own: u16,
-        bodies: &[Body],
+        bodies: &[LeadCandidate],
         duration_s: f64,
-    ) -> Option<Following> {
+    ) -> Option<CourseFollowerState> {
         let course = self.course(now);
         let lead = self.idm.and_then(|idm| self.lead(now, &idm, box_, own, bodies));
         let acceleration = self.acceleration(now, lead, duration_s);
@@ -107,39 +118,44 @@ impl Follow {
         let stretch = 1.0 - course.curvature_1_m(now.station_m) * now.lateral.offset_m();
         let station_m = now.station_m + way_m / stretch.max(0.1);
         let lateral = now.lateral.after(duration_s, 0.5 * (now.speed_mps + speed_mps));
-        let order = now.order.filter(|order| order.to_mps == 0.0 || speed_mps != order.to_mps);
-        let next = Following { station_m, speed_mps, lateral, order, ..*now };
+        let is_pending =
+            |command: &SpeedCommand| command.to_mps == 0.0 || speed_mps != command.to_mps;
+        let speed_command = now.speed_command.filter(is_pending);
+        let next = CourseFollowerState { station_m, speed_mps, lateral, speed_command, ..*now };
         let length_m = course.length_m();
         match (station_m >= length_m, self.leaves) {
             (false, _) => Some(next),
             (true, true) => None,
-            (true, false) => Some(Following { station_m: length_m, speed_mps: 0.0, ..next }),
+            (true, false) => {
+                Some(CourseFollowerState { station_m: length_m, speed_mps: 0.0, ..next })
+            }
         }
     }
 
-    /// Acceleration in m/s²: that of the model, that of an order, or the lesser of both.
-    fn acceleration(&self, now: &Following, lead: Option<Lead>, duration_s: f64) -> f64 {
-        let ordered = now.order.map(|order| {
-            let needed = (order.to_mps - now.speed_mps) / duration_s;
-            needed.clamp(-order.rate_mps2, order.rate_mps2)
+    /// Acceleration in m/s²: that of the model, that of a speed command, or the lesser of both.
+    fn acceleration(&self, now: &CourseFollowerState, lead: Option<Lead>, duration_s: f64) -> f64 {
+        let commanded = now.speed_command.map(|command| {
+            let needed = (command.to_mps - now.speed_mps) / duration_s;
+            needed.clamp(-command.rate_mps2, command.rate_mps2)
         });
-        let Some(idm) = self.idm else { return ordered.unwrap_or(0.0) };
+        let Some(idm) = self.idm else { return commanded.unwrap_or(0.0) };
         let lead = lead.unwrap_or(Lead { gap_m: f64::INFINITY, speed_mps: now.speed_mps });
-        // While it brakes to a lower speed, the term of the free road would brake at its own rate instead.
-        let free_speed_mps = now.free_mps.max(ordered.map_or(0.0, |_| now.speed_mps));
+        // During a commanded change to a lower speed, the free-road term would brake at its own rate.
+        let free_speed_mps = now.free_flow_speed_mps.max(commanded.map_or(0.0, |_| now.speed_mps));
         let model = Idm { free_speed_mps, ..idm };
         let followed = model.acceleration(now.speed_mps, lead.speed_mps, lead.gap_m);
-        ordered.map_or(followed, |ordered| ordered.min(followed))
+        commanded.map_or(followed, |commanded| commanded.min(followed))
     }
 
-    /// What the actor follows: the nearest body in its corridor, or the end of its course, which is a wall.
+    /// Returns what the actor follows: the nearest box in its corridor, or the end of its course, which acts as a
+    /// standing lead.
     fn lead(
         &self,
-        now: &Following,
+        now: &CourseFollowerState,
         idm: &Idm,
         box_: &ActorBox,
         own: u16,
-        bodies: &[Body],
+        bodies: &[LeadCandidate],
     ) -> Option<Lead> {
         let course = self.course(now);
         let [least_m, most_m] = limits::LEAD_M;
@@ -163,8 +179,8 @@ impl Follow {
         Some(body.filter(|body| body.gap_m <= end.gap_m).unwrap_or(end))
     }
 
-    /// The pose of an actor at a place.
-    fn pose(&self, at: &Following) -> Pose {
+    /// The pose of an actor in a state.
+    fn pose(&self, at: &CourseFollowerState) -> Pose {
         let on_course = self.course(at).at(at.station_m);
         let offset_m = at.lateral.offset_m();
         let rate_mps = at.lateral.rate_mps(at.speed_mps);
@@ -176,11 +192,11 @@ impl Follow {
         Pose { position_m, rotation: rotation.normalize() }
     }
 
-    /// The state at a place, `duration_s` after the pose `before`.
+    /// The actor in a state. `before` is the previous pose, and the time since then in seconds.
     pub(super) fn state(
         &self,
         index: u16,
-        at: &Following,
+        at: &CourseFollowerState,
         before: Option<(Pose, f64)>,
     ) -> ActorState {
         let pose = self.pose(at);

@@ -1,22 +1,23 @@
-//! Lateral moves of an actor on its course: from one offset to another by a quintic.
+//! Lateral manoeuvres of an actor on its course: from one offset to another by a quintic.
 
 /// The offset from the course, to the left, in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Lateral {
-    /// Coefficients of the polynomial in the move's own time, in seconds: metres, m/s, m/s² and so on.
+    /// Coefficients of the polynomial in the manoeuvre's time, in seconds: metres, m/s, m/s² and so on.
     coefficients: [f64; 6],
-    /// The move's own time so far, in seconds. It stands still while the actor does.
+    /// Elapsed time of the manoeuvre, in seconds. It stops while the actor stands.
     elapsed_s: f64,
-    /// When the move ends.
+    /// Elapsed time at which the manoeuvre ends, in seconds.
     duration_s: f64,
-    /// Where it ends, in metres.
+    /// Offset at which the manoeuvre ends, in metres.
     target_m: f64,
-    /// Speed at which the move's own time is the time, in m/s: that at its begin, but at least 1.
+    /// Reference speed, in m/s: the actor's speed at the start of the manoeuvre, at least 1. At this speed or above the
+    /// manoeuvre runs in real time; below it, in proportion to the speed.
     speed_mps: f64,
 }
 
 impl Lateral {
-    /// At an offset, without a move.
+    /// A constant offset, without a manoeuvre.
     pub(super) fn at(offset_m: f64) -> Self {
         Self {
             coefficients: [offset_m, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -27,8 +28,8 @@ impl Lateral {
         }
     }
 
-    /// A move to `target_m` within `duration_s` from the present offset, rate and acceleration. It arrives with
-    /// neither rate nor acceleration: the quintic with these six conditions.
+    /// A manoeuvre to `target_m` within `duration_s` from the present offset, rate and acceleration. At its end, rate
+    /// and acceleration are 0: the quintic with these six conditions.
     pub(super) fn moving_to(&self, target_m: f64, duration_s: f64, speed_mps: f64) -> Self {
         let [from_m, rate, acceleration] = self.derivatives();
         let way_m = target_m - from_m;
@@ -46,7 +47,8 @@ impl Lateral {
         }
     }
 
-    /// After `duration_s` at a mean speed. The move slows down with the actor, so that it never slides sideways.
+    /// The offset after `duration_s` at a mean speed. The manoeuvre slows down with the actor, so that the actor never
+    /// slides sideways.
     pub(super) fn after(&self, duration_s: f64, speed_mps: f64) -> Self {
         let pace = (speed_mps / self.speed_mps).min(1.0);
         let elapsed_s = self.elapsed_s + pace * duration_s;
@@ -66,12 +68,12 @@ impl Lateral {
         self.derivatives()[1] * (speed_mps / self.speed_mps).min(1.0)
     }
 
-    /// Where the move ends, in metres.
+    /// The offset at which the manoeuvre ends, in metres.
     pub(super) fn target_m(&self) -> f64 {
         self.target_m
     }
 
-    /// Offset, rate and acceleration in the move's own time.
+    /// Offset, rate and acceleration in the manoeuvre's time.
     fn derivatives(&self) -> [f64; 3] {
         let [a, b, c, d, e, f] = self.coefficients;
         let t = self.elapsed_s;

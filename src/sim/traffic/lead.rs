@@ -5,9 +5,9 @@ use glam::DVec3;
 use super::course::{Course, flat};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState};
 
-/// A box on the ground, as leads are searched among.
+/// A box on the ground that an actor may have to follow.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Body {
+pub(super) struct LeadCandidate {
     /// Index of the actor; `None` for the ego.
     pub(super) actor: Option<u16>,
     /// Middle of the box on the ground, in metres.
@@ -23,10 +23,10 @@ pub(super) struct Body {
     pub(super) yaw_rate_radps: f64,
 }
 
-/// What an actor follows.
+/// The vehicle, or the end of a course, that an actor follows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Lead {
-    /// From the own front to the lead's rear along the course, in metres; below 0 if they overlap.
+    /// From the actor's front to the lead's rear along the course, in metres; below 0 if they overlap.
     pub(super) gap_m: f64,
     /// The lead's speed along the course, in m/s.
     pub(super) speed_mps: f64,
@@ -35,19 +35,19 @@ pub(super) struct Lead {
 /// Where an actor looks for a lead.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Corridor {
-    /// The own station, in metres.
+    /// Station of the actor, in metres.
     pub(super) station_m: f64,
     /// The right and the left edge, in metres to the left of the course.
     pub(super) edges_m: [f64; 2],
-    /// Half of the own length, in metres.
+    /// Half of the actor's length, in metres.
     pub(super) half_length_m: f64,
-    /// Own height, in metres.
+    /// Height of the actor, in metres.
     pub(super) height_m: f64,
-    /// How far to look from the own centre, in metres.
+    /// Length of the corridor ahead of the actor's centre, in metres.
     pub(super) ahead_m: f64,
 }
 
-impl Body {
+impl LeadCandidate {
     pub(super) fn of_actor(spec: &ActorSpec, state: &ActorState) -> Self {
         let pose = state.world_from_actor;
         Self {
@@ -78,12 +78,13 @@ impl Body {
     }
 }
 
-/// The nearest body ahead in the corridor; of equally near ones the slowest, so that their order cannot matter.
+/// The nearest candidate ahead in the corridor. Of equally near ones it is the slowest, so that their order cannot
+/// matter.
 pub(super) fn lead_ahead(
     course: &Course,
     corridor: &Corridor,
     own: u16,
-    bodies: &[Body],
+    bodies: &[LeadCandidate],
 ) -> Option<Lead> {
     let own_m = course.point_m(corridor.station_m);
     let [right_m, left_m] = corridor.edges_m;
@@ -91,7 +92,7 @@ pub(super) fn lead_ahead(
     let aside_m = right_m.abs().max(left_m.abs());
     let mut lead: Option<Lead> = None;
     for body in bodies.iter().filter(|body| body.actor != Some(own)) {
-        // A body that is farther away than the corridor is long cannot be in it.
+        // A box that is farther away than the corridor is long cannot be in it.
         let reach_m = aside_m + body.half_length_m.hypot(body.half_width_m);
         let farthest_m = corridor.ahead_m + reach_m;
         if (body.center_m - own_m).length_squared() > farthest_m * farthest_m {
@@ -107,11 +108,11 @@ pub(super) fn lead_ahead(
     lead
 }
 
-/// A body as a lead, if it is ahead in the corridor.
+/// A candidate as a lead, if it is ahead in the corridor.
 fn found_in(
     course: &Course,
     corridor: &Corridor,
-    body: &Body,
+    body: &LeadCandidate,
     reach_m: f64,
     to_m: f64,
 ) -> Option<Lead> {

@@ -1,4 +1,4 @@
-//! Traffic: what moves beside the ego.
+//! Traffic: the actors that move around the ego.
 //!
 //! | module | what it holds |
 //! |---|---|
@@ -22,8 +22,8 @@ mod track;
 mod world;
 
 pub use attack::Attack;
-pub use course::{Beside, Course};
-pub use follow::Follow;
+pub use course::{Course, CourseFootPoint};
+pub use follow::CourseFollower;
 pub use idm::{Idm, rolled};
 pub use script::{Action, After, Condition, Near, Trigger};
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};

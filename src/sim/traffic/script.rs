@@ -5,7 +5,7 @@
 pub struct Trigger {
     /// Every part that is given must hold.
     pub when: Condition,
-    /// What happens then, in this order.
+    /// The actions, in this order.
     pub then: Vec<Action>,
 }
 
@@ -26,7 +26,7 @@ pub struct Condition {
     pub speed_below_mps: Option<f64>,
     /// The ego is at least this fast, in m/s.
     pub ego_speed_above_mps: Option<f64>,
-    /// Another trigger fired at least so long ago.
+    /// Another trigger fired at least [`After::delay_us`] ago.
     pub after: Option<After>,
 }
 
@@ -39,7 +39,7 @@ pub struct Near {
     pub within_m: f64,
 }
 
-/// A trigger that fired before.
+/// A trigger that has fired already.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct After {
     /// Index of its actor.
@@ -50,7 +50,7 @@ pub struct After {
     pub delay_us: i64,
 }
 
-/// What an actor does.
+/// An action of an actor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Action {
     /// Changes its speed.

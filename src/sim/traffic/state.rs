@@ -5,7 +5,7 @@ use glam::DVec3;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{ActorBox, ActorClass};
 
-/// What does not change about an actor.
+/// The constant properties of an actor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActorSpec {
     /// Name within the scenario, `[a-z0-9._-]+`.
@@ -14,7 +14,7 @@ pub struct ActorSpec {
     pub class: ActorClass,
     /// Its box.
     pub box_: ActorBox,
-    /// BLAKE3 of its asset, 64 lower-case hex digits; without one it is not drawn.
+    /// BLAKE3 of its asset, 64 lower-case hex digits. An actor without an asset is not rendered.
     pub asset: Option<String>,
 }
 
@@ -29,7 +29,7 @@ pub struct ActorState {
     pub velocity_mps: DVec3,
     /// Yaw rate about the actor's z axis, in rad/s, positive to the left.
     pub yaw_rate_radps: f64,
-    /// Whether it is there at all. An absent actor is neither drawn nor touched; its pose is meaningless.
+    /// Whether it is in the world. An absent actor is neither rendered nor touched; its pose is meaningless.
     pub present: bool,
 }
 
@@ -56,13 +56,13 @@ pub struct EgoBox {
 /// One sub-step: at most 10 ms of a step.
 #[derive(Clone, Copy, Debug)]
 pub struct SubStep<'a> {
-    /// Its begin, in microseconds since the episode's start.
+    /// Its start, in microseconds since the episode's start.
     pub begin_us: i64,
     /// Its end, in microseconds since the episode's start.
     pub end_us: i64,
-    /// The ego at its begin and at its end.
+    /// The ego at its start and at its end.
     pub ego: [EgoState; 2],
-    /// All actors at its begin, in order of their index.
+    /// All actors at its start, in order of their index.
     pub before: &'a [ActorState],
     /// All actors at its end, in order of their index.
     pub after: &'a [ActorState],

@@ -52,7 +52,7 @@ pub enum TrackError {
         index: usize,
         /// Its time, in microseconds.
         time_us: i64,
-        /// Time of the keyframe before it, in microseconds.
+        /// Time of the previous keyframe, in microseconds.
         before_us: i64,
     },
 }
@@ -83,7 +83,7 @@ impl Track {
         Self { keyframes: vec![keyframe], held: true }
     }
 
-    /// The same track, at whose ends the actor stands.
+    /// This track with an actor that stands before the first keyframe and after the last.
     pub fn held(self) -> Self {
         Self { held: true, ..self }
     }
@@ -93,8 +93,8 @@ impl Track {
         &self.keyframes
     }
 
-    /// Where the actor is at a time; `None` if it is absent then. At a keyframe the velocity is that of the
-    /// motion after it, at the last keyframe that of the motion before it.
+    /// Pose and motion at a time; `None` if the actor is absent then. At a keyframe the velocity is that of the
+    /// motion after it, and at the last keyframe that of the motion before it.
     pub fn at(&self, time_us: i64) -> Option<Tracked> {
         let last = self.keyframes.len() - 1;
         let is_before = time_us < self.keyframes[0].time_us;

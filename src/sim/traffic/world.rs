@@ -1,8 +1,8 @@
 //! The traffic of an episode: all actors, advanced together.
 //!
 //! A step is cut into equal sub-steps of at most 10 ms. Each evaluates the triggers first, in the order of the
-//! actors and of their scripts, and then moves every actor. Triggers and actors read the states at the sub-step's
-//! begin only, and each actor has its own stream of random numbers. So the order of the actors cannot matter.
+//! actors and of their scripts, and then moves every actor. Triggers and actors read only the states at the start of
+//! the sub-step, and each actor has its own stream of random numbers. So the order of the actors cannot matter.
 
 use std::sync::Arc;
 
@@ -13,8 +13,8 @@ use wildcity_scene::random::Random;
 
 use super::attack::{self, Attack, Spline};
 use super::course::turned_rad;
-use super::follow::{Follow, Following};
-use super::lead::Body;
+use super::follow::{CourseFollower, CourseFollowerState};
+use super::lead::LeadCandidate;
 use super::script::{Action, After, Condition, Near, Trigger};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 use super::track::Track;
@@ -38,9 +38,9 @@ pub struct Actor {
     pub spec: ActorSpec,
     /// How it moves.
     pub behaviour: Behaviour,
-    /// What it does when a condition holds.
+    /// Its conditions and the actions that follow.
     pub script: Vec<Trigger>,
-    /// Whether it is there from the begin; otherwise it waits for [`Action::Spawn`].
+    /// Whether it is present from the start; otherwise it waits for [`Action::Spawn`].
     pub present: bool,
 }
 
@@ -50,14 +50,14 @@ pub enum Behaviour {
     /// Along timed poses, whatever others do.
     Track(Track),
     /// Along a course.
-    Follow(Follow),
+    Follow(CourseFollower),
     /// Towards the ego.
     Attack {
         /// The settings.
         attack: Attack,
-        /// Where it begins.
+        /// Its pose at the start of the episode.
         world_from_actor: Pose,
-        /// Its speed then, in m/s.
+        /// Its speed at the start, in m/s.
         speed_mps: f64,
     },
 }
@@ -65,9 +65,9 @@ pub enum Behaviour {
 /// The ego's motion during one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EgoMotion {
-    /// At the step's begin.
+    /// At the start of the step.
     pub from: EgoState,
-    /// At the step's end.
+    /// At the end of the step.
     pub to: EgoState,
     /// Whether the velocities of both states belong to the motion between them. Then the position is the cubic
     /// with these ends. Otherwise, as for a teleport, it changes linearly.
@@ -80,27 +80,27 @@ pub struct World {
     traffic: Arc<Traffic>,
     time_us: i64,
     states: Vec<ActorState>,
-    runs: Vec<Run>,
+    progress: Vec<ActorProgress>,
 }
 
-/// What changes about one actor beside its state.
+/// The progress of one actor's behaviour and script.
 #[derive(Clone, Debug, PartialEq)]
-struct Run {
-    /// Whether it is in the world; a track may be absent nevertheless.
-    there: bool,
-    mode: Mode,
+struct ActorProgress {
+    /// Whether the actor is in the world. Its track may be absent at this time nevertheless.
+    spawned: bool,
+    behaviour: BehaviourState,
     /// When each trigger of its script fired, in microseconds.
     fired_us: Vec<Option<i64>>,
 }
 
 #[derive(Clone, Debug, PartialEq)]
-enum Mode {
+enum BehaviourState {
     Track,
-    Follow(Following),
+    Follow(CourseFollowerState),
     Attack(Attacking),
 }
 
-/// An attacker on its present plan.
+/// An attacker and its current plan.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Attacking {
     spline: Spline,
@@ -110,17 +110,17 @@ struct Attacking {
 }
 
 impl World {
-    /// The world at the begin of an episode, at time 0.
+    /// The world at the start of an episode, at time 0.
     pub fn new(traffic: Arc<Traffic>) -> Self {
-        let runs: Vec<Run> = traffic.actors.iter().map(Run::new).collect();
-        let states = traffic.actors.iter().zip(&runs).enumerate();
+        let progress: Vec<ActorProgress> = traffic.actors.iter().map(ActorProgress::new).collect();
+        let states = traffic.actors.iter().zip(&progress).enumerate();
         let states = states
-            .map(|(index, (actor, run))| match run.there {
-                true => run.state(index, actor, 0, None),
+            .map(|(index, (actor, progress))| match progress.spawned {
+                true => progress.state(index, actor, 0, None),
                 false => absent(index),
             })
             .collect();
-        Self { traffic, time_us: 0, states, runs }
+        Self { traffic, time_us: 0, states, progress }
     }
 
     /// The actors as they were set up.
@@ -138,14 +138,14 @@ impl World {
         &self.states
     }
 
-    /// The actors at a time before the episode's start, in a warm-up: tracks at their own times, others where they
-    /// begin.
+    /// The actors at a time before the episode's start, in a warm-up: tracks at their own times, others in their
+    /// starting state.
     pub fn states_before(&self, time_us: i64) -> Vec<ActorState> {
         let start = Self::new(self.traffic.clone());
-        let actors = self.traffic.actors.iter().zip(&start.runs).enumerate();
+        let actors = self.traffic.actors.iter().zip(&start.progress).enumerate();
         actors
-            .map(|(index, (actor, run))| match (&actor.behaviour, run.there) {
-                (Behaviour::Track(_), true) => run.state(index, actor, time_us.min(0), None),
+            .map(|(index, (actor, progress))| match (&actor.behaviour, progress.spawned) {
+                (Behaviour::Track(_), true) => progress.state(index, actor, time_us.min(0), None),
                 _ => start.states[index],
             })
             .collect()
@@ -153,7 +153,7 @@ impl World {
 
     /// When a trigger fired, in microseconds; `None` if it has not.
     pub fn fired_us(&self, actor: usize, trigger: usize) -> Option<i64> {
-        *self.runs.get(actor)?.fired_us.get(trigger)?
+        *self.progress.get(actor)?.fired_us.get(trigger)?
     }
 
     /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls `each` after
@@ -172,7 +172,7 @@ impl World {
             let bodies = self.bodies(&ego_now);
             self.fire(&traffic, &ego_now, &bodies);
             let before = std::mem::take(&mut self.states);
-            let after = self.moved(&traffic, &before, &bodies, sub_end_us);
+            let after = self.advance_actors(&traffic, &before, &bodies, sub_end_us);
             each(&SubStep {
                 begin_us: sub_begin_us,
                 end_us: sub_end_us,
@@ -186,21 +186,21 @@ impl World {
         }
     }
 
-    /// The boxes that are there, the ego's first.
-    fn bodies(&self, ego: &EgoState) -> Vec<Body> {
+    /// The boxes of the ego and of all present actors, the ego's first.
+    fn bodies(&self, ego: &EgoState) -> Vec<LeadCandidate> {
         let present = self.states.iter().filter(|state| state.present);
         let actors = &self.traffic.actors;
-        let boxes =
-            present.map(|state| Body::of_actor(&actors[usize::from(state.index)].spec, state));
-        std::iter::once(Body::of_ego(ego, &self.traffic.ego_box)).chain(boxes).collect()
+        let boxes = present
+            .map(|state| LeadCandidate::of_actor(&actors[usize::from(state.index)].spec, state));
+        std::iter::once(LeadCandidate::of_ego(ego, &self.traffic.ego_box)).chain(boxes).collect()
     }
 
-    /// Fires the triggers whose conditions hold at the begin of the sub-step.
-    fn fire(&mut self, traffic: &Traffic, ego: &EgoState, bodies: &[Body]) {
+    /// Fires the triggers whose conditions hold at the start of the sub-step.
+    fn fire(&mut self, traffic: &Traffic, ego: &EgoState, bodies: &[LeadCandidate]) {
         let mut firing: Vec<(usize, usize)> = Vec::new();
         for (index, actor) in traffic.actors.iter().enumerate() {
             for (at, trigger) in actor.script.iter().enumerate() {
-                let waits = self.runs[index].fired_us[at].is_none();
+                let waits = self.progress[index].fired_us[at].is_none();
                 if waits && self.holds(traffic, index, &trigger.when, ego, bodies) {
                     firing.push((index, at));
                 }
@@ -208,9 +208,9 @@ impl World {
         }
         for (index, at) in firing {
             let actor = &traffic.actors[index];
-            self.runs[index].fired_us[at] = Some(self.time_us);
+            self.progress[index].fired_us[at] = Some(self.time_us);
             for action in &actor.script[at].then {
-                self.runs[index].ordered(actor, *action);
+                self.progress[index].apply_action(actor, *action);
             }
         }
     }
@@ -221,26 +221,27 @@ impl World {
         index: usize,
         when: &Condition,
         ego: &EgoState,
-        bodies: &[Body],
+        bodies: &[LeadCandidate],
     ) -> bool {
-        let run = &self.runs[index];
+        let progress = &self.progress[index];
         let state = &self.states[index];
         let speed_mps = state.velocity_mps.length();
-        let station_m = || match (&traffic.actors[index].behaviour, &run.mode) {
-            (Behaviour::Follow(_), Mode::Follow(now)) => now.station_m,
+        let station_m = || match (&traffic.actors[index].behaviour, &progress.behaviour) {
+            (Behaviour::Follow(_), BehaviourState::Follow(now)) => now.station_m,
             _ => f64::NEG_INFINITY,
         };
-        let ego_station_m = || match (&traffic.actors[index].behaviour, &run.mode) {
-            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+        let ego_station_m = || match (&traffic.actors[index].behaviour, &progress.behaviour) {
+            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
                 follow.course(now).nearest(bodies[0].center_m).station_m
             }
             _ => f64::NEG_INFINITY,
         };
-        // An actor that has not appeared yet waits where it will: distances to it count.
+        // Distances to an actor that has not appeared yet are measured to the place where it will appear.
         let own_m = match state.present {
             true => state.world_from_actor.position_m,
             false => {
-                run.state(index, &traffic.actors[index], self.time_us, None)
+                progress
+                    .state(index, &traffic.actors[index], self.time_us, None)
                     .world_from_actor
                     .position_m
             }
@@ -269,28 +270,28 @@ impl World {
             && when.ego_station_m.is_none_or(|least_m| ego_station_m() >= least_m)
     }
 
-    /// The states at the end of a sub-step.
-    fn moved(
+    /// Advances all actors to the end of a sub-step. Returns their states then.
+    fn advance_actors(
         &mut self,
         traffic: &Traffic,
         before: &[ActorState],
-        bodies: &[Body],
+        bodies: &[LeadCandidate],
         end_us: i64,
     ) -> Vec<ActorState> {
         let begin_us = self.time_us;
         let duration_s = (end_us - begin_us) as f64 * 1e-6;
-        let actors = traffic.actors.iter().zip(&mut self.runs).enumerate();
+        let actors = traffic.actors.iter().zip(&mut self.progress).enumerate();
         actors
-            .map(|(index, (actor, run))| {
-                if !run.there {
+            .map(|(index, (actor, progress))| {
+                if !progress.spawned {
                     return absent(index);
                 }
                 let state = &before[index];
-                run.advance(traffic, actor, state, bodies, [begin_us, end_us]);
-                match run.there {
+                progress.advance(traffic, actor, state, bodies, [begin_us, end_us]);
+                match progress.spawned {
                     true => {
                         let before = state.present.then_some((state.world_from_actor, duration_s));
-                        run.state(index, actor, end_us, before)
+                        progress.state(index, actor, end_us, before)
                     }
                     false => absent(index),
                 }
@@ -339,26 +340,31 @@ impl EgoMotion {
     }
 }
 
-impl Run {
+impl ActorProgress {
     fn new(actor: &Actor) -> Self {
-        let mode = match &actor.behaviour {
-            Behaviour::Track(_) => Mode::Track,
-            Behaviour::Follow(follow) => Mode::Follow(follow.begin()),
-            Behaviour::Attack { world_from_actor, speed_mps, .. } => Mode::Attack(Attacking {
-                spline: Spline::straight(*speed_mps),
-                world_from_begin: *world_from_actor,
-                begin_us: 0,
-                plans: 0,
-            }),
+        let behaviour = match &actor.behaviour {
+            Behaviour::Track(_) => BehaviourState::Track,
+            Behaviour::Follow(follow) => BehaviourState::Follow(follow.begin()),
+            Behaviour::Attack { world_from_actor, speed_mps, .. } => {
+                BehaviourState::Attack(Attacking {
+                    spline: Spline::straight(*speed_mps),
+                    world_from_begin: *world_from_actor,
+                    begin_us: 0,
+                    plans: 0,
+                })
+            }
         };
-        Self { there: actor.present, mode, fired_us: vec![None; actor.script.len()] }
+        Self { spawned: actor.present, behaviour, fired_us: vec![None; actor.script.len()] }
     }
 
-    fn ordered(&mut self, actor: &Actor, action: Action) {
-        match (action, &actor.behaviour, &mut self.mode) {
-            (Action::Spawn, ..) => self.there = true,
-            (Action::Remove, ..) => self.there = false,
-            (_, Behaviour::Follow(follow), Mode::Follow(now)) => *now = follow.ordered(now, action),
+    /// Carries out an action of the actor's script.
+    fn apply_action(&mut self, actor: &Actor, action: Action) {
+        match (action, &actor.behaviour, &mut self.behaviour) {
+            (Action::Spawn, ..) => self.spawned = true,
+            (Action::Remove, ..) => self.spawned = false,
+            (_, Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
+                *now = follow.with_action(now, action)
+            }
             // The scenario's check refuses such scripts.
             _ => {}
         }
@@ -369,23 +375,23 @@ impl Run {
         traffic: &Traffic,
         actor: &Actor,
         before: &ActorState,
-        bodies: &[Body],
+        bodies: &[LeadCandidate],
         [begin_us, end_us]: [i64; 2],
     ) {
-        match (&actor.behaviour, &mut self.mode) {
-            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+        match (&actor.behaviour, &mut self.behaviour) {
+            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
                 let duration_s = (end_us - begin_us) as f64 * 1e-6;
                 let box_ = &actor.spec.box_;
                 match follow.after(now, box_, before.index, bodies, duration_s) {
                     Some(next) => *now = next,
-                    None => self.there = false,
+                    None => self.spawned = false,
                 }
             }
-            (Behaviour::Attack { attack, .. }, Mode::Attack(now)) => {
+            (Behaviour::Attack { attack, .. }, BehaviourState::Attack(now)) => {
                 let is_first = now.plans == 0;
                 let is_due = begin_us.saturating_sub(now.begin_us) >= attack.plan_us;
                 if before.present && (is_first || is_due) {
-                    *now = now.planned(
+                    *now = now.plan_next(
                         traffic.seed,
                         attack,
                         &actor.spec.name,
@@ -401,7 +407,7 @@ impl Run {
         }
     }
 
-    /// The state at a time; `before` is the pose before and the time since then, in seconds.
+    /// The state at a time. `before` is the previous pose, and the time since then in seconds.
     fn state(
         &self,
         index: usize,
@@ -409,7 +415,7 @@ impl Run {
         time_us: i64,
         before: Option<(Pose, f64)>,
     ) -> ActorState {
-        match (&actor.behaviour, &self.mode) {
+        match (&actor.behaviour, &self.behaviour) {
             (Behaviour::Track(track), _) => match track.at(time_us) {
                 None => absent(index),
                 Some(at) => ActorState {
@@ -420,10 +426,12 @@ impl Run {
                     present: true,
                 },
             },
-            (Behaviour::Follow(follow), Mode::Follow(now)) => {
+            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
                 follow.state(index as u16, now, before)
             }
-            (Behaviour::Attack { .. }, Mode::Attack(now)) => now.state(index, time_us, before),
+            (Behaviour::Attack { .. }, BehaviourState::Attack(now)) => {
+                now.state(index, time_us, before)
+            }
             _ => absent(index),
         }
     }
@@ -431,19 +439,19 @@ impl Run {
 
 impl Attacking {
     /// The next plan from where the attacker is.
-    fn planned(
+    fn plan_next(
         &self,
         seed: u64,
         attack: &Attack,
         name: &str,
         own: &ActorState,
-        bodies: &[Body],
+        bodies: &[LeadCandidate],
         time_us: i64,
     ) -> Self {
         let begin = own.world_from_actor;
         let speed_mps = own.velocity_mps.dot(begin.rotation * DVec3::X);
         let begin_from_world = begin.inverse();
-        let predicted = |body: &Body| {
+        let predicted = |body: &LeadCandidate| {
             let at_m = begin_from_world.transform_point(body.center_m).truncate();
             let velocity_mps = (begin_from_world.rotation * body.velocity_mps).truncate();
             attack::predicted(at_m, velocity_mps, body.yaw_rate_radps)

@@ -35,7 +35,7 @@ pub(super) fn read(bytes: Vec<u8>, budget: UnpackBudget) -> Result<Gaussians, In
     sog::read(&json, &folder, &mut archive)
 }
 
-/// Reads the tracked objects of a NuRec archive; none of another one.
+/// Reads the tracked objects of a NuRec archive; none of any other archive.
 pub(super) fn read_tracked(
     bytes: Vec<u8>,
     budget: UnpackBudget,
@@ -95,7 +95,7 @@ impl SceneFiles for Archive {
     }
 }
 
-/// Checks that nothing follows the archive: its last record, with a comment of the length that it says, ends the file.
+/// Checks that nothing follows the archive: the file ends with its last record, whose comment has the stated length.
 fn check_end(bytes: &[u8]) -> Result<(), IngestError> {
     const RECORD_BYTES: usize = 22;
     let is_record_at = |at: usize| {

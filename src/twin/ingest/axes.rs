@@ -1,6 +1,6 @@
 //! Converts from the axes and unit of a file to a twin's: metres, x east, y north, z up.
 //!
-//! No format says which axes its coordinates have (two PLY files may differ), so an import has
+//! No format defines the axes of its coordinates (two PLY files may differ), so an import has
 //! options for them.
 
 use std::str::FromStr;
@@ -45,7 +45,7 @@ impl Axes {
     /// The file has a twin's axes and unit.
     pub const IDENTITY: Self = Self { twin_from_file: DMat3::IDENTITY, metres_per_unit: 1.0 };
 
-    /// How far an entry of `M Mᵀ` may be from the identity's: a matrix typed with four digits is
+    /// Largest difference of an entry of `M Mᵀ` from the identity's: a matrix typed with four digits is
     /// accepted.
     const MAX_ERROR: f64 = 1e-3;
 
@@ -74,7 +74,7 @@ impl Axes {
         Some(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
     }
 
-    /// The same axes, with a unit of `metres_per_unit`.
+    /// These axes, with a unit of `metres_per_unit`.
     ///
     /// # Errors
     /// [`IngestError::InvalidAxes`] if the scale is not from 1e-6 to 1e6.
@@ -91,7 +91,7 @@ impl Axes {
         self.twin_from_file.transpose()
     }
 
-    /// The same change of axes and unit for poses; `None` for axes with a reflection, in which no camera has a pose.
+    /// This change of axes and unit for poses; `None` for axes with a reflection, in which no camera has a pose.
     pub fn alignment(&self) -> Option<Alignment> {
         let is_mirrored = self.twin_from_file.determinant() < 0.0;
         let rotation = DQuat::from_mat3(&self.twin_from_file).normalize();

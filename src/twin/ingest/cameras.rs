@@ -24,15 +24,15 @@ pub struct ListedCamera {
     pub camera: Camera,
     /// Its pose, in the axes and units of the scene.
     pub world_from_camera: Pose,
-    /// The smallest z that it draws, if the list says one, in units of the scene.
+    /// The smallest z that it draws, if the list has it, in units of the scene.
     pub near: Option<f64>,
-    /// File of the image that it took, if the list says one, relative to the list.
+    /// File of the image that it took, if the list has it, relative to the list.
     pub image: Option<String>,
     /// File of the image's mask, likewise.
     pub mask: Option<String>,
-    /// When the image was taken, in microseconds, if the list says so.
+    /// Time at which the image was taken, in microseconds, if the list has it.
     pub time_us: Option<i64>,
-    /// The exposure of the image in stops against the scene's, if the list says one.
+    /// The exposure of the image in stops relative to the scene's, if the list has it.
     pub exposure_stops: Option<f64>,
 }
 
@@ -58,7 +58,7 @@ pub enum CamerasError {
         index: usize,
         /// The refused name.
         name: String,
-        /// What must hold instead.
+        /// The values that are accepted.
         must: &'static str,
     },
     /// A camera has neither `position` nor `position_ply`, or both.
@@ -91,7 +91,7 @@ pub enum CamerasError {
     Pose {
         /// The camera's name.
         name: String,
-        /// What is wrong.
+        /// The error.
         cause: PoseError,
     },
     /// An exposure that no camera has.
@@ -118,7 +118,7 @@ pub enum CamerasError {
     Camera {
         /// The camera's name.
         name: String,
-        /// What is wrong.
+        /// The error.
         cause: CameraError,
     },
 }

@@ -40,7 +40,7 @@ pub enum IngestError {
         format: &'static str,
         /// Where in the header, such as `line 3` or `tensor means`.
         place: String,
-        /// What is wrong, and what must hold instead.
+        /// The error, and the accepted values.
         reason: String,
     },
     /// The header implies another file size.
@@ -66,7 +66,7 @@ pub enum IngestError {
         format: &'static str,
         /// Where in the body, such as `positions` or `means_l.webp`.
         place: String,
-        /// What is wrong, and what must hold instead.
+        /// The error, and the accepted values.
         reason: String,
     },
     /// Compressed data expands to more than any scene does.
@@ -116,9 +116,9 @@ pub enum IngestError {
     InvalidAxes {
         /// The option.
         option: &'static str,
-        /// What was given.
+        /// The given value.
         given: String,
-        /// What is wrong, and what must hold instead.
+        /// The error, and the accepted values.
         reason: String,
     },
 }

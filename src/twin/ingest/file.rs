@@ -4,7 +4,7 @@ use std::fs::{self, File};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// Why a file was refused before its content was looked at.
+/// Why a file was refused before its content was read.
 #[derive(Debug, thiserror::Error)]
 pub enum FileError {
     /// An I/O operation failed.

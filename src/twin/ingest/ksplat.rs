@@ -21,9 +21,9 @@ const HEADER_BYTES: usize = 4096;
 const SECTION_HEADER_BYTES: usize = 1024;
 /// Largest SH degree of the format.
 const MAX_DEGREE: u16 = 2;
-/// Half the number of steps of a 16-bit position, unless the section says otherwise.
+/// Default for half the number of steps of a 16-bit position, which a section may override.
 const POSITION_RANGE: u32 = 32767;
-/// Range of 8-bit coefficients in both directions, unless the file says otherwise.
+/// Default range of 8-bit coefficients in both directions, which the file may override.
 const SH_RANGE: f32 = 1.5;
 
 /// Reads a file of a known size.

@@ -220,8 +220,8 @@ impl Format {
     }
 }
 
-/// Whether a file that starts like this is an object of JSON: text that begins with a brace, and a name or another brace.
-/// A number of a `.splat` file may begin with the same bytes, but 64 bytes of numbers, colours and rotations are no
+/// Whether a file that starts like this is a JSON object: text that begins with a brace, and a name or another brace.
+/// A number of a `.splat` file may begin with the same bytes, but 64 bytes of numbers, colours and rotations are not
 /// text.
 fn is_json(start: &[u8]) -> bool {
     let object = start.trim_ascii_start().strip_prefix(b"{").map(<[u8]>::trim_ascii_start);
@@ -238,7 +238,7 @@ fn is_text(bytes: &[u8]) -> bool {
     is_utf8 && bytes.iter().all(|byte| !byte.is_ascii_control() || byte.is_ascii_whitespace())
 }
 
-/// Whether a file that starts like this is a safetensors file: a length of eight bytes, and so many bytes of JSON.
+/// Whether a file that starts like this is a safetensors file: a length in eight bytes, and JSON of that length.
 fn is_safetensors(start: &[u8]) -> bool {
     start.split_first_chunk().is_some_and(|(length, rest)| {
         let length = usize::try_from(u64::from_le_bytes(*length)).unwrap_or(usize::MAX);

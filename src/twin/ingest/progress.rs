@@ -2,7 +2,7 @@
 
 use std::io::{self, BufRead, Read};
 
-/// Is called with the bytes read so far and the size of the file.
+/// Is called with the number of bytes that have been read and the size of the file.
 pub type Progress<'a> = &'a mut dyn FnMut(u64, u64);
 
 /// A reader that reports its progress after every [`REPORT_EVERY_BYTES`], and at the end.

@@ -1,4 +1,4 @@
-//! What reading a scene may use.
+//! Limits of reading a scene.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,7 +7,7 @@ use super::IngestError;
 use super::scene_files::ListedFiles;
 use crate::limits;
 
-/// What reading a scene may use, and how fine it becomes. A scene of an untrusted source gets the first three.
+/// Limits of reading a scene, and its resolution. The first three are for scenes from an untrusted source.
 #[derive(Clone, Debug)]
 pub struct ReadLimits<'a> {
     /// The files that the scene may name; without a list, those below the folder of its own file.

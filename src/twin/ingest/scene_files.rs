@@ -13,7 +13,7 @@ pub(super) trait SceneFiles {
     /// given first, with `/`. Each file may be read once.
     fn read(&mut self, name: &str, limit_bytes: u64) -> Result<Vec<u8>, IngestError>;
 
-    /// How much the scene may unpack.
+    /// Number of bytes that the scene may unpack.
     fn budget(&mut self) -> &mut UnpackBudget;
 
     /// Number of Gaussians that cover the triangles of a mesh.
@@ -31,7 +31,7 @@ pub fn is_below_folder(name: &str) -> bool {
     is_below && !Path::new(name).is_absolute() && !name.contains(['\\', '\0'])
 }
 
-/// Files beside the one given first, on the local disk.
+/// Further files of the scene, in the folder of the one given first, on the local disk.
 pub(super) struct PartFiles<'a> {
     place: Place<'a>,
     /// Names of the files that were read.
@@ -80,7 +80,7 @@ impl<'a> PartFiles<'a> {
         }
     }
 
-    /// The names of the files that were read beside the one given first.
+    /// The names of the files that were read in addition to the one given first.
     pub(super) fn into_names(self) -> BTreeSet<String> {
         self.names
     }

@@ -59,7 +59,7 @@ impl ActorPool {
         }
     }
 
-    /// An asset that is not in the store, under a key that is no hash; the one of this key if there is one already.
+    /// An asset that is not in the store, under a key that is not a hash; the existing one if the key has one already.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoomForActor`].
@@ -109,7 +109,7 @@ fn add(
 }
 
 impl ResidencyError {
-    /// The error of an asset for which there is no room.
+    /// The error of an asset for which there is not enough memory.
     fn of_actor(self) -> Self {
         match self {
             Self::NoRoom { twin, needed_bytes, held_bytes, limit_bytes } => {

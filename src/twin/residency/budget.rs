@@ -10,9 +10,10 @@ use super::ResidencyError;
 
 /// Bytes that are reserved for the worst frames of sessions, by version.
 ///
-/// Sessions on one version share what they draw, so together they never need more than the whole
-/// version takes. Their frames are rendered in turn, but for a small one beside a large one, so that of what frames hold
-/// between the stages only the largest counts, and the largest of those beside; each has images of its own.
+/// Sessions on one version share its sections, so together they never need more than the whole version takes. Frames
+/// are rendered one at a time, except that a small frame may be rendered while a large one is. So the intermediate
+/// buffers count twice at most: the largest of all frames, and the largest of the small frames. The images of every
+/// session count.
 #[derive(Clone, Debug)]
 pub(super) struct Budget {
     limit_bytes: u64,
@@ -26,21 +27,22 @@ pub(super) struct Budget {
     images_bytes: u64,
 }
 
-/// What the frames of a session take beside their scenes, in bytes.
+/// Memory of a session's frames in addition to their scenes, in bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameBytes {
-    /// What a frame holds while it is rendered. All sessions share it.
+    /// Intermediate buffers of a frame while it is rendered. All sessions share them.
     pub stages: u64,
-    /// What a small frame holds if it is rendered while a large one is; 0 for large frames, which never are.
+    /// Intermediate buffers of a small frame that is rendered while a large one is; 0 for large frames, which are not
+    /// rendered at the same time as another.
     pub beside: u64,
-    /// Whether it is a large frame, which small ones are rendered beside.
+    /// Whether it is a large frame, during which small ones are rendered.
     pub is_large: bool,
     /// The images that a session holds.
     pub images: u64,
 }
 
 impl FrameBytes {
-    /// What a session's frames take if no other session draws.
+    /// Memory of a session's frames if no other session renders.
     pub fn alone(&self) -> u64 {
         self.stages.saturating_add(self.images)
     }
@@ -63,7 +65,7 @@ pub(super) struct Claim {
     pub(super) version: String,
     /// Bytes that the scene of the frame needs at once.
     pub(super) bytes: u64,
-    /// What the frame takes beside its scene.
+    /// Memory of the frame in addition to its scene.
     pub(super) frame: FrameBytes,
     /// Bytes that all levels of detail of the whole version take.
     pub(super) total_bytes: u64,
@@ -137,7 +139,7 @@ impl Budget {
         self.versions.values().map(VersionClaims::bytes).sum::<u64>() + self.frame_bytes()
     }
 
-    /// Bytes of these that frames take beside their scenes.
+    /// The part of these bytes that frames take in addition to their scenes.
     pub(super) fn frame_bytes(&self) -> u64 {
         self.stages_bytes() + self.images_bytes.min(limits::IMAGE_BYTES)
     }

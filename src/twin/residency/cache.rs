@@ -52,7 +52,7 @@ impl Cache {
         Self::with_source(catalog, source, limit_bytes)
     }
 
-    /// As [`Cache::limited`], with sections read from another source than the catalog.
+    /// As [`Cache::limited`], with sections read from a source other than the catalog.
     pub fn with_source(
         catalog: Catalog,
         source: Arc<dyn SectionSource>,
@@ -112,8 +112,8 @@ impl Cache {
         self.actors.get(&self.catalog, &self.shared, hash)
     }
 
-    /// An asset that is not in the store, in memory until its last copy is dropped; the one of the same key if there is
-    /// one already. `key` stands for all that it is made from, and is no hash.
+    /// An asset that is not in the store, in memory until its last copy is dropped; the existing one if the key has one
+    /// already. `key` identifies everything that it is made from, and is not a hash.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoomForActor`].

@@ -11,7 +11,7 @@ pub enum ResidencyError {
     /// The version is not in the store, or differs from what was committed.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The memory for its worst frame does not fit beside that of the open sessions.
+    /// The memory for its worst frame does not fit in addition to that of the open sessions.
     #[error(
         "a frame of twin {twin:?} may need {needed_bytes} bytes of memory; {held_bytes} of \
          {limit_bytes} are reserved for open sessions: close some, allow more with --memory-gib, or \
@@ -27,7 +27,7 @@ pub enum ResidencyError {
         /// Bytes that all twins together may use.
         limit_bytes: u64,
     },
-    /// The memory for an asset of an actor does not fit beside that of the open sessions.
+    /// The memory for an asset of an actor does not fit in addition to that of the open sessions.
     #[error(
         "actor {actor:?} needs {needed_bytes} bytes of memory; {held_bytes} of {limit_bytes} are reserved for open \
          sessions: close some, allow more with --memory-gib, or import the actor with fewer Gaussians"
@@ -85,7 +85,7 @@ pub enum ResidencyError {
         block: u8,
         /// The level of detail.
         level: u8,
-        /// How many attempts were made.
+        /// Number of attempts.
         attempts: u32,
         /// Why the last attempt failed.
         cause: String,

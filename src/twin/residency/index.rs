@@ -15,7 +15,7 @@ use super::demand::{SectionRef, Viewpoint, coarsest_level, longest_focal_px};
 const GROUP_CELLS: i32 = 16;
 
 /// The sections that a frame draws, in order of (cell y, cell x, block): one for every block within
-/// `reach_m` of a camera. It depends on the cameras, the profile, and the manifest's table alone.
+/// `reach_m` of a camera. It depends only on the cameras, the profile, and the manifest's table.
 ///
 /// An error of `e` metres at a distance of `d` metres is `f e / d` pixels wide, with `f` the focal
 /// length in pixels. A block is drawn at the coarsest level for which that is at most `tau_px`,

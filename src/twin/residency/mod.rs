@@ -1,7 +1,7 @@
 //! Which sections of twins are in memory.
 //!
 //! ```text
-//! demand, index       which sections a frame draws, computed from the table of a version alone
+//! demand, index       which sections a frame draws, computed only from the table of a version
 //! cache, resident     the open versions, and requests for the frames of one
 //! pager               loads what frames request and hands each frame all of it at once
 //! requests            which request waits for which section, and which section is loaded next
@@ -20,7 +20,7 @@
 //! **A section is in memory once**, under a key made of everything that its chunk depends on:
 //! content hash, cell, block, level, origin, and record. Fifty versions of a twin that differ in
 //! ten blocks take the memory of one twin plus ten blocks each. Sections of a closed version stay
-//! until their room is needed.
+//! until their memory is needed.
 //!
 //! **A frame's scene pins its sections.** The scene holds the chunks' `Arc`s, so a section may be
 //! evicted when the table holds the only `Arc`. There is no pin count that could get out of step,
@@ -31,16 +31,16 @@
 //! least one frame makes progress, with any number of sessions and even without admission control.
 //! Admission control only keeps sessions out of this slow state.
 //!
-//! **Room is reserved before a load begins**, because the table says how much a section takes.
+//! **Memory is reserved before a load begins**, because the table has the size of each section.
 //! Sections that are being loaded count as in use. The budget covers chunks; outside it are the
 //! bytes of one section per loader thread (eight), and 64 B of bookkeeping per section.
 //!
-//! **An evicted section leaves pages, not a hole**: the next section is read into them
-//! (`wildcity_scene::pages`). What the heap loses between pages is a few per cent of the budget.
+//! **Memory is allocated in pages**: the next section is read into the pages of an evicted one
+//! (`wildcity_scene::pages`). The heap loses a few per cent of the budget between pages.
 //!
 //! **Eviction is least recently used; a prefetch counts as a use.** As far as prefetching predicts the
 //! need for sections, this evicts first what is needed last. A prefetch evicts nothing that was used since
-//! its session's last prefetch, and is dropped if that leaves no room. So a prefetch can evict neither its
+//! its session's last prefetch, and is dropped if this does not free enough memory. So a prefetch can evict neither its
 //! own sections nor those that other sessions at the same pace are about to need.
 //!
 //! **Prefetching uses the exact poses of the next steps**, with the rig's own cameras. One point in the

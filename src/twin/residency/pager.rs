@@ -51,7 +51,7 @@ pub(super) struct WaitingFrame {
 struct Shared {
     source: Arc<dyn SectionSource>,
     state: Mutex<State>,
-    /// Notified when there may be a section to load, or room for one.
+    /// Notified when there may be a section to load, or memory for one.
     work: Condvar,
 }
 
@@ -113,7 +113,7 @@ impl Pager {
         Ok(WaitingFrame { shared: self.0.clone(), number })
     }
 
-    /// Loads sections that frames may need later, in order, as far as there is room. This replaces
+    /// Loads sections that frames may need later, in order, as far as the memory allows. This replaces
     /// the prefetch of the same owner with the number `before`. Returns the new number.
     pub(super) fn prefetch(
         &self,
@@ -161,7 +161,7 @@ impl Pager {
         self.0.state.lock().requests.load_times.clone()
     }
 
-    /// All statistics except the reserved bytes, which the pager does not know.
+    /// All statistics except the reserved bytes, which the pager does not count.
     pub(super) fn stats(&self) -> Stats {
         // A copy, so that it is sorted without the lock.
         let times = self.load_times();
@@ -178,7 +178,7 @@ impl Drop for Pager {
 }
 
 impl WaitingFrame {
-    /// How many of its sections are not in memory.
+    /// Number of its sections that are not in memory.
     pub(super) fn missing(&self) -> usize {
         self.shared.state.lock().requests.missing(self.number)
     }

@@ -2,7 +2,7 @@
 //! prefetches. Decides which section is loaded next, and which frames are notified once it is
 //! loaded or has failed.
 //!
-//! There is no thread, lock, or file here: those belong to the pager. `C` is a frame's callback,
+//! This module has no thread, lock, or file: they belong to the pager. `C` is a frame's callback,
 //! which is stored and returned here, but never called.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,16 +22,16 @@ use super::{ResidencyError, Stats};
 /// All requests, and the table of sections that answers them.
 pub(super) struct Requests<C> {
     pub(super) table: SectionTable,
-    /// What is to be loaded, the most urgent first. A section may be queued for several requests;
+    /// The sections to load, the most urgent first. A section may be queued for several requests;
     /// each entry stays until the section is loaded.
     queue: BTreeMap<QueueKey, SectionRef>,
     requests: BTreeMap<u64, Request<C>>,
-    /// Sections with a failed last load.
+    /// Sections whose last load failed.
     failures: BTreeMap<SlotId, RetryState>,
-    /// Number of requests so far. It numbers requests, and is the time of last use of their
+    /// Number of requests until now. It numbers requests, and is the time of last use of their
     /// sections.
     number: u64,
-    /// Whether the most urgent load waits for room.
+    /// Whether the most urgent load waits for free memory.
     pub(super) waiting_for_room: bool,
     stats: Stats,
     pub(super) load_times: LoadTimes,
@@ -88,7 +88,7 @@ struct RetryState {
     not_before: Instant,
 }
 
-/// What a loader thread does next.
+/// The next action of a loader thread.
 pub(super) enum NextLoad {
     Load {
         id: SlotId,
@@ -268,13 +268,13 @@ impl<C> Requests<C> {
         Some(request)
     }
 
-    /// The most urgent section that can be loaded now. Its room is reserved.
+    /// The most urgent section that can be loaded now. Its memory is reserved.
     pub(super) fn next(&mut self, now: Instant) -> NextLoad {
         self.waiting_for_room = false;
         let mut obsolete = Vec::new();
         let mut next_retry: Option<Instant> = None;
         let mut found = None;
-        // The prefetch that found no room: the rest of it is dropped as well.
+        // The prefetch that did not find enough memory: the rest of it is dropped as well.
         let mut without_room = None;
         for (key, section) in &self.queue {
             let QueueKey { urgency, request, id, .. } = *key;
@@ -303,7 +303,7 @@ impl<C> Requests<C> {
                     found = Some((id, *section, requested.version.clone(), evicted));
                     break;
                 }
-                // No younger frame may take the room that this one waits for.
+                // No younger frame may take the memory that this one waits for.
                 None if urgency == Urgency::Required => {
                     self.waiting_for_room = true;
                     break;

@@ -31,7 +31,7 @@ pub struct Prefetcher {
 enum PrefetchState {
     /// Holds the number of the last prefetch request.
     Open(Option<u64>),
-    /// Nothing is prefetched any more.
+    /// Prefetching has ended.
     Ended,
 }
 
@@ -45,8 +45,8 @@ impl Resident {
         self.reserve_with(extent, profile, FrameBytes::default())
     }
 
-    /// As [`Resident::reserve`], for frames that are drawn with another profile than the version's, and with what they
-    /// take beside their scenes.
+    /// As [`Resident::reserve`], for frames that are drawn with a profile other than the version's, and with the memory
+    /// that they take in addition to their scenes.
     ///
     /// # Errors
     /// As [`Resident::reserve`].
@@ -67,8 +67,9 @@ impl Reservation {
         Ok(Self { claim, prefetcher: Arc::new(Prefetcher::new(resident)) })
     }
 
-    /// Reserves `bytes` for scenes of another version in place of this one, in one step: there need not be
-    /// room for both. Prefetching of the old version ends. What frames take beside their scenes stays reserved.
+    /// Reserves `bytes` for scenes of another version in place of this one, in one step: both need not fit at the
+    /// same time. Prefetching of the old version ends. The memory that frames take in addition to their scenes stays
+    /// reserved.
     ///
     /// # Errors
     /// [`ResidencyError::NoRoom`] with the numbers; nothing has changed then.
@@ -96,7 +97,7 @@ impl Reservation {
         self.claim.bytes
     }
 
-    /// The part of it that frames take beside their scenes.
+    /// The part of it that frames take in addition to their scenes.
     pub fn frame(&self) -> FrameBytes {
         self.claim.frame
     }
@@ -169,7 +170,7 @@ impl Drop for Prefetcher {
     }
 }
 
-/// Changes the budget. What frames may take is taken from the sections at once.
+/// Changes the budget. The memory of frames is taken from the sections at once.
 fn change_budget<R>(resident: &Resident, change: impl FnOnce(&mut Budget) -> R) -> R {
     let mut budget = resident.shared.budget.lock();
     let changed = change(&mut budget);

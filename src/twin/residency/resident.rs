@@ -19,7 +19,7 @@ use super::table::{Key, SlotId};
 use super::worst_case::worst_case_bytes;
 use super::{BlockIndex, PinnedScene, ResidencyError, RigExtent, SceneCallback, Stats};
 
-/// What all open versions share.
+/// The state that all open versions share.
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) pager: Pager,
@@ -37,7 +37,7 @@ pub struct Resident {
     index: BlockIndex,
     /// Slots in the pager's table, chunk by chunk, section by section.
     ids: Vec<SlotId>,
-    /// Where each chunk begins in `ids`.
+    /// Start of each chunk in `ids`.
     first: Vec<usize>,
     /// Bytes of all levels of the whole version, and of its sky.
     total_bytes: u64,
@@ -45,8 +45,7 @@ pub struct Resident {
     worst_cases: Mutex<Vec<(WorstCaseKey, u64)>>,
 }
 
-/// What the most that a frame needs depends on: the rig, and of a profile the two values that
-/// decide how much is drawn.
+/// The inputs of the worst case: the rig, and the two values of a profile that decide how much is drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct WorstCaseKey {
     extent: RigExtent,
@@ -150,7 +149,7 @@ impl Resident {
         self.worst_case_bytes_with(extent, &self.version.manifest.profile)
     }
 
-    /// As [`Resident::worst_case_bytes`], for frames that are drawn with another profile than the
+    /// As [`Resident::worst_case_bytes`], for frames that are drawn with a profile other than the
     /// version's.
     pub fn worst_case_bytes_with(&self, extent: RigExtent, profile: &RenderProfile) -> u64 {
         let key = WorstCaseKey { extent, tau_px: profile.tau_px, reach_m: profile.reach_m };

@@ -19,9 +19,9 @@ pub struct Stats {
     pub failed_crashed: u64,
     /// Loads that were tried again after a failure.
     pub retries: u64,
-    /// Sections that were evicted to make room for others.
+    /// Sections that were evicted to free memory for others.
     pub evictions: u64,
-    /// Sections that were not prefetched because there was no room.
+    /// Sections that were not prefetched because there was not enough memory.
     pub prefetches_dropped: u64,
     /// Frames that had to wait for a section.
     pub waits: u64,

@@ -118,7 +118,7 @@ impl SectionTable {
         id
     }
 
-    /// A version that contains it was closed. A section in memory stays until its room is needed,
+    /// A version that contains it was closed. A section in memory stays until its memory is needed,
     /// because the next version may contain it, too.
     pub(super) fn unregister(&mut self, id: SlotId) {
         self.slots[id as usize].versions -= 1;
@@ -172,8 +172,8 @@ impl SectionTable {
         self.waiters.get(&id).map_or(&[], Vec::as_slice)
     }
 
-    /// Reserves the room of a section that is to be loaded, and returns the sections evicted for
-    /// it. `None` if evicting everything permitted would not make enough room; then nothing
+    /// Reserves the memory of a section that is to be loaded, and returns the sections evicted for
+    /// it. `None` if evicting everything permitted would not free enough memory; then nothing
     /// changes.
     pub(super) fn reserve(&mut self, id: SlotId, requester: Requester) -> Option<Vec<SlotId>> {
         let bytes = self.slots[id as usize].bytes;
@@ -237,7 +237,7 @@ impl SectionTable {
         self.limit_bytes.saturating_sub(self.outside_bytes + self.frame_bytes)
     }
 
-    /// Keeps so many bytes free for frames: sections that no frame draws or waits for are evicted.
+    /// Keeps `bytes` free for frames: sections that no frame draws or waits for are evicted.
     pub(super) fn set_frame_bytes(&mut self, bytes: u64) {
         self.frame_bytes = bytes;
         let mut next = self.oldest;

@@ -195,14 +195,14 @@ pub(super) struct HashedStart {
 /// The objects of a twin.
 #[derive(Debug, Default)]
 pub(super) struct ObjectListing {
-    /// Those that were found, in order of their hashes.
+    /// The objects that were found, in order of their hashes.
     pub(super) objects: Vec<ListedObject>,
-    /// The others.
+    /// Objects that cannot be listed.
     pub(super) unlisted: Vec<UnlistedObjects>,
 }
 
 impl ObjectListing {
-    /// The objects. What is no folder has none.
+    /// The objects. An entry that is not a folder has none.
     ///
     /// # Errors
     /// The disk fails to list some.
@@ -218,9 +218,9 @@ impl ObjectListing {
 /// Objects that cannot be listed: one, or all of a folder.
 #[derive(Debug)]
 pub(super) struct UnlistedObjects {
-    /// The hash of the object, or the two digits that the hashes of a folder begin with.
+    /// The hash of the object, or the first two digits of the hashes in a folder.
     pub(super) digits: String,
-    /// [`StoreError::Io`] if the disk fails, [`StoreError::Damaged`] if the folder is none.
+    /// [`StoreError::Io`] if the disk fails, [`StoreError::Damaged`] if it is not a folder.
     pub(super) error: StoreError,
 }
 

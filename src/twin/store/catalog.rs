@@ -52,9 +52,9 @@ pub struct TwinListing {
 /// The twins of a catalog.
 #[derive(Debug, Default)]
 pub struct TwinList {
-    /// Those whose newest log record can be read, sorted by name.
+    /// Twins whose newest log record can be read, sorted by name.
     pub twins: Vec<TwinListing>,
-    /// The others, sorted by name. Their damage does not concern the twins beside them.
+    /// The other twins, sorted by name. Their damage does not affect the readable ones.
     pub damaged: Vec<DamagedTwin>,
 }
 
@@ -63,7 +63,7 @@ pub struct TwinList {
 pub struct DamagedTwin {
     /// The twin's name.
     pub name: String,
-    /// What is wrong.
+    /// The error.
     pub error: StoreError,
 }
 
@@ -127,7 +127,7 @@ impl Catalog {
         Remote::over(store, url, prefix, open_cache(cache)?, retry).map(Self::remote)
     }
 
-    /// The same twins with another clock.
+    /// These twins with another clock.
     pub fn with_clock(self, clock: Arc<dyn Clock>) -> Self {
         Self { clock, ..self }
     }
@@ -154,7 +154,7 @@ impl Catalog {
         Self { objects, clock: Arc::new(SystemClock), remote: Some(remote), pages: page_pool() }
     }
 
-    /// The same twins, read without the disk cache.
+    /// These twins, read without the disk cache.
     pub(super) fn uncached(&self) -> Self {
         self.remote.as_ref().map_or_else(|| self.clone(), |remote| Self::remote(remote.uncached()))
     }
@@ -193,7 +193,7 @@ impl Catalog {
         Ok(Some(TwinListing { name: name.to_owned(), number, hash }))
     }
 
-    /// Number of a twin's latest version, from the names of the log's records alone. The records
+    /// Number of a twin's latest version, only from the names of the log's records. The records
     /// are not read, so a damaged one causes no error.
     ///
     /// # Errors
@@ -223,7 +223,7 @@ impl Catalog {
         Ok(Version { number, hash, created_us, manifest })
     }
 
-    /// All versions of a twin in order of their numbers, from the log alone.
+    /// All versions of a twin in order of their numbers, only from the log.
     ///
     /// # Errors
     /// [`StoreError::Name`] or [`StoreError::NoTwin`]; [`StoreError::Damaged`] for a record that
@@ -237,7 +237,7 @@ impl Catalog {
         self.numbers(name)?.into_iter().map(entry).collect()
     }
 
-    /// Where a version of the log comes from, from its manifest alone.
+    /// The source of a version of the log, only from its manifest.
     ///
     /// # Errors
     /// As [`Catalog::version`].

@@ -18,8 +18,8 @@
 //! repeats its own part of the table, so that it can be read without the manifest; `verify`
 //! compares the two.
 //!
-//! What is read, decoded, and drawn as one unit is a section: one level of detail of one block of
-//! 16 m, within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer knows nothing of
+//! A section is read, decoded, and drawn as one unit: one level of detail of one block of 16 m,
+//! within a cell of 64 m. It becomes one `scene::Chunk`, so the renderer does not depend on
 //! levels. A sparse cell, such as one of a skyline, is a single block: as 3,000 blocks of three Gaussians
 //! each, the demo street's skyline took 9 ms of every frame.
 
@@ -62,7 +62,7 @@ impl PackedSection {
     }
 }
 
-/// What every section of a chunk object shares.
+/// The properties that all sections of a chunk object share.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct ChunkHeader {
     pub(super) cell: [i32; 2],

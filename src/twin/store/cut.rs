@@ -21,7 +21,7 @@ pub const CUT_ABOVE_M: f64 = 0.05;
 pub struct Cut {
     /// The new version.
     pub version: Version,
-    /// What was cut out, in the axes of the box, at full detail.
+    /// The Gaussians that were cut out, in the axes of the box, at full detail.
     pub gaussians: Gaussians,
 }
 

@@ -40,8 +40,8 @@ pub struct CellSize {
 }
 
 impl Catalog {
-    /// The differences between version `before` and version `after` of a twin, from their manifests
-    /// alone.
+    /// The differences between version `before` and version `after` of a twin, only from their
+    /// manifests.
     ///
     /// # Errors
     /// As [`Catalog::version`].

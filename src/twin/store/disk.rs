@@ -16,7 +16,7 @@ pub trait Disk: Debug + Send + Sync {
     /// As [`std::fs::read_dir`].
     fn list(&self, dir: &Path) -> io::Result<Vec<String>>;
 
-    /// What is at a path; links to files are not followed.
+    /// The kind of the entry at a path; links to files are not followed.
     ///
     /// # Errors
     /// As [`std::fs::symlink_metadata`].
@@ -25,7 +25,7 @@ pub trait Disk: Debug + Send + Sync {
     /// Opens a regular file for reading.
     ///
     /// # Errors
-    /// There is none, or what is there is something else, such as a link or a pipe.
+    /// The path does not exist, or is something else, such as a link or a pipe.
     fn open(&self, path: &Path) -> io::Result<Box<dyn ReadFile>>;
 
     /// Creates an empty file, in place of an older one.
@@ -90,7 +90,7 @@ pub trait Disk: Debug + Send + Sync {
     fn lock(&self, path: &Path, wait: Wait) -> io::Result<Option<Lock>>;
 }
 
-/// What is at a path.
+/// The kind of the entry at a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileInfo {
     /// Size in bytes.
@@ -145,7 +145,7 @@ pub struct Lock {
     _held: Box<dyn Held>,
 }
 
-/// What keeps a lock.
+/// An object that holds a lock until it is dropped.
 pub trait Held: Any + Debug + Send + Sync {}
 
 impl<T: Any + Debug + Send + Sync> Held for T {}

@@ -12,7 +12,7 @@ use super::settings::{VersionChange, VersionSettings};
 use super::sky::NewSky;
 use super::{Catalog, StoreError, Version, views};
 
-/// What an edit changes.
+/// The changes of an edit.
 #[derive(Clone, Debug)]
 pub struct Edit {
     /// Turns, moves and scales the Gaussians, the drives and the sky; the identity leaves the stored bytes as they are.
@@ -24,7 +24,7 @@ pub struct Edit {
 }
 
 impl Catalog {
-    /// Makes a version with the Gaussians of another one in other axes and another unit, and with other drives.
+    /// Makes a version with the Gaussians of an existing one in other axes and another unit, and with other drives.
     ///
     /// The rig stays as it is, since it is in metres of the vehicle, and so does the profile. A place on the earth is
     /// of the old axes, and is dropped if they change. The version remembers the alignment, with earlier ones, as the

@@ -77,7 +77,7 @@ pub enum StoreError {
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What differs.
+        /// The difference.
         reason: String,
     },
     /// Written by another version of this program.
@@ -102,19 +102,19 @@ pub enum StoreError {
     NoActor {
         /// The requested name or hash.
         text: String,
-        /// How many have it.
+        /// Number of assets that have it.
         found: usize,
-        /// Those that have it, or else all that exist.
+        /// The assets that have it, or else all that exist.
         known: Vec<String>,
     },
     /// An asset differs from what was stored, or cannot be read.
     #[error("{}", damaged_actor(hash, name.as_deref(), reason))]
     ActorDamaged {
-        /// Its hash, 64 lower-case hex digits; or only two, if the folder of all hashes that begin with them is none.
+        /// Its hash, 64 lower-case hex digits; only the first two if their folder of hashes is not a folder.
         hash: String,
         /// The name that it states, if that can be read. It may be damaged, too.
         name: Option<String>,
-        /// What is wrong.
+        /// The error.
         reason: String,
     },
     /// An asset of another content has the name.
@@ -150,7 +150,7 @@ pub enum StoreError {
         /// The number that was taken.
         number: u64,
     },
-    /// The same cell was put twice into a commit.
+    /// A cell was put twice into a commit.
     #[error(
         "cell {cell:?} of twin {name:?} was put before: put all its Gaussians at once, or only \
          cells that are new"
@@ -173,7 +173,7 @@ pub enum StoreError {
         /// Number of cells that they lie in.
         cells: usize,
     },
-    /// Gaussians were stored in another way than the rest of the twin.
+    /// Gaussians were stored in a different way from the rest of the twin.
     #[error(
         "{field} is {stored}, but twin {name:?} has {needed}: store the Gaussians with {needed}, or replace \
          the whole twin"
@@ -213,8 +213,8 @@ pub enum StoreError {
         latest: u64,
         /// Grid cells (x, y) that both changed, in order of (y, x).
         cells: Vec<[i32; 2]>,
-        /// What both changed of [`Diff::settings`](super::Diff::settings). `alignment` is there also if others alone
-        /// changed it.
+        /// The fields of [`Diff::settings`](super::Diff::settings) that both changed. `alignment` is listed even if
+        /// only others changed it.
         settings: Vec<&'static str>,
     },
     /// A side file (a lease, or the state of garbage collection) is too large to be read again.
@@ -241,7 +241,7 @@ pub enum StoreError {
         name: String,
         /// The version.
         number: u64,
-        /// What failed.
+        /// The cause.
         cause: Box<StoreError>,
     },
     /// The answer to the last request of a commit was lost, and the log cannot be read.
@@ -254,7 +254,7 @@ pub enum StoreError {
         name: String,
         /// The version.
         number: u64,
-        /// What failed.
+        /// The cause.
         cause: io::Error,
     },
     /// A URL of twins cannot be used.
@@ -262,7 +262,7 @@ pub enum StoreError {
     Url {
         /// The URL.
         url: String,
-        /// What is wrong with it, or with the credentials.
+        /// The error in it, or in the credentials.
         reason: String,
     },
     /// The Gaussians of a commit cannot be used.

@@ -43,7 +43,7 @@ pub struct VerifyReport {
 pub struct DamagedObject {
     /// Its name, 64 lower-case hex digits.
     pub object: String,
-    /// What is wrong with it: it is missing, unreadable, or has another hash.
+    /// Its damage: it is missing, unreadable, or has another hash.
     pub error: StoreError,
 }
 
@@ -52,7 +52,7 @@ pub struct DamagedObject {
 pub struct RecordSetAside {
     /// Number of the version that it was the record of.
     pub number: u64,
-    /// What was wrong with it.
+    /// Its damage.
     pub error: StoreError,
     /// Where it is now.
     pub path: PathBuf,

@@ -221,7 +221,7 @@ impl Catalog {
             if stays && !needed.contains(&record.manifest) {
                 match self.named_by(name, &record.manifest) {
                     Ok(named) => needed.extend(named),
-                    // What is lost can be read no more.
+                    // A lost manifest can no longer be read.
                     Err(StoreError::Io { cause, .. }) if cause.kind() == ErrorKind::NotFound => {}
                     Err(error @ StoreError::Io { .. }) => return Err(error),
                     // It is unknown what a damaged manifest names, until it goes itself.

@@ -79,8 +79,8 @@ impl Catalog {
         let files = self.objects.list_side_files(name, FOLDER)?;
         for id in files.into_iter().filter(|file| !file.ends_with(LOCK_ENDING)) {
             let read = self.objects.read_side_file(name, &format!("{FOLDER}/{id}"))?;
-            // A missing file is a lease that ended meanwhile. A damaged one cannot say which
-            // version it holds.
+            // A missing file is a lease that ended meanwhile. The version of a
+            // damaged one is unknown.
             let record =
                 read.and_then(|record| serde_json::from_slice::<LeaseRecord>(&record).ok());
             leases.extend(record.filter(|record| record.id == id));

@@ -51,7 +51,7 @@ pub enum CommitKind {
 }
 
 /// A record of the log, stored as JSON. How a version was made is stored here and not in the manifest,
-/// so that the hash of a manifest depends on the content of the version alone.
+/// so that the hash of a manifest depends only on the content of the version.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LogRecord {

@@ -34,7 +34,7 @@ pub struct NewVersion<'a> {
 }
 
 impl<'a> NewVersion<'a> {
-    /// Gaussians alone, rendered and stored with defaults.
+    /// Only Gaussians, rendered and stored with defaults.
     pub fn of(name: &'a str, gaussians: &'a Gaussians, provenance: Provenance) -> Self {
         Self {
             name,

@@ -173,7 +173,7 @@ impl<'a> CellPacker<'a> {
     }
 }
 
-/// How many of the next cells are packed in parallel.
+/// Number of the next cells that are packed in parallel.
 fn batch_cells(cells: &[CellRun]) -> usize {
     let mut gaussians = 0;
     let few = cells.iter().take_while(|cell| {

@@ -10,8 +10,9 @@ use wildcity_scene::random::Random;
 use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::Ground;
 use wildcity_sim::traffic::{
-    Action, Actor, ActorSpec, ActorState, After, Attack, Behaviour, Condition, Course, EgoBox,
-    EgoMotion, EgoState, Follow, Idm, Near, Track, TrackKeyframe, Traffic, Trigger, World,
+    Action, Actor, ActorSpec, ActorState, After, Attack, Behaviour, Condition, Course,
+    CourseFollower, EgoBox, EgoMotion, EgoState, Idm, Near, Track, TrackKeyframe, Traffic, Trigger,
+    World,
 };
 
 use crate::vectors::{assert_near, cases, number};
@@ -36,7 +37,7 @@ fn winding() -> Arc<Course> {
 }
 
 fn follow(course: &Arc<Course>, station_m: f64, speed_mps: f64, idm: Option<Idm>) -> Behaviour {
-    Behaviour::Follow(Follow {
+    Behaviour::Follow(CourseFollower {
         courses: vec![course.clone()],
         station_m,
         offset_m: 0.0,
@@ -126,7 +127,7 @@ fn a_car_follows_the_ego_and_brakes_for_what_cuts_in() {
     let front_m = world.states()[0].world_from_actor.position_m.x + 2.25;
     assert!((front_m - (100.0 + 1.3 - 2.25 - 1.0)).abs() < 1e-3, "{front_m}");
     // A car in the next lane is no lead until it moves over.
-    let beside = Behaviour::Follow(Follow {
+    let beside = Behaviour::Follow(CourseFollower {
         courses: vec![road.clone()],
         station_m: 60.0,
         offset_m: 3.5,

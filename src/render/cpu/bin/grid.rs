@@ -21,7 +21,7 @@ impl Grid {
     pub(in crate::cpu) fn new(view: &View) -> Self {
         let size_px = [view.camera.width_px, view.camera.height_px];
         let [columns, rows] = size_px.map(|size| size.div_ceil(TILE_PX));
-        // Smaller ones in small images, so that there are enough for all cores.
+        // Use smaller macro tiles in small images, so that there are enough for all cores.
         let macro_bits = match columns * rows {
             512.. => [3, 2],
             64.. => [2, 1],

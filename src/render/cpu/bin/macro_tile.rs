@@ -25,11 +25,11 @@ const MAX_KEPT: usize = 1 << 18;
 /// The splats of one macro tile, and the lists of its tiles.
 #[derive(Debug, Default)]
 pub(in crate::cpu) struct MacroTile {
-    /// In order of global ids.
+    /// The pairs, in order of global ids.
     pairs: Vec<Pair>,
-    /// Of each pair; empty if there are too many.
+    /// The splat of each pair; empty if there are too many.
     copies: Vec<Splat>,
-    /// Indices of pairs, tile after tile, from the nearest splat; what follows is of no use.
+    /// Indices of pairs, tile after tile, from the nearest splat. Values after the last list are meaningless.
     instances: Vec<u32>,
     /// End of each tile's list in `instances`.
     ends: [u32; MACRO_TILE_TILES],

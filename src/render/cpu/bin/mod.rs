@@ -50,7 +50,8 @@ pub(super) fn check_instances(instances: u64) -> Result<(), RenderError> {
     }
 }
 
-/// Splats of a segment, at least, unless its view has fewer: enough to outweigh its counters of a view's macro tiles.
+/// Least number of splats of a segment, unless its view has fewer: enough to outweigh its counters of a view's macro
+/// tiles.
 const SEGMENT: usize = 1 << 14;
 
 /// The splats of a frame by macro tile.
@@ -65,7 +66,7 @@ pub(super) struct Bins {
     instances: u64,
     /// Number of (splat, macro tile) pairs.
     pairs: u64,
-    /// Pairs of a segment, each with the number of its macro tile. Not in use.
+    /// Unused scratch memory: pairs of a segment, each with the number of its macro tile.
     scratches: Mutex<Vec<Vec<(u32, Pair)>>>,
 }
 
@@ -73,8 +74,8 @@ impl Bins {
     /// Stage bin: finds the macro tiles that each splat touches.
     ///
     /// # Errors
-    /// More than [`MAX_INSTANCES`] (splat, tile) pairs; or [`Overflow`], if what the part of the frame holds from now on
-    /// takes more than `most_bytes`.
+    /// More than [`MAX_INSTANCES`] (splat, tile) pairs; or [`Overflow`], if the buffers of this part of the frame take
+    /// more than `most_bytes` from now on.
     pub(super) fn bin(
         &mut self,
         level: Level,
@@ -94,7 +95,7 @@ impl Bins {
         let scratches = &self.scratches;
         let segments = self.segments[..self.used_segments].par_iter_mut().with_max_len(1);
         segments.for_each(|segment| {
-            // Beyond either limit the rest is skipped: the part is drawn in smaller ones, or the frame fails.
+            // Beyond either limit the rest is skipped: the part is drawn in smaller parts, or the frame fails.
             let is_over = bytes_of(pairs.load(Relaxed), total.load(Relaxed)) > most_bytes;
             if is_over || total.load(Relaxed) > MAX_INSTANCES {
                 return;
@@ -118,8 +119,8 @@ impl Bins {
         Ok(())
     }
 
-    /// Frees what segments and the threads' lists of pairs keep of earlier frames if it is more than `most_bytes`: each
-    /// may have been long in another frame.
+    /// Frees the memory that segments and the threads' lists of pairs keep from earlier frames if it is more than
+    /// `most_bytes`: each may have been long in another frame.
     pub(super) fn trim(&mut self, most_bytes: u64) {
         let of_segments: usize = self.segments.iter().map(Segment::held_bytes).sum();
         let scratches = self.scratches.get_mut();
@@ -131,7 +132,7 @@ impl Bins {
         }
     }
 
-    /// Bytes that a part of the frame holds until it is drawn, at most.
+    /// Most bytes that a part of the frame holds until it is drawn.
     pub(super) fn held_bytes(&self, projected: &Projected) -> u64 {
         (projected.places() * size_of::<Splat>()) as u64 + bytes_of(self.pairs, self.instances)
     }
@@ -142,8 +143,8 @@ impl Bins {
         tile.load(number, self.of_view(view));
     }
 
-    /// The macro tiles of a view, those with the most instances first: what is drawn last is small, so that no thread
-    /// waits long for another one.
+    /// The macro tiles of a view, those with the most instances first: the last ones are small, so that no thread waits
+    /// long for another.
     pub(super) fn by_work(&self, view: usize) -> Vec<usize> {
         let mut instances = vec![0_u64; self.grids[view].macro_tiles()];
         for segment in self.of_view(view) {

@@ -79,7 +79,7 @@ pub(super) fn for_each_row(
 #[inline(always)]
 fn tiles(center: f32, low: f32, high: f32, size_px: u32) -> Option<(u32, u32)> {
     let last_px = (size_px - 1) as f32;
-    // Comparisons and not `max` and `min`, which have instructions for a NaN.
+    // Use comparisons and not `max` and `min`, which take additional instructions for a NaN.
     let first = (center + low - 0.5).ceil();
     let first = if first > 0.0 { first } else { 0.0 };
     let last = (center + high - 0.5).floor();
@@ -88,7 +88,7 @@ fn tiles(center: f32, low: f32, high: f32, size_px: u32) -> Option<(u32, u32)> {
 }
 
 /// A whole number from 0 to 2^23 - 1 as an integer: 2^23 + n has the bits of n as its mantissa. A conversion takes six
-/// instructions, since it considers every other number as well.
+/// instructions, since it handles all other numbers as well.
 #[inline(always)]
 fn whole(value: f32) -> u32 {
     (value + 8_388_608.0).to_bits() & 0x7F_FFFF

@@ -16,7 +16,7 @@ pub(super) struct Segment {
     pub(super) units: Range<usize>,
     /// Macro tile after macro tile, and within one in order of global ids.
     pairs: Vec<Pair>,
-    /// For each macro tile of the view.
+    /// Counts of each macro tile of the view.
     pub(super) counts: Vec<Counts>,
 }
 
@@ -25,13 +25,13 @@ pub(super) struct Segment {
 pub(super) struct Pair {
     /// [`Cutoffs::sort_key`] without the view.
     pub(super) depth: u32,
-    /// Of the splat in the projection.
+    /// Place of the splat in the projection.
     pub(super) place: u32,
     /// A bit for each tile.
     pub(super) tiles: u32,
 }
 
-/// Of one segment and one macro tile.
+/// Counts of one segment and one macro tile.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Counts {
     /// First the number of pairs, then the end of them in the segment.
@@ -55,7 +55,7 @@ impl Segment {
         let units = &projected.units()[self.units.clone()];
         let mut instances = 0;
         for (first_place, splats) in units.iter().flat_map(|unit| projected.pages(unit)) {
-            // Beyond the limit the frame fails. A pair has at least one instance, so that this bounds the memory, too.
+            // Beyond the limit the frame fails. A pair has at least one instance, so this bounds the memory, too.
             if instances > MAX_INSTANCES {
                 return;
             }

@@ -1,7 +1,7 @@
 //! Smooth functions as short series.
 //!
-//! A series is chosen by its Chebyshev terms, whose sizes bound what is left out, and evaluated by powers: half the
-//! operations, and two chains of them that do not wait for each other. The functions here are smooth beyond the ends of
+//! A series is chosen by its Chebyshev terms, whose sizes bound the remainder, and evaluated by powers: half the
+//! operations, in two independent chains. The functions here are smooth beyond the ends of
 //! their range, so that the coefficients of the powers fall, too, and nothing cancels.
 
 use fearless_simd::{f32x16, prelude::*};

@@ -1,5 +1,5 @@
-//! Projection around a point to second order: what the six points of the unscented transform give for a small
-//! Gaussian, without projecting them.
+//! Projection around a point to second order: the result of the six points of the unscented transform for a small
+//! Gaussian, without projecting the points.
 //!
 //! Let a displacement of a point at distance d be `d (a, b, c)`: a away from the lens' axis, b around it, c along
 //! the ray. With the point's angle θ off the axis and the lens' radius r(θ), the image moves by
@@ -11,8 +11,8 @@
 //!
 //! up to terms of third order. A lens of slopes X = x/z, Y = y/z has the same form with α = β = 1 and the rest 0,
 //! for `a = (δx - X δz)/z`, `b = (δy - Y δz)/z` and `c = δz/z`; the distortion's Jacobian leads from there to
-//! pixels. A windshield and a shutter change what (a, b, c) is of a displacement, and nothing else to first order.
-//! [`crate::unscented::ExpansionBound`] bounds what is left out.
+//! pixels. A windshield and a shutter change the map from a displacement to (a, b, c), and nothing else to first order.
+//! [`crate::unscented::ExpansionBound`] bounds the terms that are left out.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -37,12 +37,13 @@ pub(in crate::cpu) struct Expansion<S: Simd> {
     mu: f32x16<S>,
     /// Rows of the matrix from movements away from the axis and around it to pixels.
     plane: [[f32x16<S>; 2]; 2],
-    /// How far the end of the lens' field is, as a length of (a, b, c).
+    /// Distance to the end of the lens' field, as a length of (a, b, c).
     room: f32x16<S>,
     shutter: Option<ShutterTerms<S>>,
 }
 
-/// How the moment of exposure changes with a place on the image.
+/// The rolling shutter around a point: the exposure time depends on the image position, and the image position depends
+/// on the exposure time.
 struct ShutterTerms<S: Simd> {
     /// (a, b, c) of a point per unit of the remaining exposure.
     motion: Vec3x16<S>,
@@ -52,9 +53,10 @@ struct ShutterTerms<S: Simd> {
     per_px: Px<S>,
     /// `1/(1 - per_px · motion_px)`.
     gain: f32x16<S>,
-    /// 1, or 0 for points beside the image that are exposed before the first row or after the last, as that is.
+    /// 1 where the exposure time changes with the image position; 0 beyond the first and the last row, where it is
+    /// clamped.
     rolls: f32x16<S>,
-    /// Distance of the remaining exposure from 0 and 1, where its change begins or ends.
+    /// Distance of the remaining exposure from 0 or 1, where its change begins or ends.
     to_limit: f32x16<S>,
     /// Rotation of the camera during the exposure, in radians.
     rotation_rad: f32x16<S>,
@@ -66,19 +68,19 @@ pub(in crate::cpu) struct ExpandedAxes<S: Simd> {
     pub(in crate::cpu) columns: [Px<S>; 6],
     /// From the image of the centre to the mean of the six points.
     pub(in crate::cpu) mean_shift: Px<S>,
-    /// Bounds of what is left out, in units of the bound's factors.
+    /// Bounds of the terms that are left out, in units of the bound's factors.
     pub(in crate::cpu) remainder: Remainder<S>,
 }
 
-/// What [`crate::unscented::ExpansionBound`] is a function of.
+/// The arguments of [`crate::unscented::ExpansionBound`].
 pub(in crate::cpu) struct Remainder<S: Simd> {
     /// Sum of the squares of all (a, b, c).
     pub(in crate::cpu) square: f32x16<S>,
     /// The largest length of an axis' (a, b, c).
     pub(in crate::cpu) longest: f32x16<S>,
-    /// What the shutter adds, in pixels.
+    /// Term of the rolling shutter, in pixels.
     pub(in crate::cpu) shutter_px: f32x16<S>,
-    /// How far the end of the lens' field is, as a length of (a, b, c).
+    /// Distance to the end of the lens' field, as a length of (a, b, c).
     pub(in crate::cpu) room: f32x16<S>,
 }
 
@@ -160,7 +162,7 @@ impl LensProjection {
         Some(expansion)
     }
 
-    /// The expansion around points, or directions behind the windshield, by the lens alone.
+    /// The expansion around points, or directions behind the windshield, by the lens only.
     #[inline(always)]
     fn expand_lens<S: Simd>(
         &self,
@@ -181,7 +183,7 @@ impl LensProjection {
                 let inverse = one / (distance + z);
                 let per_distance = one / distance;
                 let t = rho * inverse;
-                // On the axis every azimuth is as good as another.
+                // On the axis any azimuth may be used.
                 let on_axis = rho.simd_lt(splat(1e-18));
                 let per_rho = one / on_axis.select(one, rho);
                 let cos_azimuth = on_axis.select(one, x * per_rho);
@@ -203,7 +205,8 @@ impl LensProjection {
                     gamma = within.select(gamma, zero);
                     room = within.select(room, tangent.past_begin_rad(simd, t));
                 }
-                // Below 1e-3 rad off the axis the numerators are of second order, and rounding errors.
+                // Below 1e-3 rad off the axis the numerators are of second order and consist of rounding errors only,
+                // so the divisor is clamped.
                 let per_sin = one / sin.max(splat(1e-3));
                 let kappa = (alpha * cos - beta) * per_sin;
                 let mu = (alpha - beta * cos) * per_sin;
@@ -344,8 +347,8 @@ impl<S: Simd> Expansion<S> {
             square += length2;
             longest2 = longest2.max(length2);
         }
-        // The middle of a pair of points lies 3 times its axis' terms beside the centre's image; its distance from the
-        // mean, over √3, is a column of the root.
+        // The middle of a pair of points is offset from the centre's image by 3 times its axis' terms. Its distance
+        // from the mean, over √3, is a column of the root.
         let root_3 = f32x16::splat(simd, 3.0_f32.sqrt());
         let per_root_3 = f32x16::splat(simd, 3.0_f32.sqrt().recip());
         for bend in &mut columns[3..] {

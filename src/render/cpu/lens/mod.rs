@@ -79,7 +79,7 @@ pub(super) struct LensPixels<S: Simd> {
     pub(super) y_px: f32x16<S>,
     /// Not below 0 where the pixels are those of the point: within the field, or where the lens is continued.
     pub(super) margin: f32x16<S>,
-    /// Of round lenses: the distance from the principal point by the sine of the angle off the axis.
+    /// For round lenses: the distance from the principal point divided by the sine of the angle off the axis.
     per_sin: f32x16<S>,
 }
 
@@ -142,7 +142,7 @@ impl LensProjection {
         Some(Self { shutter, windshield, center_px, model })
     }
 
-    /// The same camera in other motion; `None` as for [`LensProjection::new`].
+    /// This camera in another motion; `None` as for [`LensProjection::new`].
     pub(super) fn moved(&self, view: &View) -> Option<Self> {
         let shutter = match view.shutter_motion() {
             None => None,
@@ -186,7 +186,7 @@ impl LensProjection {
         }
     }
 
-    /// Projects points, or directions behind the windshield, by the lens alone.
+    /// Projects points, or directions behind the windshield, by the lens only.
     #[inline(always)]
     fn project_lens<S: Simd>(&self, simd: S, point_m: Vec3x16<S>) -> LensPixels<S> {
         let splat = |value: f32| f32x16::splat(simd, value);
@@ -225,7 +225,7 @@ impl LensProjection {
                 let mut x_slope = x * inverse;
                 let mut y_slope = y * inverse;
                 let slope2 = x_slope.mul_add(x_slope, y_slope * y_slope);
-                // Points behind the camera are not within, and neither is a NaN (a point beside it).
+                // Points behind the camera are not within, and neither is a NaN (a point in the camera plane).
                 let within = z.simd_gt(splat(0.0)) & slope2.simd_le(splat(*max_slope2));
                 let mut margin = within.select(splat(0.0), splat(-1.0));
                 if !within.all_true() {
@@ -269,7 +269,7 @@ impl LensProjection {
                 LensPixels {
                     x_px: (x.mul_add(radial, tangential_x) + prism_x).mul_add(fx, cx),
                     y_px: (y.mul_add(radial, tangential_y) + prism_y).mul_add(fy, cy),
-                    // Points behind the camera are outside, and so is a NaN (a point beside it).
+                    // Points behind the camera are outside, and so is a NaN (a point in the camera plane).
                     margin: z.simd_gt(splat(0.0)).select(splat(*max_slope2) - r2, splat(-1.0)),
                     per_sin: splat(0.0),
                 }
@@ -304,10 +304,10 @@ impl Model {
 }
 
 impl RoundDerivatives {
-    /// Largest error of the slope, as a share of the slope at the axis: of the size of a splat.
+    /// Largest error of the slope, as a share of the slope at the axis. It is a relative error of the size of a splat.
     const SLOPE_ERROR: f64 = 1e-5;
 
-    /// The same of the curvature, which only moves the mean of a splat by a pixel or so.
+    /// Largest error of the curvature, which only moves the mean of a splat by a pixel or so.
     const CURVATURE_ERROR: f64 = 1e-3;
 
     /// `None` if no short series describes them.
@@ -359,7 +359,7 @@ mod tests {
     use wildcity_scene::geometry::camera::{Fisheye, OpenCv, Pinhole, ShutterDirection};
 
     /// The cameras of two real rigs (one is behind a windshield) and one camera of each other model, each
-    /// with its name and how many of 4,000 directions up to the end of its field must be found within it.
+    /// with its name and the number of 4,000 directions up to the end of its field that must be found within it.
     fn cameras() -> Vec<(String, Camera, usize)> {
         let rigs = ["alpamayo1", "alpamayo2"].map(|rig| Rig::preset(rig).unwrap());
         let real = rigs.into_iter().flat_map(|rig| rig.cameras);
@@ -433,7 +433,7 @@ mod tests {
         assert!(max_error_rad < 2e-6, "{max_error_rad:e} rad");
     }
 
-    /// Points on a spiral from the axis to far beyond the end of the field, and points 0.9 m beside them.
+    /// Points on a spiral from the axis to far beyond the end of the field, and points at 0.9 m from them.
     #[test]
     fn projected_points_match_f64() {
         for (name, camera, least_inside) in cameras() {
@@ -482,8 +482,8 @@ mod tests {
                 assert!(inside > least_inside, "{name}: {inside}");
                 let is_bare = camera.windshield.is_none();
                 let is_continued = is_bare && matches!(camera.lens, Lens::FTheta(_));
-                // Of 999 that are beyond the field at the end of the exposure. When they are exposed, a camera that
-                // drives towards them may have them within its field: 100 of those of a telephoto lens.
+                // 999 points are beyond the field at the end of the exposure. When they are exposed, a camera that
+                // drives towards them may have them within its field: 100 of them with a telephoto lens.
                 assert!(beyond > 900 || !is_continued, "{name}: {beyond} beyond its field");
                 eprintln!("{name}: {max_error_px:.1e} px");
                 // Behind a windshield and far beyond the image 2.0e-3 px were measured.

@@ -25,7 +25,7 @@ pub(in crate::cpu) struct LensRays {
     round_from_px: [[f32; 3]; 2],
     /// `None` for a pinhole.
     round: Option<RoundLens>,
-    /// Rows that take directions in the camera's frame at the end of the exposure to the wanted axes.
+    /// Rows that take directions in the camera's frame at the end of the exposure to the requested axes.
     axes_from_camera: [[f32; 3]; 3],
 }
 
@@ -39,7 +39,7 @@ struct RoundLens {
 }
 
 impl LensRays {
-    /// `None` for OpenCV's polynomials of slopes, for what [`super::LensProjection`] does not describe, and
+    /// `None` for OpenCV's polynomials of slopes, for cameras that [`super::LensProjection`] does not describe, and
     /// for a windshield with a refraction that fades within the image.
     pub(in crate::cpu) fn new(view: &View, axes_from_world: DMat3) -> Option<Self> {
         let Camera { pinhole, lens, windshield, .. } = &view.camera;

@@ -24,7 +24,7 @@ const MAX_ERROR_PX: f32 = 1.0 / 8192.0;
 /// The search ends when the fraction changes by at most this: 1e-6 of 1 m of motion.
 const CONVERGED: f32 = 1e-6;
 
-/// Steps below this say nothing about the slope: f32 rounds places on the image.
+/// Steps below this do not give a usable slope, because f32 rounds places on the image.
 const LEAST_STEP: f32 = 1e-5;
 
 /// Most projections after the first one. Points that need more are left to the f64 path.
@@ -85,9 +85,9 @@ impl LensProjection {
         self.search(simd, shutter, at_end_m, &end, wanted)
     }
 
-    /// Projects points near others that are exposed at `moment`, given in the camera's frame then. As
-    /// [`Self::project`]. A call of its own: few Gaussians need it, and within the caller it takes the compiler a fifth
-    /// of this package's time.
+    /// Projects points near others that are exposed at `moment`, given in the camera's frame at that moment. As
+    /// [`Self::project`]. It is not inlined: few Gaussians need it, and inlining takes the compiler a fifth of this
+    /// package's time.
     #[inline(always)]
     pub(in crate::cpu) fn project_near<S: Simd>(
         &self,
@@ -118,7 +118,7 @@ impl LensProjection {
         let zero = splat(0.0);
         let motion_m = shutter.motion(simd, from.remaining);
         let mut remaining = from.remaining;
-        // Of the round before; without one there is no secant.
+        // Values of the previous round; without one there is no secant.
         let mut step = zero;
         let [mut x_px, mut y_px, mut off] = [zero; 3];
         let mut round = 0;
@@ -137,7 +137,7 @@ impl LensProjection {
                 & step.abs().simd_gt(splat(LEAST_STEP));
             let slope = slow.select(secant, from.slope);
 
-            // What is left, and the error if it is taken on the image.
+            // The remaining step, and the error if it is taken on the image.
             let last = within_exposure(simd, remaining - next_off / slope) - remaining;
             let moved_x = next.x_px - x_px;
             let moved_y = next.y_px - y_px;

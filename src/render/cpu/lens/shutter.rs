@@ -19,7 +19,7 @@ pub(in crate::cpu) struct SimdShutter {
     translation_m: [f32; 3],
     axis: [f32; 3],
     rotation_rad: f32,
-    /// Whether the camera rotates by more than f32 can tell.
+    /// Whether the camera rotates by more than the rounding error of f32.
     rotates: bool,
 }
 
@@ -53,7 +53,7 @@ impl SimdShutter {
         remaining.max(f32x16::splat(simd, 0.0)).min(f32x16::splat(simd, 1.0))
     }
 
-    /// The same without the limits of the exposure.
+    /// The remaining fraction without the limits of the exposure.
     #[inline(always)]
     pub(super) fn unclamped_remaining_at<S: Simd>(
         &self,
@@ -76,7 +76,7 @@ impl SimdShutter {
         self.rotation_rad
     }
 
-    /// How a point moves in the camera's frame, in metres per unit of the remaining fraction. `then_m` is its
+    /// The motion of a point in the camera's frame, in metres per unit of the remaining fraction. `then_m` is its
     /// place in that frame while `remaining` remains.
     ///
     /// The place is `R(r) (p + r t)` with the rotation R by `r ω` about the axis k, so that its derivative is
@@ -150,7 +150,7 @@ impl SimdShutter {
         self.rotated(simd, moved_m, remaining)
     }
 
-    /// By how many metres the camera-space z of points is larger while a fraction remains than at the end.
+    /// The difference of the camera-space z of points while a fraction remains and at the end, in metres.
     #[inline(always)]
     pub(in crate::cpu) fn z_change<S: Simd>(
         &self,
@@ -165,13 +165,13 @@ impl SimdShutter {
         translation_m.z + self.rotation_change(simd, at_end_m.plus(translation_m), remaining).z
     }
 
-    /// How far the camera's centre has yet to move, in metres, in its frame at the end of the exposure.
+    /// The remaining motion of the camera's centre, in metres, in its frame at the end of the exposure.
     #[inline(always)]
     pub(in crate::cpu) fn translation<S: Simd>(&self, simd: S, remaining: f32x16<S>) -> Vec3x16<S> {
         Vec3x16::splat(simd, self.translation_m).scale(remaining)
     }
 
-    /// The same in world axes.
+    /// The remaining motion of the camera's centre in world axes.
     #[inline(always)]
     pub(in crate::cpu) fn translation_world<S: Simd>(
         &self,
@@ -192,7 +192,7 @@ impl SimdShutter {
         self.rotated(simd, direction, f32x16::splat(simd, 0.0) - remaining)
     }
 
-    /// By how much rotation changes a vector, from the frame at the end to the frame while a fraction
+    /// The change of a vector by rotation, from the frame at the end to the frame while a fraction
     /// remains; with a negative fraction, the other way.
     ///
     /// Rodrigues' formula without the vector itself: `sin θ (k × v) + (1 - cos θ) k × (k × v)`, with

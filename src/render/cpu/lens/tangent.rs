@@ -10,9 +10,9 @@ use crate::cpu::math::angle_of;
 pub(super) struct Tangent {
     /// `tan(θ/2)` where the line begins.
     begin: f32,
-    /// The distance there.
+    /// The distance at the start of the line.
     radius: f32,
-    /// Its change per radian.
+    /// The change of the distance per radian.
     per_rad: f32,
 }
 
@@ -26,9 +26,9 @@ impl Tangent {
         Self { begin, radius: radius as f32, per_rad: per_rad as f32 }
     }
 
-    /// Distances at angles with `t = tan(θ/2)`, beyond the line's begin.
+    /// Distances at angles with `t = tan(θ/2)`, beyond the start of the line.
     ///
-    /// With u the tangent of half the angle from the begin, that half has the sine `u/√(1 + u²)` and the cosine
+    /// With u the tangent of half the angle from the start, that half has the sine `u/√(1 + u²)` and the cosine
     /// `1/√(1 + u²)`.
     #[inline(always)]
     pub(super) fn radius<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {
@@ -53,7 +53,7 @@ impl Tangent {
         t.simd_le(widest).select(widest - t, f32x16::splat(simd, -1.0))
     }
 
-    /// How far angles with `t = tan(θ/2)` are beyond the begin of the line, at least, in radians: below 0 before it.
+    /// Lower bound of the angle by which `t = tan(θ/2)` is beyond the start of the line, in radians: below 0 before it.
     /// `dt/dθ` is `(1 + t²)/2`.
     #[inline(always)]
     pub(super) fn past_begin_rad<S: Simd>(&self, simd: S, t: f32x16<S>) -> f32x16<S> {

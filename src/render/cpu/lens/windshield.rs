@@ -13,8 +13,8 @@ use wildcity_scene::geometry::camera::{Bivariate, Windshield, WindshieldReferenc
 /// which fades the refraction out at large angles. Directions outside, and derivatives, are valid where the
 /// refraction is complete.
 ///
-/// The polynomials here are by how much the angles change. A windshield changes a ray by 0.01, so what f32 rounds of
-/// that is a hundredth of what it rounds of a ray. Beside the camera this decides: from `z² = 1 - x² - y²` alone, z =
+/// The polynomials give the change of the angles. A windshield changes a ray by 0.01, so the f32 rounding error of the
+/// change is a hundredth of that of a ray. This matters at large angles: computed only from `z² = 1 - x² - y²`, z =
 /// 0.15 would be off by 1e-6, and the image of a lens of slopes by 0.01 px.
 #[derive(Clone, Debug)]
 pub(super) struct SimdWindshield {
@@ -47,10 +47,10 @@ pub(super) struct Refracted<S: Simd> {
 pub(super) struct RefractionDerivatives<S: Simd> {
     /// The unit direction inside.
     pub(super) inside: Vec3x16<S>,
-    /// How it changes with the x and the y of the unit direction outside.
+    /// Its derivatives by the x and the y of the unit direction outside.
     pub(super) by_x: Vec3x16<S>,
     pub(super) by_y: Vec3x16<S>,
-    /// How far, in the outside z, the refraction is complete; not below 0 where it is.
+    /// Margin of the outside z within which the refraction is complete; not below 0 where it is complete.
     pub(super) margin: f32x16<S>,
 }
 
@@ -157,8 +157,8 @@ impl SimdWindshield {
     }
 }
 
-/// Unit directions with other angles φ = asin x and θ = asin y, by their cosines and by how much they change. z
-/// follows from the unit length.
+/// Unit directions whose angles φ = asin x and θ = asin y are changed, by their cosines and the changes. z follows from
+/// the unit length.
 #[inline(always)]
 fn turned<S: Simd>(
     simd: S,
@@ -173,7 +173,7 @@ fn turned<S: Simd>(
     Vec3x16 { x: unit.x + x, y: unit.y + y, z }
 }
 
-/// By how much a sine changes with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`. Taylor's
+/// The change of a sine with its angle: `sin(φ + δ) - sin φ` is `cos φ sin δ - sin φ (1 - cos δ)`. Taylor's
 /// terms up to the 8th power of δ leave 3e-10 of `1 - cos δ` up to [`SimdWindshield::MAX_RAD`].
 #[inline(always)]
 fn sine_change<S: Simd>(simd: S, [sine, cosine]: [f32x16<S>; 2], by_rad: f32x16<S>) -> f32x16<S> {

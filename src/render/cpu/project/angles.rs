@@ -15,9 +15,9 @@ pub(super) struct CenterAngles<S: Simd> {
     least: f32x16<S>,
     /// Largest angle between a centre and one of its points.
     spread: f32x16<S>,
-    /// By how much the shutter changes that angle, if both are exposed at different moments.
+    /// Change of this angle by the shutter, if both are exposed at different moments.
     motion: f32x16<S>,
-    /// How far splats reach from the images of their centres, in pixels per radian of their points' spread.
+    /// Reach of splats from the images of their centres, in pixels per radian of their points' spread.
     reach_px_per_rad: f32x16<S>,
     /// Not close to the camera, where these bounds do not hold.
     far: mask32x16<S>,
@@ -83,7 +83,7 @@ impl<S: Simd> CenterAngles<S> {
         }
     }
 
-    /// Which Gaussians certainly miss the image: the test of [`CullBound`].
+    /// The Gaussians that certainly miss the image: the test of [`CullBound`].
     #[inline(always)]
     pub(super) fn surely_unseen(&self, simd: S, bound: &CullBound) -> mask32x16<S> {
         let splat = |value: f64| f32x16::splat(simd, value as f32);
@@ -93,8 +93,9 @@ impl<S: Simd> CenterAngles<S> {
         self.far & (self.continued & out | self.least.simd_gt(splat(bound.max_center_rad)))
     }
 
-    /// Which Gaussians miss the image, given the images of their centres: none of their points lands farther from there
-    /// than the most pixels per radian allow. A windshield changes the angle between two rays by less than half of it.
+    /// The Gaussians that miss the image, given the images of their centres: the largest number of pixels per radian
+    /// bounds the distance of their points' images from there. A windshield changes the angle between two rays by less
+    /// than half of it.
     #[inline(always)]
     pub(super) fn beside(
         &self,
@@ -111,7 +112,7 @@ impl<S: Simd> CenterAngles<S> {
         self.far & self.continued & off_x.max(off_y).simd_gt(reach_px)
     }
 
-    /// How far splats reach from the images of their centres, in pixels, if their points spread by some angles.
+    /// Reach of splats from the images of their centres, in pixels, if their points spread by some angles.
     #[inline(always)]
     fn reach_px(&self, simd: S, spread_rad: f32x16<S>, bound: &CullBound) -> f32x16<S> {
         spread_rad.mul_add(self.reach_px_per_rad, f32x16::splat(simd, bound.blur_px as f32))

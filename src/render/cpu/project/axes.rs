@@ -1,4 +1,4 @@
-//! The axes of Gaussians, and coordinates of their centres in f64: what both projections begin with.
+//! The axes of Gaussians, and coordinates of their centres in f64: the first step of both projections.
 
 use fearless_simd::{f32x16, f64x8, prelude::*};
 
@@ -26,7 +26,7 @@ pub(super) fn transform_row<S: Simd>(simd: S, points: Vec3x16<S>, row: [f64; 4])
 
 /// Columns of the rotation matrices of a block's unit quaternions: each Gaussian's own axes, in the world.
 ///
-/// Of a unit quaternion (w, x, y, z) the matrix is
+/// The matrix of a unit quaternion (w, x, y, z) is
 ///
 /// ```text
 /// 1 - 2(yy + zz)   2(xy - wz)       2(xz + wy)

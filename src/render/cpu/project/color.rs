@@ -61,8 +61,8 @@ pub(super) fn color<S: Simd>(
 }
 
 impl<S: Simd> Vec3x16<S> {
-    /// Adds `basis` times SH coefficient `k`. A function and not a closure, which would not be inlined, and so would be
-    /// compiled without the instruction set.
+    /// Adds `basis` times SH coefficient `k`. It is not a closure, because a closure would not be inlined, and so would
+    /// be compiled without the instruction set.
     #[inline(always)]
     fn plus_term(self, simd: S, columns: &[Lanes], k: usize, basis: f32x16<S>) -> Self {
         Self::load(simd, columns, column::SH + 3 * k).mul_add(basis, self)

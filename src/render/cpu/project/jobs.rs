@@ -1,4 +1,4 @@
-//! What stage project computes: a job for each part of a chunk that a view may see.
+//! The work of stage project: a job for each part of a chunk that a view may see.
 
 use std::ops::Range;
 
@@ -17,19 +17,20 @@ use wildcity_scene::chunk::Cluster;
 /// Clusters of a unit: 4,096 Gaussians take about 100 µs, long enough to outweigh scheduling them.
 const UNIT_CLUSTERS: usize = 16;
 
-/// What one thread computes at a time: becomes one [`Unit`](super::Unit).
+/// The work of one thread at a time, whose output is one [`Unit`](super::Unit).
 pub(in crate::cpu) struct Job<'a> {
     pub(super) view: usize,
     pub(super) chunk: &'a Chunk,
     pub(super) clusters: Range<usize>,
     pub(super) projection: ChunkProjection<'a>,
     pub(super) light: Light<'a>,
-    /// As of [`Unit`](super::Unit).
+    /// As in [`Unit`](super::Unit).
     pub(super) instance: u16,
 }
 
 impl Job<'_> {
-    /// Which Gaussians it projects: the address of their chunk, and the first cluster. Only the schedule depends on it.
+    /// The Gaussians that it projects: the address of their chunk, and the first cluster. Only the schedule depends on
+    /// it.
     pub(super) fn gaussians(&self) -> (usize, usize) {
         (std::ptr::from_ref(self.chunk).addr(), self.clusters.start)
     }
@@ -45,7 +46,7 @@ impl Job<'_> {
     }
 }
 
-/// What the jobs of one chunk in one view share.
+/// The data that the jobs of one chunk in one view share.
 #[derive(Clone, Copy)]
 struct JobOwner<'a> {
     view: usize,
@@ -72,7 +73,7 @@ struct NonPinholeView<'a> {
 
 /// Runs `work` with the jobs of a frame: one for each unit that a view may see, in order of (view, global id).
 pub(in crate::cpu) fn with_jobs<R>(frame: &Frame<'_>, work: impl FnOnce(&[Job<'_>]) -> R) -> R {
-    // What is the same for all chunks of a view or of an actor.
+    // Compute the data that is the same for all chunks of a view or of an actor.
     let non_pinhole: Vec<Option<NonPinholeView<'_>>> =
         frame.views.iter().map(|view| NonPinholeView::new(view, frame)).collect();
     let actor_views = ActorViews::new(frame);
@@ -94,7 +95,7 @@ impl<'a> NonPinholeView<'a> {
         Some(Self { unscented, lens: LensProjection::new(view) })
     }
 
-    /// The same camera elsewhere, or in other motion.
+    /// This camera at another pose or in another motion.
     fn moved<'b>(&self, view: &'b View) -> NonPinholeView<'b> {
         let lens = self.lens.as_ref().and_then(|lens| lens.moved(view));
         NonPinholeView { unscented: self.unscented.moved(view), lens }
@@ -153,8 +154,8 @@ impl<'a> ChunkProjection<'a> {
     }
 }
 
-/// The views from actors' axes that are no static pinholes. What depends on the lens is taken from `own`, the frame's
-/// own views.
+/// The views from actors' axes that are not static pinholes. Data that depends on the lens is taken from `own`, the
+/// frame's own views.
 fn non_pinhole_from_actors<'a>(
     frame: &Frame<'_>,
     actor_views: &'a ActorViews,

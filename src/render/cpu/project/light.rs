@@ -1,5 +1,5 @@
-//! What changes the colours of splats besides the direction from which they are seen: an actor's tint, and the
-//! contact shadows of actors on the twin.
+//! Changes of the colours of splats that do not depend on the viewing direction: an actor's tint, and the contact
+//! shadows of actors on the twin.
 
 use fearless_simd::{f32x16, prelude::*};
 
@@ -9,7 +9,7 @@ use crate::layout::ChunkShadow;
 use wildcity_scene::actor::ContactShadow;
 use wildcity_scene::chunk::{Cluster, Lanes, column};
 
-/// What lights the Gaussians of one chunk.
+/// The light on the Gaussians of one chunk.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Light<'a> {
     /// The colours are those of the Gaussians.
@@ -21,7 +21,7 @@ pub(super) enum Light<'a> {
 }
 
 impl Light<'_> {
-    /// What of it reaches a cluster.
+    /// The part of the light that reaches a cluster.
     #[inline(always)]
     pub(super) fn on(self, cluster: &Cluster) -> Self {
         match self {

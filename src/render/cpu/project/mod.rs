@@ -4,7 +4,7 @@
 //! static pinhole camera has its projection linearised at each centre ([`pinhole`]). Every other camera (lens
 //! distortion, windshield, rolling shutter while it moves) has six points of each Gaussian projected
 //! ([`unscented`]). Both produce the same kind of splat ([`splat_block`]). A static pinhole keeps its own
-//! path, to the byte: without other cameras in a frame nothing of the second path runs.
+//! path, to the byte: without other cameras in a frame the second path does not run.
 //!
 //! # Layout
 //!
@@ -43,8 +43,8 @@ use wildcity_scene::chunk::{CLUSTER, LANES, Lanes};
 
 pub(super) use self::jobs::{Job, with_jobs};
 
-/// How many blocks ahead memory is read. The loads of the block itself would come too late: the processor cannot see
-/// past the computations of one block to the loads of the next.
+/// Number of blocks by which memory is read ahead. The loads of the block itself would come too late: the processor
+/// does not reach the loads of the next block before the computations of the current one.
 const AHEAD: usize = 2;
 
 /// Splats of a page.
@@ -74,15 +74,15 @@ pub(super) struct Unit {
     pub(super) len: usize,
     /// Index of its first page.
     first_page: usize,
-    /// Whose splats they are, as in [`Target::instances`](crate::Target::instances).
+    /// The owner of the splats, as in [`Target::instances`](crate::Target::instances).
     pub(super) instance: u16,
 }
 
 impl Projected {
-    /// Projects the Gaussians of all jobs, or those splats of them that are in a slab.
+    /// Projects the Gaussians of all jobs, or only the splats that are in a slab.
     ///
     /// # Errors
-    /// [`Overflow`]: there are more than `most_places` places for splats. Nothing is projected then.
+    /// [`Overflow`]: there are more than `most_places` places for splats. Then nothing is projected.
     pub(super) fn project(
         &mut self,
         level: Level,
@@ -166,7 +166,7 @@ impl Projected {
         })
     }
 
-    /// Whose splat is at a place, as in [`Target::instances`](crate::Target::instances).
+    /// The owner of the splat at a place, as in [`Target::instances`](crate::Target::instances).
     pub(super) fn instance(&self, place: u32) -> u16 {
         let page = (place >> PAGE_BITS) as usize;
         let after = self.units.partition_point(|unit| unit.first_page <= page);

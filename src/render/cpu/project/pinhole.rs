@@ -28,7 +28,7 @@ pub(super) fn project_block<S: Simd>(
 ) -> Option<SplatBlock> {
     let splat = |value: f32| f32x16::splat(simd, value);
 
-    // Depth first, since it culls most. A NaN fails every comparison, and so is culled.
+    // Test the depth first, since it culls most. A NaN fails every comparison, and so is culled.
     let mean = Vec3x16::load(simd, columns, column::MEAN);
     let z = depth(simd, view, mean);
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
@@ -94,8 +94,8 @@ fn camera_coordinate<S: Simd>(
 /// A row of `J W R`, in px/m: how a pixel coordinate moves as the centre moves along each of its own axes.
 ///
 /// For the pixel coordinate `f x/z + c` the row of `J` is `(f/z)(1, 0, -x/z)`. Times `W` this is
-/// `(f/z)(W_x - (x/z) W_z)` with the rows of `W`; and times `R` its dot products with the own axes. Beside the
-/// image the slope x/z is clamped, since the linearisation is wrong there and would give splats of unbounded
+/// `(f/z)(W_x - (x/z) W_z)` with the rows of `W`; and times `R` its dot products with the own axes. Outside of
+/// the image the slope x/z is clamped, since the linearisation is wrong there and would give splats of unbounded
 /// size (see [`SLOPE_SLACK`](crate::constants::SLOPE_SLACK)).
 #[inline(always)]
 fn jacobian_row<S: Simd>(

@@ -1,4 +1,4 @@
-//! Sixteen splats: their screen ellipses, which of them the image shows, and their storage.
+//! Sixteen splats: their screen ellipses, their visibility on the image, and their storage.
 //!
 //! **A splat stores a Cholesky factor of its inverse covariance, not the inverse itself (a "conic").** The
 //! rasterizer's exponent is then `log2(opacity) - (l0 dx + l1 dy)² - (l2 dy)²`, a sum of squares, which stays
@@ -15,7 +15,7 @@ use crate::cpu::math::log2;
 use crate::layout::{Cutoffs, PixelFilter, Splat};
 use wildcity_scene::chunk::LANES;
 
-/// `√(log2(e)/2)`: what turns standard deviations into the unit of [`Splat::factor`], as
+/// `√(log2(e)/2)`: converts standard deviations to the unit of [`Splat::factor`], because
 /// `exp(-q/2) = 2^(-q log2(e)/2)`.
 pub(super) const LOG2_UNIT: f32 = 0.849_321_8;
 
@@ -30,7 +30,7 @@ pub(super) struct Ellipse<S: Simd> {
     sigma_y: f32x16<S>,
     /// Determinant before the blur as a share of the one after the blur of native pixels.
     blur_share: f32x16<S>,
-    /// Of an image below its native size: determinant after the blur of native pixels as a share of the one
+    /// For an image below its native size: determinant after the blur of native pixels as a share of the one
     /// after the whole filter.
     shrink_share: Option<f32x16<S>>,
 }
@@ -139,7 +139,7 @@ pub(super) struct ProjectedBlock<S: Simd> {
     /// Base-2 logarithm of the peak opacity, as stored.
     pub(super) log2_opacity: f32x16<S>,
     pub(super) ellipse: Ellipse<S>,
-    /// Which Gaussians can be seen at all.
+    /// The Gaussians that can be visible.
     pub(super) in_range: mask32x16<S>,
 }
 
@@ -189,7 +189,7 @@ impl<S: Simd> ProjectedBlock<S> {
     }
 }
 
-/// Which splats reach a pixel's centre of an image of this size along one axis: these lie at 0.5 to size - 0.5.
+/// The splats that reach a pixel's centre of an image of this size along one axis: these lie at 0.5 to size - 0.5.
 #[inline(always)]
 fn on_image<S: Simd>(simd: S, mean: f32x16<S>, extent: f32x16<S>, size_px: f32) -> mask32x16<S> {
     let first = f32x16::splat(simd, 0.5);

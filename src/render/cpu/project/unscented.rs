@@ -39,7 +39,7 @@ pub(super) struct UnscentedChunkView<'a> {
     /// The camera's centre relative to the chunk's origin, in world axes, in metres.
     camera_m: [f32; 3],
     size_px: [f32; 2],
-    /// What is added to screen covariances.
+    /// The variances that are added to screen covariances.
     filter: PixelFilter,
     /// Whether depth is the distance from the camera, and not z.
     depth_is_distance: bool,
@@ -79,8 +79,8 @@ impl<'a> UnscentedChunkView<'a> {
         self.unscented.may_see(origin_m, min_m, max_m, sigma_m)
     }
 
-    /// A depth, and how far the depths of all centres in a ball can be from it while the camera moves, in metres. The
-    /// ball is relative to the chunk's origin.
+    /// A depth, and the largest difference of the depths of all centres in a ball from it while the camera moves, in
+    /// metres. The ball is relative to the chunk's origin.
     pub(super) fn depth_m(&self, center_m: DVec3, radius_m: f64) -> [f64; 2] {
         let CullBound { translation_m, rotation_rad, .. } = *self.unscented.cull_bound();
         let at_end_m = self
@@ -105,13 +105,13 @@ pub(super) fn project_block<S: Simd>(
     view: &UnscentedChunkView<'_>,
     cutoffs: &Cutoffs,
 ) -> Option<SplatBlock> {
-    // What the lens describes, 16 at a time.
+    // Project the Gaussians that the lens describes, 16 at a time.
     let mut toward_m = [[0.0_f32; LANES]; 3];
     let (mut splats, remaining) = match view.lens {
         Some(lens) => project_lanes(simd, columns, view, lens, cutoffs, &mut toward_m),
         None => (SplatBlock::default(), (1 << LANES) - 1),
     };
-    // The rest, one by one in f64.
+    // Project the rest one by one in f64.
     for lane in (0..LANES).filter(|lane| remaining >> lane & 1 == 1) {
         if let Some(from_camera_m) = project_one(columns, lane, view, cutoffs, &mut splats) {
             splats.visible |= 1 << lane;
@@ -151,7 +151,7 @@ fn project_lanes<S: Simd>(
     let center = Vec3x16 { x: x.0.narrow(x.1), y: y.0.narrow(y.1), z: z.0.narrow(z.1) };
     let at_end_m = [x, y, z];
 
-    // Cull what is too faint, and what surely misses the image, before the lens is applied.
+    // Before the lens is applied, cull Gaussians that are too faint or certainly miss the image.
     let log2_opacity = f32x16::load_array_ref(simd, &columns[column::LOG2_OPACITY].0);
     let scale = Vec3x16::load(simd, columns, column::SCALE);
     let bound = view.unscented.cull_bound();
@@ -184,7 +184,8 @@ fn project_lanes<S: Simd>(
         None => splat(0.0).simd_ge(splat(0.0)),
         Some(_) => found,
     };
-    // Too far outside of the lens' field, or so far beside the image that no point of it lands there.
+    // Cull Gaussians too far outside of the lens' field, or so far outside of the image that none of their points
+    // reaches it.
     let least_z = splat(bound.max_center_cos as f32) * distance_m;
     let too_far = then_m.z.simd_lt(least_z) | angles.beside(simd, center_px, view.size_px, bound);
     let in_range = in_range & (in_depth | !is_depth) & !(found & too_far);
@@ -231,7 +232,7 @@ struct CenteredBlock<S: Simd> {
     exposed: ExposedPixels<S>,
     depth_m: f32x16<S>,
     log2_opacity: f32x16<S>,
-    /// Which may be seen.
+    /// The Gaussians that may be visible.
     in_range: mask32x16<S>,
 }
 
@@ -273,7 +274,7 @@ fn expand<S: Simd>(
     (projected.clip(simd, view.size_px, cutoffs), in_range & !close)
 }
 
-/// Where the expansion differs from six points by less than the bound.
+/// The lanes in which the expansion differs from six points by less than the bound.
 #[inline(always)]
 fn is_close<S: Simd>(simd: S, remainder: &Remainder<S>, bound: &ExpansionBound) -> mask32x16<S> {
     let splat = |value: f64| f32x16::splat(simd, value as f32);
@@ -399,7 +400,7 @@ fn depth<S: Simd>(
     }
     let low = x.0.mul_add(x.0, y.0.mul_add(y.0, z.0 * z.0));
     let high = x.1.mul_add(x.1, y.1.mul_add(y.1, z.1 * z.1));
-    // A step of Newton's method from the f32 distance: its error, squared, is beyond what f32 tells.
+    // A step of Newton's method from the f32 distance: its error, squared, is below the resolution of f32.
     let (near_low, near_high) = distance_m.widen();
     let off = (low - near_low * near_low).narrow(high - near_high * near_high);
     off.mul_add(f32x16::splat(simd, 0.5) / distance_m, distance_m)

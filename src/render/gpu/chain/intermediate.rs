@@ -38,7 +38,7 @@ impl Chain {
     }
 
     /// Runs the stages up to and including `last`, from the beginning or after those whose outputs are
-    /// `done`, and reads what they write.
+    /// `done`, and reads their outputs.
     ///
     /// # Errors
     /// The device fails, or the frame needs more than the device can hold at once.
@@ -139,8 +139,8 @@ impl Chain {
         counts(outputs)
     }
 
-    /// Reads the outputs of the stages up to `last`. `sorted` tells which of the buffers of the sort of
-    /// splats are in order.
+    /// Reads the outputs of the stages up to `last`. `sorted` is the index of the buffers of the sort of
+    /// splats that are in order.
     fn read(
         &self,
         sorted: usize,

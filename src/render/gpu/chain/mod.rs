@@ -56,7 +56,7 @@ pub(super) struct Chain {
     /// Resolved timestamps, before they are copied to the host.
     timestamps: GrowableBuffer,
     read_backs: ReadBackPool,
-    /// The largest needs of any region so far.
+    /// The largest needs of any region until now.
     high_water: Capacity,
     partitions: PartitionCache,
     /// Number of attempts that drew nothing because buffers were too small.
@@ -94,7 +94,7 @@ impl Source<'_> {
     }
 }
 
-/// What is drawn.
+/// The input of a draw.
 #[derive(Clone, Copy, Debug)]
 struct DrawInput<'a> {
     frame: &'a Frame<'a>,
@@ -234,7 +234,7 @@ impl Chain {
         self.project.upload(&self.device, &work);
         add_time(&mut current.stats, "prepare", start.elapsed());
 
-        // What the device counts.
+        // Draw the region. The device counts its needs.
         let tiles = current.parameters.restrict(rows, region);
         let needs = self.draw_region(Source::Gaussians(&work), tiles, current)?;
         let count = needs.min_regions(self.limit());
@@ -246,7 +246,7 @@ impl Chain {
         Ok(RegionOutcome::Split(regions))
     }
 
-    /// Uploads what the whole frame shares, and makes room for its pixels.
+    /// Uploads the data that the whole frame shares, and makes room for its pixels.
     fn begin(
         &mut self,
         frame: &Frame<'_>,
@@ -275,7 +275,7 @@ impl Chain {
     }
 
     /// Draws some tiles. If the buffers are too small, the device draws nothing, and the host tries again with
-    /// larger ones. Returns what the region needs. If that exceeds the limit, the pixels are not valid.
+    /// larger ones. Returns the needs of the region. If that exceeds the limit, the pixels are not valid.
     fn draw_region(
         &mut self,
         source: Source<'_>,
@@ -317,7 +317,7 @@ impl Chain {
         }
     }
 
-    /// What a region needed, and whether the buffers could hold it. If they could not, the next call of
+    /// The needs of a region, and whether the buffers could hold it. If they could not, the next call of
     /// [`Chain::reserve`] enlarges them, unless the device has no such buffers.
     fn evaluate(&mut self, counters: &Counters, parameters: &GpuFrame) -> (Capacity, bool) {
         let needs = Capacity {
@@ -338,7 +338,7 @@ impl Chain {
         (needs, fits)
     }
 
-    /// Makes room for the largest needs so far, and writes the capacities to the frame's parameters.
+    /// Makes room for the largest needs until now, and writes the capacities to the frame's parameters.
     fn reserve(&mut self, parameters: &mut GpuFrame, cluster_views: u32) {
         let Capacity { splats, touches, instances } = self.high_water;
         let device = &self.device;
@@ -354,7 +354,7 @@ impl Chain {
         self.timestamps.reserve(device, TIMESTAMP_BYTES);
     }
 
-    /// The most that the device can hold at once.
+    /// Largest needs that the device can hold at once.
     fn limit(&self) -> Capacity {
         let listed = Bin::limit(&self.device);
         Capacity { splats: SplatBuffers::limit(&self.device), touches: listed, instances: listed }

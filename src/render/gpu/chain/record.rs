@@ -29,7 +29,7 @@ impl Chain {
         self.record(&mut recorder, source, &current.parameters, Stage::Bin);
         let Self { device, plan, project, splats, bin, lenses, timestamps, .. } = self;
 
-        // Whose splats they are. Only instance ids read it.
+        // The owners of the splats. Only instance ids read them.
         let mut resumed = Vec::new();
         let owners = match source {
             Source::Gaussians(work) => work.owners(),
@@ -51,7 +51,7 @@ impl Chain {
         self.rasterize.run(device, &mut pass, inputs, output);
         drop(pass);
 
-        // Everything that the host reads.
+        // Copy all values that the host reads.
         let read_back = &current.read_back;
         let timestamps = timestamps.buffer();
         let head = read_back.head.buffer();

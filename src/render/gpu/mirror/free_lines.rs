@@ -14,7 +14,7 @@ impl FreeLines {
         free
     }
 
-    /// Allocates the first free range of consecutive lines; `None` if there is none of that length.
+    /// Allocates the first free range of consecutive lines; `None` if no range has that length.
     pub(super) fn allocate(&mut self, lines: u32) -> Option<Range<u32>> {
         let index = self.0.iter().position(|range| range.end - range.start >= lines)?;
         let range = &mut self.0[index];

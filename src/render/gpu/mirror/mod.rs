@@ -56,15 +56,15 @@ struct Page {
 #[derive(Debug)]
 struct Resident {
     chunk: Weak<Chunk>,
-    /// Of each cluster, in order.
-    places: Vec<Place>,
+    /// The location of each cluster, in order.
+    places: Vec<ClusterLocation>,
     /// The frame that drew the chunk last.
     last_frame: u64,
 }
 
-/// Where a cluster lies.
+/// The location of a cluster in the mirror.
 #[derive(Clone, Debug)]
-pub(super) struct Place {
+pub(super) struct ClusterLocation {
     /// Index of the page.
     pub(super) page: usize,
     /// Lines of the page.
@@ -86,7 +86,7 @@ impl Mirror {
     /// Uploads the chunks of a scene that are not resident yet. Drops those that main memory has dropped.
     ///
     /// # Errors
-    /// [`RenderError::DeviceMemory`] if the scene alone exceeds the limit.
+    /// [`RenderError::DeviceMemory`] if the scene by itself exceeds the limit.
     pub(super) fn make_resident(
         &mut self,
         device: &Device,
@@ -109,7 +109,7 @@ impl Mirror {
     }
 
     /// Where a chunk's clusters lie, in order. Empty if the chunk is not resident.
-    pub(super) fn places(&self, chunk: &Arc<Chunk>) -> &[Place] {
+    pub(super) fn places(&self, chunk: &Arc<Chunk>) -> &[ClusterLocation] {
         self.resident.get(&address(chunk)).map_or(&[], |resident| &resident.places)
     }
 
@@ -162,10 +162,15 @@ impl Mirror {
 
     /// Allocates consecutive lines: of an existing page, of a new page, or after evicting chunks that this
     /// frame does not draw. `needed` is the number of lines that the frame still has to allocate.
-    fn allocate(&mut self, device: &Device, lines: u32, needed: u64) -> Result<Place, Full> {
+    fn allocate(
+        &mut self,
+        device: &Device,
+        lines: u32,
+        needed: u64,
+    ) -> Result<ClusterLocation, Full> {
         loop {
             let found = self.pages.iter_mut().enumerate().find_map(|(index, page)| {
-                Some(Place { page: index, lines: page.as_mut()?.free.allocate(lines)? })
+                Some(ClusterLocation { page: index, lines: page.as_mut()?.free.allocate(lines)? })
             });
             match found {
                 Some(place) => return Ok(place),
@@ -231,7 +236,7 @@ impl Mirror {
         }
     }
 
-    fn free(&mut self, places: &[Place]) {
+    fn free(&mut self, places: &[ClusterLocation]) {
         for place in places {
             if let Some(Some(page)) = self.pages.get_mut(place.page) {
                 page.free.free(place.lines.clone());
@@ -241,7 +246,7 @@ impl Mirror {
 
     /// Encodes a chunk's clusters in parallel, and uploads them. Clusters on consecutive lines are uploaded
     /// together, up to [`UPLOAD_LINES`].
-    fn upload(&self, device: &Device, chunk: &Chunk, places: &[Place]) {
+    fn upload(&self, device: &Device, chunk: &Chunk, places: &[ClusterLocation]) {
         let mut next_cluster = 0;
         for run in places.chunk_by(|a, b| a.page == b.page && a.lines.end == b.lines.start) {
             let Some(buffer) = self.page(run[0].page) else { continue };

@@ -123,9 +123,9 @@ impl FieldCone {
     /// Number of cones in [`FieldCone::scales`].
     pub const SCALES: usize = 5;
 
-    /// How much wider than the image these cones are, in radians, except for the last. Most Gaussians that are culled lie
-    /// little beside the image, where a pinhole of 100° has 3 times the scale that it has on its axis; at the end of its
-    /// continuation it has 17 times that scale.
+    /// Angles by which these cones are wider than the image, in radians, except for the last. Most Gaussians that are
+    /// culled lie just outside of the image, where a pinhole of 100° has 3 times the scale that it has on its axis; at
+    /// the end of its continuation it has 17 times that scale.
     const WIDER_RAD: [f64; Self::SCALES - 1] = [0.05, 0.15, 0.35, 0.7];
 
     /// Bounds of a camera from a thousand samples of its projection, with a margin of a fifth for what lies

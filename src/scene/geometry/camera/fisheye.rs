@@ -44,7 +44,7 @@ impl Fisheye {
         &self.radius
     }
 
-    /// Where the field ends, in radians off the axis.
+    /// End of the field, in radians off the axis.
     pub fn limit_rad(&self) -> f64 {
         self.radius.end()
     }

@@ -75,7 +75,7 @@ impl FTheta {
         self.max_angle_rad
     }
 
-    /// Where the field ends, in radians off the axis: at most [`FTheta::max_angle_rad`].
+    /// End of the field, in radians off the axis: at most [`FTheta::max_angle_rad`].
     pub fn limit_rad(&self) -> f64 {
         match self.reference {
             FThetaReference::AngleToPixel => self.rising.end(),

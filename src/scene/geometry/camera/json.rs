@@ -27,7 +27,7 @@ pub struct Intrinsics {
     pub center_px: [f64; 2],
     /// The lens; `None` for a pinhole.
     pub lens: Option<LensFields>,
-    /// The windshield before the lens.
+    /// The windshield in front of the lens.
     pub windshield: Option<WindshieldFields>,
     /// Width and height in native pixels; `None` for an image of native size.
     pub native_size_px: Option<[f64; 2]>,

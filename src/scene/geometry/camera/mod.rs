@@ -77,7 +77,7 @@ pub struct Camera {
     pub pinhole: Pinhole,
     /// The lens model.
     pub lens: Lens,
-    /// The windshield before the lens.
+    /// The windshield in front of the lens.
     pub windshield: Option<Windshield>,
     /// The image's width and height in pixels of the native image, that is, at the size at which the camera
     /// takes images and twins are trained; `None` if that is its own size. An image below its native size is
@@ -119,7 +119,7 @@ pub enum CameraError {
         field: &'static str,
         /// The refused value.
         value: f64,
-        /// What must hold instead.
+        /// The values that are accepted.
         must: &'static str,
     },
     /// A focal length is missing.
@@ -266,9 +266,9 @@ impl Camera {
     /// linearly in the angle: 4, 76° off the axis, or the slope of the farthest corner of the image if that is
     /// larger, at most 8.
     ///
-    /// The slope's derivative by the angle is `1 + slope²`. With a limit of 8, geometry beside the camera, such
-    /// as the road below it, was torn into splats of some hundred pixels that reached into the image. With 4
-    /// none did.
+    /// The slope's derivative by the angle is `1 + slope²`. With a limit of 8, geometry far off the axis, such
+    /// as the road below the camera, was torn into splats of some hundred pixels that reached into the image.
+    /// With 4 none did.
     #[inline(always)]
     pub fn extrapolation_slope(&self) -> f64 {
         let Pinhole { fx, fy, cx, cy } = self.pinhole;
@@ -331,7 +331,7 @@ impl Camera {
         (self.size_px() / native_px).min(DVec2::ONE)
     }
 
-    /// The camera with the same field of view and an image of another size, in pixels. The native size stays
+    /// The camera with the same field of view and a different image size, in pixels. The native size stays
     /// what it was.
     ///
     /// # Errors

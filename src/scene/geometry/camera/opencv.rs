@@ -123,7 +123,7 @@ impl OpenCv {
     /// The unit direction that projects to `plane`, or `None` beyond the limit.
     pub(super) fn direction(&self, plane: DVec2) -> Option<DVec3> {
         let most = self.limit_slope;
-        // Damped Newton's method. It starts at the inverse of the radial part alone, and halves each step
+        // Damped Newton's method. It starts at the inverse of only the radial part, and halves each step
         // until it reduces the residual.
         let mut slope = plane.normalize_or_zero() * self.radial_slope(plane.length());
         let mut off = self.distort(slope) - plane;

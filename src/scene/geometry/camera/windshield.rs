@@ -1,4 +1,4 @@
-//! A windshield before the lens: it refracts rays by two bivariate polynomials of their angles.
+//! A windshield in front of the lens: it refracts rays by two bivariate polynomials of their angles.
 
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -40,7 +40,7 @@ pub struct Bivariate {
 
 impl Windshield {
     /// The refraction fades out between these values of z of the unit direction: full above 0.15 (81° off the
-    /// axis), none below 0.05 (87°). Without a limit, the polynomials would refract rays beside the camera
+    /// axis), none below 0.05 (87°). Without a limit, the polynomials would refract rays far off the axis
     /// arbitrarily; with an abrupt one, a Gaussian across it would be torn.
     pub const FADES_Z: [f64; 2] = [0.05, 0.15];
 
@@ -210,7 +210,7 @@ impl Bivariate {
     /// A polynomial of order 0 to 5 from its 1, 3, 6, 10, 15 or 21 coefficients.
     ///
     /// # Errors
-    /// The number of coefficients is none of these.
+    /// The number of coefficients is not one of these.
     pub fn new(field: &'static str, coefficients: &[f64]) -> Result<Self, CameraError> {
         let count = coefficients.len();
         let whole = (0..=5).any(|order| (order + 1) * (order + 2) / 2 == count);

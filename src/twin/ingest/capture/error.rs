@@ -45,7 +45,7 @@ pub enum CaptureError {
         path: PathBuf,
         /// Where in it.
         place: Place,
-        /// What is wrong, and what to do.
+        /// The error, and what to do.
         reason: String,
     },
 }

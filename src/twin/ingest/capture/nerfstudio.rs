@@ -37,16 +37,16 @@ struct Frame {
     intrinsics: Intrinsics,
 }
 
-/// A frame with what is beside its camera.
+/// A frame: its camera and the other data of its image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameImage {
     /// Its image and camera.
     pub posed: PosedImage,
     /// File of its mask (`mask_path`), if it has one.
     pub mask: Option<String>,
-    /// When it was taken (`time_us`), in microseconds, if the file says so.
+    /// Time at which it was taken (`time_us`), in microseconds, if the file has it.
     pub time_us: Option<i64>,
-    /// Its exposure (`exposure_stops`) in stops against the scene's, if the file says so.
+    /// Its exposure (`exposure_stops`) in stops relative to the scene's, if the file has it.
     pub exposure_stops: Option<f64>,
 }
 
@@ -63,7 +63,7 @@ pub fn read(path: &Path) -> Result<Vec<PosedImage>, CaptureError> {
     Ok(read_frames(path)?.into_iter().map(|frame| frame.posed).collect())
 }
 
-/// The same with masks and times.
+/// The frames with masks and times.
 ///
 /// # Errors
 /// As [`read`].

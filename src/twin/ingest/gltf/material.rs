@@ -1,4 +1,4 @@
-//! What is read of a material, and the images of its textures.
+//! The properties of a material that are used, and the images of its textures.
 //!
 //! Source: glTF 2.0, sections 3.9.2 (metallic-roughness material) and 3.9.3 (additional textures), and the texts of
 //! KHR_materials_emissive_strength, KHR_materials_unlit and KHR_texture_transform. In linear light:
@@ -10,9 +10,10 @@
 //! alpha = base.a                                                  (1 with alphaMode OPAQUE)
 //! ```
 //!
-//! The base colour is a surface's in white light of strength 1 from all sides; what it emits is added to what it
-//! reflects. Textures are decoded from sRGB, and one that is absent is 1. `alpha` covers what is behind the surface, so
-//! that emitted light is as opaque as the surface. An emissive texture without a factor emits nothing, and is not read.
+//! The base colour is a surface's in white light of strength 1 from all sides; emitted light is added to
+//! reflected light. Textures are decoded from sRGB, and an absent texture is 1. `alpha` covers the objects behind the
+//! surface, so that emitted light is as opaque as the surface. An emissive texture without a factor emits nothing, and
+//! is not read.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -27,7 +28,7 @@ use super::uris::Uris;
 use super::{FORMAT, bad};
 use crate::ingest::IngestError;
 
-/// What is read of a material.
+/// The properties of a material that are used.
 pub(super) struct MaterialSource<'a> {
     base_factor: DVec4,
     base: Option<(gltf::Image<'a>, TextureArea)>,
@@ -51,7 +52,7 @@ pub(super) struct TextureArea {
 }
 
 impl<'a> MaterialSource<'a> {
-    /// What is read of a material.
+    /// Reads the properties of a material that are used.
     ///
     /// # Errors
     /// Says what cannot be read.

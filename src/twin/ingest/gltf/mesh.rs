@@ -26,7 +26,7 @@ use wildcity_scene::Gaussians;
 
 /// Bytes of a Gaussian of a mesh in memory.
 const GAUSSIAN_BYTES: u64 = 56;
-/// Small triangles, and rounding to whole cells, make up to so many Gaussians of each one that was asked for.
+/// Largest number of Gaussians per requested one, because of small triangles and rounding to whole cells.
 const MOST_PER_ASKED: u64 = 4;
 
 /// Covers all triangles of the scene.
@@ -130,7 +130,7 @@ struct PrimitiveReader<'a> {
     place: Place,
 }
 
-/// What a primitive has at each corner.
+/// The attributes of a primitive at each corner.
 struct Corners {
     positions_m: Vec<DVec3>,
     /// Vertex colours; none if all are white.
@@ -199,7 +199,7 @@ impl PrimitiveReader<'_> {
         Ok(())
     }
 
-    /// What the primitive has at its corners; none without positions.
+    /// The attributes of the primitive at its corners; none without positions.
     fn corners(&self) -> Option<Corners> {
         let reader = self.primitive.reader(|buffer| self.buffers.get(buffer.index()).copied());
         let uv = |area: Option<&TextureArea>| {

@@ -5,7 +5,7 @@
 //! and SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in
 //! earlier drafts it was its logarithm, which is detected by negative values: no standard deviation
 //! is negative. Kernel, colour space, projection, and sorting are ignored, as the extension allows;
-//! the render profile says how the trainer rendered.
+//! the render profile describes how the trainer rendered.
 //!
 //! The triangles of a scene without splats are covered with flat Gaussians (`mesh.rs`).
 

@@ -41,7 +41,7 @@ pub(super) struct Triangle {
     pub(super) material: Arc<Material>,
 }
 
-/// What all triangles of a primitive share.
+/// The properties that all triangles of a primitive share.
 pub(super) struct Material {
     pub(super) texture: Option<Texture>,
     pub(super) emission: Option<Emission>,
@@ -286,7 +286,7 @@ mod tests {
         let rail = triangle([[0.0; 3], [5.0, 0.0, 0.0], [5.0, 0.01, 0.0]]);
         let area_m2 = rail.area_m2();
         let parts = rail.halved(0.1);
-        // Of its two long edges one is halved first, and then both halves' edges in turn.
+        // One of its two long edges is halved first, and then the edges of both halves in turn.
         assert!((100..=1 << HALVINGS).contains(&parts.len()), "{}", parts.len());
         let sum_m2: f64 = parts.iter().map(Triangle::area_m2).sum();
         assert!((sum_m2 / area_m2 - 1.0).abs() < 1e-12);
@@ -312,7 +312,7 @@ mod tests {
         let mut parts = Gaussians::with_capacity(0, 0);
         whole.cover(3, &mut parts);
         assert_eq!(parts.len(), 0);
-        // Nothing is made of a line.
+        // A line gives no Gaussians.
         let line = triangle([[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]);
         assert_eq!(line.cuts(1e-3), 0);
         line.cover(1, &mut parts);

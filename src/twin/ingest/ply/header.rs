@@ -68,7 +68,7 @@ impl Header {
                     "the file or the limit of {limit} bytes ends before end_header"
                 )));
             }
-            // The first word says what the line declares.
+            // The first word is the kind of the declaration.
             let text = std::str::from_utf8(&line).map_err(|_| bad("is not text".into()))?.trim();
             let words: Vec<&str> = text.split_ascii_whitespace().collect();
             match words[..] {

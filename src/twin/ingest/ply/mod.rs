@@ -28,7 +28,7 @@ pub(super) fn read(
     if vertex.property("packed_position").is_ok() {
         return compressed::read(input, &header, file_bytes, progress);
     }
-    // Columns come before the size: a missing column changes the size, too, and its name says more.
+    // Check columns before the size: a missing column changes the size, too, and its name is the clearer error.
     let columns = Columns::find(vertex)?;
     header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;

@@ -38,7 +38,7 @@ impl SogFiles {
     /// Reads a description. Error messages contain `name`.
     ///
     /// # Errors
-    /// It is no JSON, or a key that names files has another type.
+    /// It is not JSON, or a key that names files has another type.
     pub fn of(json: &[u8], name: &str) -> Result<Self, IngestError> {
         let keys: Keys = serde_json::from_slice(json).map_err(|e| bad(name, e.to_string()))?;
         let Keys { filenames, environment, means, scales, quats, sh0, sh_n } = keys;

@@ -66,7 +66,7 @@ pub(super) struct Tables {
 
 pub(super) struct HigherTable {
     pub(super) values: [f32; 256],
-    /// Number of entries of the palette, if meta.json says it.
+    /// Number of entries of the palette, if meta.json has it.
     pub(super) entries: Option<u64>,
     pub(super) bands: Option<u8>,
 }

@@ -115,7 +115,7 @@ impl Catalog {
     }
 }
 
-/// What is wrong with an asset that cannot be read, without its path: clients of a server get this text.
+/// The error of an asset that cannot be read, without its path, because clients of a server get this text.
 pub(super) fn reason_of(error: StoreError) -> String {
     match error {
         StoreError::Io { action, cause, .. } => format!("cannot {action} it: {cause}"),

@@ -1,4 +1,4 @@
-//! Assets of actors: objects beside the twins, in `<twins>/.actors`, that every twin shares.
+//! Assets of actors: objects in `<twins>/.actors`, next to the twins, that every twin shares.
 //!
 //! An asset is one immutable object, named by its BLAKE3, which is its identity:
 //!
@@ -9,7 +9,7 @@
 //! ```
 //!
 //! There is no log: an asset never changes, and the same input gives the same object. Garbage collection of twins does
-//! not touch assets; [`Catalog::remove_actor`] removes one. An asset that is damaged does not concern the others.
+//! not touch assets; [`Catalog::remove_actor`] removes one. A damaged asset does not affect the others.
 
 mod list;
 mod object;
@@ -36,7 +36,7 @@ pub struct StoredActor {
     pub hash: String,
     /// Size of the object, in bytes.
     pub bytes: u64,
-    /// What it is.
+    /// Its description.
     pub description: AssetDescription,
     /// Spherical-harmonic degree of its colours.
     pub sh_degree: u8,
@@ -49,7 +49,7 @@ pub struct StoredActor {
 /// The assets of a catalog.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ActorList {
-    /// Those that can be read, in order of name and hash.
+    /// The assets that can be read, in order of name and hash.
     pub actors: Vec<StoredActor>,
     /// The others, in order of hash.
     pub damaged: Vec<DamagedActor>,
@@ -58,15 +58,15 @@ pub struct ActorList {
 /// An asset that differs from what was stored, or cannot be read; or a folder of assets that cannot be listed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DamagedActor {
-    /// Its hash, 64 lower-case hex digits; of a folder, the two that the hashes of its assets begin with.
+    /// Its hash, 64 lower-case hex digits; for a folder, the first two digits of the hashes of its assets.
     pub hash: String,
     /// The name that it states, if that can be read. It may be damaged, too, so that it stands for no asset.
     pub name: Option<String>,
-    /// What is wrong.
+    /// The error.
     pub reason: String,
 }
 
-/// What [`Catalog::add_actor`] has done.
+/// The result of [`Catalog::add_actor`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct AddedActor {
     /// The asset.
@@ -75,7 +75,8 @@ pub struct AddedActor {
     pub is_new: bool,
 }
 
-/// Whether an asset may get the name of an asset of another content. A name that two assets have stands for neither.
+/// Whether an asset may get the name of an asset of another content. A name that two assets have cannot be used for
+/// either.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SameName {
     /// It may.
@@ -109,7 +110,7 @@ impl Catalog {
         self.add_actor(asset, record, SameName::Allowed).map(|added| added.actor)
     }
 
-    /// As [`Catalog::put_actor`], and says whether the asset is new.
+    /// As [`Catalog::put_actor`], and returns whether the asset is new.
     ///
     /// In an object store, which has no locks, two processes that add different assets of one name at the same time
     /// both succeed.
@@ -127,7 +128,7 @@ impl Catalog {
         self.remove_abandoned_commits(Some(ACTORS))?;
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let mut staging = self.objects.begin_staging(ACTORS, &id)?;
-        // What holds of the other assets now holds until this one is visible.
+        // The other assets cannot change from now on until this one is visible.
         staging.lock_publishing()?;
         let listing = self.objects.list_objects(ACTORS)?;
         let is_whole = |known: &ListedObject| known.is_file && known.bytes == bytes.len() as u64;
@@ -206,8 +207,8 @@ impl Catalog {
     /// Removes an asset, given as to [`Catalog::find_actor`]; a damaged one, too. Returns its hash. With `dry_run`
     /// nothing is removed.
     ///
-    /// What has the asset in memory keeps it. Scenarios that name it are refused from now on, and recorded episodes
-    /// that drew it cannot be replayed, until the same asset is stored again.
+    /// Sessions that have the asset in memory keep it. Scenarios that name it are refused from now on, and recorded
+    /// episodes that drew it cannot be replayed, until the same asset is stored again.
     ///
     /// # Errors
     /// [`StoreError::NoActor`]; it cannot be removed.
@@ -244,7 +245,7 @@ impl Catalog {
         };
         let bytes = match self.objects.read_object(ACTORS, hash, limits::ACTOR_BYTES) {
             Ok(bytes) => bytes,
-            // It does not exist, is no file, or cannot be read.
+            // It does not exist, is not a file, or cannot be read.
             Err(error @ StoreError::Io { .. }) => {
                 return Err(self.find_actor(hash).err().unwrap_or(error));
             }

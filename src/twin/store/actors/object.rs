@@ -21,10 +21,10 @@ const MAGIC: [u8; 8] = *b"WILDACTR";
 const FORMAT: u32 = 1;
 /// Bytes before the header.
 const START_BYTES: usize = 16;
-/// The header and all before it are among so many first bytes.
+/// Number of first bytes that contain the header and everything before it.
 pub(super) const HEAD_BYTES: usize = START_BYTES + limits::ACTOR_HEADER_BYTES;
 
-/// What an asset says of itself.
+/// The header of an asset.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Header {
@@ -76,7 +76,7 @@ impl Catalog {
 }
 
 impl Header {
-    /// The header of an asset, and the bytes after it. The error says what is wrong with them.
+    /// The header of an asset, and the bytes after it. The error describes their damage.
     pub(super) fn read(bytes: &[u8]) -> Result<(Self, &[u8]), String> {
         let start = bytes.split_first_chunk::<START_BYTES>();
         let (start, rest) = start.ok_or("it is shorter than its start")?;
@@ -99,7 +99,7 @@ impl Header {
         Ok((header, &rest[length..]))
     }
 
-    /// Checks what the type does not say.
+    /// Checks the rules that the type does not express.
     fn check(&self) -> Result<(), String> {
         self.description.box_.check().map_err(|error| error.to_string())?;
         if self.sh_degree > sh::MAX_DEGREE {
@@ -115,7 +115,7 @@ impl Header {
         if rising && finite && first.error_m == 0.0 { Ok(()) } else { Err("wrong levels".into()) }
     }
 
-    /// The levels of detail, of the bytes after the header. The error says what is wrong with them.
+    /// The levels of detail, from the bytes after the header. The error describes their damage.
     pub(super) fn levels(&self, mut rest: &[u8]) -> Result<Vec<AssetLevel>, String> {
         let mut levels = Vec::with_capacity(self.levels.len());
         for (index, level) in self.levels.iter().enumerate() {

@@ -40,7 +40,7 @@ pub struct Commit {
     views: Option<Option<ViewsRef>>,
 }
 
-/// What one [`Commit::put`] stored.
+/// The result of one [`Commit::put`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredCells {
     /// A chunk for each cell, in order of (cell y, cell x).

@@ -61,7 +61,7 @@ impl Local {
     /// Names in a folder of objects, sorted; none if it was removed.
     ///
     /// # Errors
-    /// The disk fails to list it; [`StoreError::Damaged`] if it is no folder.
+    /// The disk fails to list it; [`StoreError::Damaged`] if it is not a folder.
     pub(super) fn names_in_folder(&self, dir: &Path) -> Result<Vec<String>, StoreError> {
         let cause = match self.disk.list(dir) {
             Ok(mut names) => {

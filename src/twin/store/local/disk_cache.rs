@@ -3,7 +3,7 @@
 //! ```text
 //! <cache>/3f/3f9c...          sections, manifests and tables, named by the BLAKE3 of their bytes
 //! <cache>/~<process>.<n>      a part that is being written
-//! <cache>/lock                locked by the process that removes parts to make room
+//! <cache>/lock                locked by the process that removes parts to free space
 //! ```
 //!
 //! Every part is compared with its hash on every read, which costs less than decoding it. So
@@ -27,7 +27,7 @@ use super::files::{WRITING, create_dirs, entries};
 const TOUCH_AFTER: Duration = Duration::from_secs(60);
 /// Age after which an unfinished file counts as left behind by a killed process.
 const LEFT_AFTER: Duration = Duration::from_secs(3600);
-/// Each process makes room whenever it has written this fraction (1 / `SLACK`) of the limit, so that several
+/// Each process frees space whenever it has written this fraction (1 / `SLACK`) of the limit, so that several
 /// processes together stay close to the limit.
 const SLACK: u64 = 16;
 
@@ -45,7 +45,7 @@ struct Counts {
     misses: AtomicU64,
     /// Number of files begun, which makes their names unique.
     begun: AtomicU64,
-    /// Bytes written since room was last made.
+    /// Bytes written since space was last freed.
     written: AtomicU64,
 }
 
@@ -113,7 +113,7 @@ impl DiskCache {
         self.dir.join(&hash[..2]).join(hash)
     }
 
-    /// Removes the least recently used parts until there is room for everything that is written before the
+    /// Removes the least recently used parts until there is space for everything that is written before the
     /// next call. One process at a time does this; concurrent callers return at once.
     fn make_room(&self) -> Result<(), StoreError> {
         let path = self.dir.join("lock");
@@ -225,7 +225,7 @@ mod tests {
             cache.put(&name, &part(1));
             assert_eq!(cache.get(&name), Some(part(1)));
         }
-        // What a killed process was writing is removed after a while.
+        // Unfinished files of a killed process are removed after a while.
         let [old, new] = ["~1.0", "~1.1"].map(|name| dir.path().join(name));
         for path in [&old, &new] {
             fs::write(path, "half").unwrap();

@@ -51,7 +51,7 @@ impl<F: Write> Write for HashingFile<F> {
 /// Reads a file, up to a limit.
 ///
 /// # Errors
-/// The file system fails, or has fewer bytes than the file's size says.
+/// The file system fails, or returns fewer bytes than the file's size.
 pub(super) fn read_all(file: Box<dyn ReadFile>, limit_bytes: u64) -> io::Result<Vec<u8>> {
     let size = file.size_bytes()?.min(limit_bytes);
     let mut bytes = Vec::with_capacity(size as usize);

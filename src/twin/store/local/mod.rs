@@ -162,7 +162,7 @@ impl ObjectBackend for Local {
         if abandoned.is_empty() {
             return Ok(());
         }
-        // What the log says decides what is removed.
+        // The log decides which objects are removed.
         self.settle(name)?;
         // The staging directories are removed last: while they exist, the next start tries again.
         if let Some(named) = named() {
@@ -194,7 +194,7 @@ impl ObjectBackend for Local {
     fn list_objects(&self, name: &str) -> Result<ObjectListing, StoreError> {
         let objects = self.objects_dir(name);
         let mut listing = ObjectListing::default();
-        // No object lies in a folder of another name.
+        // Folders of other names contain no objects.
         for prefix in entries(&*self.disk, &objects)?.into_iter().filter(|name| is_prefix(name)) {
             let dir = objects.join(&prefix);
             let hashes = match self.names_in_folder(&dir) {

@@ -74,7 +74,7 @@ impl Disk for RealDisk {
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
         // The parent of "twins" is "", which is the current directory.
         let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
-        // What is no directory, such as a pipe, is an error, and nothing to wait for.
+        // An entry that is not a directory, such as a pipe, is an error, and must not block.
         let flags = OFlags::DIRECTORY.bits().cast_signed();
         File::options().read(true).custom_flags(flags).open(dir)?.sync_all()
     }
@@ -119,7 +119,7 @@ fn open_regular(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
     match options.custom_flags(flags.bits().cast_signed()).open(path) {
         Ok(file) if file.metadata()?.is_file() => Ok(file),
         Ok(_) => Err(io::Error::other("it is not a regular file")),
-        // The error of the system does not say what a link or a pipe is.
+        // The error of the system does not name the kind of the entry, such as a link or a pipe.
         Err(error) => Err(match fs::symlink_metadata(path) {
             Ok(found) if found.is_symlink() => io::Error::other("it is a symbolic link"),
             Ok(found) if !found.is_file() => io::Error::other("it is not a regular file"),

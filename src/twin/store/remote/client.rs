@@ -32,7 +32,7 @@ impl Remote {
     /// The twins at a URL, as `s3://bucket/twins`, with credentials from the environment.
     ///
     /// # Errors
-    /// [`StoreError::Url`] says what is wrong with the URL or the credentials.
+    /// [`StoreError::Url`] describes the error in the URL or the credentials.
     pub(in crate::store) fn at(url: &str, cache: Option<DiskCache>) -> Result<Self, StoreError> {
         let (store, prefix) = url::open(url)?;
         Self::over(store, url, prefix.as_ref(), cache, RetryPolicy::default())
@@ -54,12 +54,12 @@ impl Remote {
         Ok(Self { root, prefix, store, runner: Arc::new(runner), cache })
     }
 
-    /// The same twins without the disk cache.
+    /// These twins without the disk cache.
     pub(in crate::store) fn uncached(&self) -> Self {
         Self { cache: None, ..self.clone() }
     }
 
-    /// Counts of requests so far, and of their results.
+    /// Counts of requests until now, and of their results.
     pub(in crate::store) fn traffic(&self) -> Traffic {
         let mut traffic = self.runner.traffic();
         if let Some(cache) = &self.cache {
@@ -96,7 +96,7 @@ impl Remote {
         read.map_err(|size| self.damaged(key, format!("{size} bytes are above {limit_bytes}")))
     }
 
-    /// Reads a range of an object. If the object ends before the range does, the error says so.
+    /// Reads a range of an object. If the object ends before the range does, the error reports it.
     pub(super) fn range(&self, key: &str, bytes: Range<u64>) -> Result<Vec<u8>, StoreError> {
         let store = self.store.clone();
         let at = self.key(key);

@@ -2,8 +2,8 @@
 //! catalog can be opened over a store that is open already.
 //!
 //! Objects are uploaded to their final keys, under their hashes. No reader sees them before a log
-//! record names a manifest that names them. The remains of a killed commit are removed by garbage
-//! collection alone.
+//! record names a manifest that names them. Only garbage collection removes the remains of a killed
+//! commit.
 
 mod client;
 mod retry;

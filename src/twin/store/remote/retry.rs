@@ -57,7 +57,7 @@ pub struct Traffic {
     pub requests: u64,
     /// Attempts after a request's first.
     pub retries: u64,
-    /// Requests that failed after the last attempt. An object that does not exist is no failure.
+    /// Requests that failed after the last attempt. An object that does not exist is not a failure.
     pub failures: u64,
     /// Parts that were found in the disk cache.
     pub cache_hits: u64,
@@ -73,7 +73,7 @@ pub(super) enum RequestCounter {
     Failure,
 }
 
-/// The threads that requests run on. Any thread may wait for a request, even one of another
+/// The threads on which requests run. Any thread may wait for a request, even one of another
 /// runtime.
 #[derive(Debug)]
 pub(super) struct RequestRunner {

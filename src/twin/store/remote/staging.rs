@@ -87,7 +87,7 @@ impl Staging for RemoteStaging {
     }
 
     /// Puts the record, if there is none with its number. If the answer is lost, the record that
-    /// exists tells what happened, because no two commits write the same record.
+    /// exists shows whether it was written, because no two commits write the same record.
     ///
     /// # Errors
     /// [`StoreError::Conflict`]; [`StoreError::OutcomeUnknown`] if the record cannot be read
@@ -112,7 +112,7 @@ impl Staging for RemoteStaging {
             });
             let Err(cause) = put else { return Ok(()) };
             match cause.kind() {
-                // The number is taken, or the answer was lost: the record that exists tells which.
+                // The number is taken, or the answer was lost: the existing record shows which.
                 ErrorKind::AlreadyExists | ErrorKind::Other | ErrorKind::TimedOut => {}
                 _ => return Err(StoreError::io("write", &self.remote.root.join(&key))(cause)),
             }

@@ -23,7 +23,7 @@ pub(super) fn open(url: &str) -> Result<(Arc<dyn ObjectStore>, Key), StoreError>
     }
     let prefix = Key::parse(prefix).map_err(|error| refused(error.to_string()))?;
     provide_tls();
-    // Retries are made in `retry.rs` alone.
+    // Retries are made only in `retry.rs`.
     let retry = RetryConfig { max_retries: 0, ..RetryConfig::default() };
     let timeout = format!("{} s", limits::REMOTE_TIMEOUT.as_secs());
     let store: object_store::Result<Arc<dyn ObjectStore>> = match scheme {
