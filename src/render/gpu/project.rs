@@ -29,7 +29,7 @@ use super::layout::{
     ChunkLight, ChunkShadow, ChunkView, ClusterView, Span, SplatColor, SplatShape, VIEW_BITS,
 };
 use super::lens::{LensIndices, Lenses};
-use super::mirror::{Mirror, Place};
+use super::mirror::{ClusterLocation, Mirror};
 use super::plan::{Plan, job};
 use super::scan::Scan;
 use crate::actor_views::ActorViews;
@@ -262,7 +262,7 @@ impl ChunkInView<'_> {
             let Cluster { min_m, max_m, sigma_m, .. } = **cluster;
             may_see(min_m, max_m, sigma_m)
         });
-        let place = |(place, cluster): (&Place, &Cluster)| {
+        let place = |(place, cluster): (&ClusterLocation, &Cluster)| {
             let touches = |s: &CpuChunkShadow| s.may_touch(cluster.min_m, cluster.max_m);
             let shadowed = shadows.iter().any(touches);
             ClusterPlace { page: place.page, line: place.lines.start, shadowed }
