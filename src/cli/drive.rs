@@ -30,7 +30,7 @@ const LOST_EXIT_CODE: u8 = 69;
 /// and 69 if the connection to it was lost. For a server with tokens, set $WILDCITY_TOKEN.
 ///
 /// Without TWIN the command is an agent for `wildcity episode run`, which describes the episode in environment
-/// variables. `--agent egodriver:HOST:PORT` starts it with the driver's own cameras; `--agent 'wildcity drive
+/// variables. `--agent egodriver:HOST:PORT` starts it with all cameras of the rig; `--agent 'wildcity drive
 /// --egodriver HOST:PORT --cameras front --size 576x320'` starts it with others.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = EXAMPLES)]
@@ -192,7 +192,7 @@ impl Drive {
             frames: 4,
             steps,
             seed,
-            patience: Duration::from_millis(self.drive_timeout_ms),
+            max_wait: Duration::from_millis(self.drive_timeout_ms),
         })
     }
 }

@@ -19,8 +19,6 @@ mod backend_options;
 mod bench;
 mod bisect;
 mod demo;
-#[cfg(unix)]
-mod desktop;
 mod devices;
 mod directories;
 mod doctor;
@@ -111,8 +109,6 @@ enum Command {
 /// for a recording that is cut (`replay --verify`). A
 /// command line that cannot be parsed ends the process with code 2.
 pub fn main() -> ExitCode {
-    #[cfg(unix)]
-    desktop::start_without_device_selection();
     let arguments = Arguments::parse();
     let result = match arguments.command {
         Command::Demo(command) => command.run(),

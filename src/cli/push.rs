@@ -132,8 +132,9 @@ impl Push {
                     let twin = pushed.twin;
                     writeln!(
                         io::stderr(),
-                        "warning: twin {twin} was aligned, and the files were taken to be in its axes: give --frame \
-                         twin if they are, or --frame capture if they are in those of its capture"
+                        "warning: twin {twin} was aligned, and the files were taken to be in its axes. If they are in \
+                         the axes of its capture, roll back (wildcity twin rollback) and push with --frame capture; with \
+                         --frame twin there is no warning"
                     )?;
                 }
                 Ok(())
@@ -287,7 +288,7 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         let before: u64 = report.cells.iter().map(|cell| cell.before).sum();
         let after: u64 = report.cells.iter().map(|cell| cell.after).sum();
         let cells = report.cells.len();
-        writeln!(out, "cells       {cells}: {before} Gaussians before, {after} after")?;
+        writeln!(out, "cells       {cells}, with {before} Gaussians before and {after} after")?;
     }
     if report.left_out > 0 {
         writeln!(out, "left out    {} Gaussians in other cells", report.left_out)?;

@@ -234,6 +234,18 @@ pub struct EpisodeResult {
     pub scores: BTreeMap<String, ScoreLine>,
 }
 
+/// A fault of the ego.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FaultLine {
+    /// Its name, as `contact.at_fault`.
+    pub fault: String,
+    /// When, in microseconds.
+    pub time_us: i64,
+    /// Name of the actor, for a contact with one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub actor: Option<String>,
+}
+
 impl FaultLine {
     /// The fault in words, with the values of the episode's scores: `contact.pedestrian with walker at 4.615 s`.
     pub fn text(&self, scores: &BTreeMap<String, ScoreLine>) -> String {
@@ -247,18 +259,6 @@ impl FaultLine {
             _ => text,
         }
     }
-}
-
-/// A fault of the ego.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FaultLine {
-    /// Its name, as `contact.at_fault`.
-    pub fault: String,
-    /// When, in microseconds.
-    pub time_us: i64,
-    /// Name of the actor, for a contact with one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub actor: Option<String>,
 }
 
 /// A score: its value, or null and the reason.

@@ -96,8 +96,8 @@ fn of_path(error: PathError) -> PushError {
     PushError::InvalidField { field, reason: error.to_string() }
 }
 
-/// Makes the version when no other push of the twin runs, and loads the sections that sessions see before the version
-/// becomes the latest.
+/// Makes the version when no other push of the twin runs. Before it becomes the latest, loads the sections that sessions
+/// see.
 ///
 /// # Errors
 /// The request cannot be used; [`wildcity_twin::store::StoreError::Overlap`]; or as a commit.

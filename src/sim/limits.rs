@@ -95,7 +95,7 @@ pub const ROUTE_LOST_M: f64 = 50.0;
 
 /// A route is done if more than this share of it was driven and the ego is within [`ROUTE_END_M`] of its end (HUGSIM).
 pub const ROUTE_DONE: f64 = 0.99;
-/// See [`ROUTE_DONE`], in metres.
+/// Largest distance of the ego from the end of a route that is done, in metres: see [`ROUTE_DONE`].
 pub const ROUTE_END_M: f64 = 10.0;
 
 /// Slower than this is stuck, in m/s (Bench2Drive).

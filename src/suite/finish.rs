@@ -42,7 +42,12 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
     let end = episode.end.clone();
     let end = end.ok_or_else(|| Technical::new("agent_lost", "the record has no end"))?;
     let outcome = Outcome::deserialize(end.outcome.as_str().into_deserializer());
-    let outcome = outcome.map_err(|error: ValueError| Technical::server(error.to_string()))?;
+    let outcome = outcome.map_err(|_: ValueError| {
+        let outcome = &end.outcome;
+        Technical::server(format!(
+            "the session ended as {outcome}, which this program does not know"
+        ))
+    })?;
     let kind = match outcome {
         Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure => None,
         Outcome::AgentError => Some("agent_error"),

@@ -69,6 +69,10 @@ fn a_suite_is_driven_and_its_records_are_read() {
     assert!(listed.contains("short-0-1") && listed.contains("short passed"), "{listed}");
     let shown = stdout(&wildcity(&["show", "short-0-1", "--episodes", &records[0]], dir.path()));
     assert!(shown.contains("scenario    short") && shown.contains("8 steps"), "{shown}");
+    // Why an episode failed, with the values.
+    let failed = stdout(&wildcity(&["show", "short-0-1", "--episodes", &records[1]], dir.path()));
+    assert!(failed.contains("verdict     failed\nfault       progress at "), "{failed}");
+    assert!(failed.contains(" of the recorded drive, and 0.8 is the least"), "{failed}");
     let scored = stdout(&wildcity(&["score", "short-0-1", "--episodes", &records[1]], dir.path()));
     assert!(
         scored.contains("short-0-1: failed") && scored.contains("fault   progress"),

@@ -79,7 +79,7 @@ async fn tokens_are_read_again() {
     assert_eq!(get(&served, "/v1/twins", second).await.0, 200);
 }
 
-/// An episode without a step is not an error, and has no MCAP file.
+/// An episode with frames of `observe` only is not an error, and has no MCAP file.
 #[tokio::test]
 async fn a_session_that_drove_nothing_is_no_error_in_the_log() {
     let dir = tempfile::tempdir().unwrap();

@@ -25,21 +25,6 @@ fn about(output: &Output, subject: &str) -> Vec<(String, String)> {
     found.map(|finding| (text(finding, "level"), text(finding, "text"))).collect()
 }
 
-/// A layer of Vulkan prints an error whenever it finds no desktop.
-#[test]
-fn a_machine_without_a_desktop_is_no_error() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut command = wildcity();
-    command.args(["doctor", "--twins"]).arg(dir.path()).env_remove("XDG_RUNTIME_DIR");
-    for name in ["--episodes", "--uploads"] {
-        command.arg(name).arg(dir.path());
-    }
-    let output = command.output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(!said.contains("XDG_RUNTIME_DIR"), "{said}");
-    assert!(String::from_utf8(output.stdout).unwrap().contains("gpu"));
-}
-
 #[test]
 fn the_doctor_finds_nothing_wrong_with_this_machine() {
     let dir = tempfile::tempdir().unwrap();

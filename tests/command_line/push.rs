@@ -31,7 +31,7 @@ async fn a_file_is_pushed_and_reported() {
     assert!(done.status.success(), "{out}{err}");
     for line in [
         "block.ply: 40 Gaussians",
-        "cells       1: 32 Gaussians before, 40 after",
+        "cells       1, with 32 Gaussians before and 40 after",
         "version 2 is ready",
     ] {
         assert!(out.contains(line), "no {line:?} in {out}");
@@ -74,6 +74,7 @@ async fn the_frame_of_a_push_is_said_and_the_log_has_its_note() {
     };
     let never = push("first", &["--frame", "capture"]);
     assert!(never.contains("frame       the capture's, which is the twin's"), "{never}");
+    assert!(!never.contains("warning"), "{never}");
     assert!(!push("first", &["--cells", "all"]).contains("frame"));
     let twice = json!({"scale": {"points": [[0, 0, 0], [0, 0, 1]], "distance_m": 2}});
     assert_eq!(post(&server, "/v1/twins/test/edits", &twice).await.status, 200);

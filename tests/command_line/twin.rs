@@ -146,6 +146,7 @@ fn an_empty_scene_is_imported_with_a_warning() {
     assert!(stdout(&output).contains(" 0 Gaussians"));
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.starts_with("warning: ") && said.contains("holds no Gaussians"), "{said}");
+    assert!(said.contains("note: there is no recorded drive"), "{said}");
 }
 
 #[test]

@@ -7,8 +7,8 @@
 //! of the operation that needed it, and never different content; after it, the same read succeeds. Wrong bits are
 //! simulated only in objects: log records, leases and the state of garbage collection have no digest.
 //!
-//! Not simulated: two processes that write at once, requests to the object store that are carried out in a different
-//! order, the disk cache of remote twins, and wrong bits that stay.
+//! Not simulated: two processes that write at once, requests to the object store that are carried out in another
+//! order than they began, the disk cache of remote twins, and wrong bits that stay.
 //!
 //! Uploads and connections are simulated in the package of the server, over the same disk: `tests/faults/server`.
 //!

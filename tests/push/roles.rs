@@ -322,7 +322,10 @@ async fn a_token_has_a_quota() {
     full.refused(507, "storage_full");
     let reason = full.body["message"].as_str().unwrap();
     assert!(reason.contains("this token keeps 1 uploads of 400 bytes"), "{reason}");
-    begin(RIVAL, 3, 501).await.refused(507, "storage_full");
+    let large = begin(RIVAL, 3, 501).await;
+    large.refused(507, "storage_full");
+    let reason = large.body["message"].as_str().unwrap();
+    assert!(reason.contains("501 bytes, and the uploads of this token may have 500"), "{reason}");
     assert_eq!(begin(PUSHER, 4, 500).await.status, 201);
     // All tokens together have a limit, too.
     begin(ADMIN, 5, 200).await.refused(507, "storage_full");

@@ -6,8 +6,8 @@ use std::path::Path;
 use glam::DMat3;
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::{Value, json};
-use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
+use wildcity_scene::{Gaussians, Rays, RenderProfile};
 use wildcity_twin::ingest;
 use wildcity_twin::store::{Catalog, NewSky, NewVersion, SkyBytes};
 
@@ -65,6 +65,36 @@ async fn a_profile_that_cannot_be_had_is_refused_by_its_field() {
     agent.open(json!({})).await;
 }
 
+/// The backend cannot draw the next version: the session stays on its own.
+#[tokio::test]
+async fn a_version_with_a_profile_that_cannot_be_had_is_not_switched_to() {
+    let server = TestServer::start().await;
+    let mut agent = server.driver("a").await;
+    let catalog = Catalog::open(server.twins.path()).unwrap();
+    let gaussians = one_gaussian();
+    let next = NewVersion {
+        rig: Some(rig()),
+        profile: RenderProfile { rays: Rays::Exact, ..RenderProfile::default() },
+        ..NewVersion::of("test", &gaussians, Provenance::of("test".to_owned()))
+    };
+    assert_eq!(catalog.commit(next, &mut |_, _| {}).unwrap().number, 2);
+    let answer = agent.ask(json!({ "type": "switch_version" })).await;
+    refused(&answer, "out_of_range");
+    assert_eq!(answer["field"], "profile", "{answer}");
+    assert_eq!(agent.step(1.0).await.meta["version"], 1);
+}
+
+fn one_gaussian() -> Gaussians {
+    Gaussians {
+        sh_degree: 0,
+        means_m: vec![[5.0, 0.0, 1.0]],
+        quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
+        ln_scales: vec![[-1.0; 3]],
+        logit_opacities: vec![2.0],
+        sh: vec![0.5; 3],
+    }
+}
+
 /// Commits a twin `creased`. Its sky has one kink: baked at the default sky_error, the map is off by at
 /// most half a step of 8 bits; for 1e-4 no map is fine enough.
 fn commit_creased(dir: &Path) {
@@ -86,14 +116,7 @@ fn commit_creased(dir: &Path) {
     let file = safetensors::serialize(tensors, None).unwrap();
     let bytes = ingest::sky::read_bytes(&file, None).unwrap().bytes.into();
     let sky = SkyBytes { bytes, image: None, sky_from_world: DMat3::IDENTITY };
-    let gaussians = Gaussians {
-        sh_degree: 0,
-        means_m: vec![[5.0, 0.0, 1.0]],
-        quats_wxyz: vec![[1.0, 0.0, 0.0, 0.0]],
-        ln_scales: vec![[-1.0; 3]],
-        logit_opacities: vec![2.0],
-        sh: vec![0.5; 3],
-    };
+    let gaussians = one_gaussian();
     let new = NewVersion {
         rig: Some(rig()),
         sky: Some(NewSky::Put(sky)),

@@ -121,7 +121,7 @@ def test_the_frame_of_a_push(server: str, tmp_path: Path) -> None:
     tops = []
     frames: list[Literal["twin", "capture"] | None] = [None, "twin", "capture"]
     for frame in frames:
-        expected = contextlib.nullcontext() if frame else pytest.warns(UserWarning, match="^twin aligned was aligned")
+        expected = contextlib.nullcontext() if frame else pytest.warns(UserWarning, match="the twin was aligned")
         with expected:
             pushed = wildcity.push(second, twin="aligned", server=server, frame=frame, cells="all")
         assert (pushed.report["frame"], pushed.report["aligned"]) == (frame or "twin", True)
@@ -353,6 +353,8 @@ def test_tokens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         # The token of the environment, and one that was read from a file.
         wildcity.connect(url).close()
         wildcity.connect(url, token=f"{TOKEN}\n").close()
+        with pytest.raises(wildcity.ConnectFailed, match=": unauthorized: "):
+            wildcity.connect(url, token="")
         with pytest.raises(wildcity.ConnectFailed, match=": forbidden: "):
             wildcity.connect(url, token=metrics)
         with pytest.raises(wildcity.ConnectFailed, match=": unauthorized: .*Authorization: Bearer TOKEN"):

@@ -65,7 +65,7 @@ pub struct EpisodeSettings {
     /// Seed of the episode.
     pub seed: u64,
     /// How long the driver may take for an answer.
-    pub patience: Duration,
+    pub max_wait: Duration,
 }
 
 /// How an episode ended.
@@ -125,7 +125,7 @@ pub enum BridgeError {
 pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, BridgeError> {
     // The driver first: it may take minutes to load, and a session would wait for it.
     let uuid = format!("wildcity-{}-{}", std::process::id(), settings.seed);
-    let driver = Driver::connect(&settings.driver, uuid, settings.patience).await;
+    let driver = Driver::connect(&settings.driver, uuid, settings.max_wait).await;
     let mut driver = driver.map_err(BridgeError::Driver)?;
 
     let options = ConnectOptions::with_token(settings.token.clone());

@@ -22,8 +22,8 @@ use super::{bad_input, exit};
 
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
-/// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if no
-/// episode failed by driving, and 1 if one did. It is 2 if the command line, the suite, a scenario or the run of
+/// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if every
+/// episode was judged and none failed by driving, and 1 otherwise. It is 2 if the command line, the suite, a scenario or the run of
 /// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for technical reasons, or
 /// more than a tenth of the episodes left the trained area. It is 4 if an episode does not repeat (--verify).
 ///

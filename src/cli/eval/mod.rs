@@ -76,7 +76,7 @@ pub(super) struct Eval {
     #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
     axes: Option<String>,
 
-    /// Metres per unit of the poses, applied after --axes [default: 1]
+    /// Metres per unit of the poses; only with --axes, and applied after it [default: 1]
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 

@@ -68,7 +68,7 @@ pub(super) struct Serve {
 
     /// Origins of web pages of other sites that may send requests, separated by commas, for example
     /// https://sim.example.org; pages of this machine always may. With this option, the server answers only requests to
-    /// these hosts, to its addresses and to localhost: list the server's own host name, too.
+    /// these hosts, to localhost and, with tokens, to its addresses: list the server's own host name, too.
     #[arg(long, value_name = "ORIGINS", value_parser = origins)]
     origin: Option<Origins>,
 
@@ -200,7 +200,7 @@ impl Serve {
             tracing::warn!("no twins in {dir}: wildcity import or wildcity demo makes one");
         }
         if let Some(dir) = self.directories.scenarios.missing() {
-            tracing::warn!("--scenarios {} is not a directory: it has no scenarios", dir.display());
+            tracing::warn!("scenarios: there is no directory {}", dir.display());
         }
         let tokens = self
             .tokens

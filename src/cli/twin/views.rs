@@ -48,7 +48,7 @@ pub(in crate::cli) struct Views {
     #[arg(long, value_name = "AXES", allow_hyphen_values = true, requires = "images")]
     axes: Option<String>,
 
-    /// Metres per unit of the poses, applied after --axes [default: 1]
+    /// Metres per unit of the poses; only with --axes, and applied after it [default: 1]
     #[arg(long, value_name = "M", requires = "axes")]
     scale: Option<f64>,
 

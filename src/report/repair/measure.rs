@@ -63,9 +63,9 @@ pub struct RepairSubject {
     pub size_px: [u32; 2],
     /// Source of the reference images: `recorded` images, or the twin `rendered` on its drive.
     pub references: &'static str,
-    /// Number of reference images that were read, and whose depth was rendered. They stay in memory.
+    /// Number of reference images that were read or rendered, with their depth. They stay in memory.
     pub read: usize,
-    /// Mean time to read one of them, in milliseconds.
+    /// Mean time to read and render one of them, in milliseconds.
     pub read_ms: f64,
     /// The ground truth; `None` if there is none.
     pub truth: Option<Truth>,

@@ -14,13 +14,13 @@ use super::tokens::{Secret, Token, Tokens};
 use crate::limits;
 
 #[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "an object with tokens")]
 struct File {
     tokens: Vec<Entry>,
 }
 
 #[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "an object with name and role")]
 struct Entry {
     name: String,
     role: String,
@@ -29,6 +29,17 @@ struct Entry {
     twins: Option<BTreeSet<String>>,
     #[serde(default)]
     limits: TokenLimits,
+}
+
+/// The part of a message of serde that quotes nothing of the file, where a token may stand in the wrong place.
+fn hint(message: &str) -> Option<String> {
+    let (message, _position) = message.rsplit_once(" at line ")?;
+    if message.starts_with("missing field ") || message.starts_with("duplicate field ") {
+        // These name fields of the structs above.
+        return Some(message.to_owned());
+    }
+    let (_quoted, expected) = message.rsplit_once(", expected ")?;
+    Some(format!("expected {expected}"))
 }
 
 /// Bytes of the shortest token that is accepted: 16 characters of base64 have 96 bits, too many to guess.
@@ -57,13 +68,10 @@ impl Tokens {
         let file: File = serde_json::from_slice(text).map_err(|error| {
             // serde's message could quote a token that is in the wrong place; what it expected there quotes nothing.
             let location = format!("line {}, column {}", error.line(), error.column());
-            let message = error.to_string();
-            let expected =
-                message.rsplit_once("expected ").and_then(|(_, rest)| rest.split_once(" at line "));
-            let expected = expected.map(|(expected, _)| format!("expected {expected}; "));
+            let hint = hint(&error.to_string()).map(|hint| format!("{hint}; ")).unwrap_or_default();
             let form =
                 "the file is {\"tokens\": [{\"name\", \"role\", \"token\" or \"hash\", ..}]}";
-            wrong(location, &format!("{}{form}", expected.unwrap_or_default()))
+            wrong(location, &format!("{hint}{form}"))
         })?;
         if file.tokens.is_empty() {
             return Err(wrong("tokens".to_owned(), "there is none: no client could connect"));
@@ -151,11 +159,19 @@ mod tests {
                 r#"{"tokens": [{"name": "a", "role": "secret", "token": "secretsecretsecret"}]}"#,
                 "tokens[0].role: no such role; the roles are metrics, drive, push, admin",
             ),
-            (r#"{"tokens": ["secretsecretsecret"]}"#, "line 1, column 32: expected struct Entry; "),
+            (
+                r#"{"tokens": ["secretsecretsecret"]}"#,
+                "line 1, column 32: expected an object with name and role; ",
+            ),
             (
                 r#"{"tokens": [{"name": "a", "role": "drive", "token": "secretsecretsecret",
                     "limits": {"secret": 1}}]}"#,
                 "line 2, column 39: expected one of `sessions`, ",
+            ),
+            (r#"{"tokens": [{"name": "a"}]}"#, "line 1, column 25: missing field `role`; "),
+            (
+                r#"{"tokens": [{"secret, expected secret": 1}]}"#,
+                "line 1, column 38: expected one of `name`, ",
             ),
             (
                 r#"{"tokens": [{"name": "a", "role": "drive", "token": "secret"}]}"#,

@@ -67,7 +67,8 @@ impl Quota {
         let most = self.of_token(upload.owner()).bytes;
         if size > most {
             let reason = format!(
-                "{size} bytes, and the limit upload_bytes is {most}: send less, or raise the limit"
+                "{size} bytes, and the uploads of this token may have {most}: send it in parts, or ask the operator \
+                 for a larger limit (upload_bytes of the token, or --token-spool-gib)"
             );
             return Err(Fault::StorageFull { reason });
         }

@@ -114,7 +114,7 @@ impl Shared {
 enum Failure {
     /// Something is wrong.
     Bad(String),
-    /// The episode has no steps.
+    /// The ego was never driven: the record has only frames of `observe`.
     Empty(String),
 }
 

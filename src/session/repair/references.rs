@@ -26,7 +26,7 @@ use wildcity_twin::store::Version;
 const OFFSETS_M: [f64; 5] = [-8.0, -5.5, -3.0, -0.5, 2.0];
 
 /// Largest distance between an image and a place along the drive for the image to be used there, in metres.
-const MAX_PLACE_DISTANCE_M: f64 = 1.5;
+const MAX_STATION_DIFFERENCE_M: f64 = 1.5;
 
 /// Distance between the places where a twin without recorded images is drawn, in metres.
 const STEP_M: f64 = 2.0;
@@ -228,8 +228,9 @@ impl ReferenceViews {
         let mut around: Vec<ReferenceView> = Vec::new();
         for offset_m in OFFSETS_M {
             let wanted_m = place.station_m + offset_m;
-            let is_near =
-                |view: &ReferenceView| (view.station_m - wanted_m).abs() <= MAX_PLACE_DISTANCE_M;
+            let is_near = |view: &ReferenceView| {
+                (view.station_m - wanted_m).abs() <= MAX_STATION_DIFFERENCE_M
+            };
             for view in self.at(&place, wanted_m).into_iter().filter(is_near) {
                 if around.iter().all(|other| other.name != view.name) {
                     around.push(view);

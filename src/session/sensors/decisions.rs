@@ -46,7 +46,7 @@ impl Decisions {
     }
 
     /// Returns the ego after each of some steps of `dt_us` from `time_us`. The decision `command` is made at `time_us`,
-    /// and is used until the end of these steps and the latency. Before the first decision takes effect, a car keeps
+    /// takes effect after the latency, and holds until the end of these steps plus the latency. Before the first decision takes effect, a car keeps
     /// its speed on a straight line, and an ego with `teleport` keeps its pose.
     ///
     /// # Errors

@@ -167,7 +167,9 @@ impl Session {
         let version = prepare(&engine, resident.clone(), &settings, coverage_for).await?;
         let version = version.with_solids(solids);
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
-        let reservation = Engine::reserve(resident, extent, version.profile, frame).await?;
+        let reservation = Engine::reserve(resident.clone(), extent, version.profile, frame).await?;
+        let references = references_of(&engine, &resident, &settings).await?;
+        let version = version.with_references(references);
 
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
@@ -241,9 +243,10 @@ impl Session {
                 run_blocking(find).await??
             }
         };
+        let references = references_of(&self.engine, &resident, &self.settings).await?;
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
         self.reservation.exchange(resident, bytes)?;
-        self.version = version.with_solids(solids.clone());
+        self.version = version.with_solids(solids.clone()).with_references(references);
         if let Some(traffic) = self.state.traffic.take() {
             self.state.traffic = Some(traffic.with_solids(solids, self.state.episode.ego()));
         }
@@ -306,8 +309,8 @@ impl OpenedScenario {
     }
 }
 
-/// Prepares a version for the frames of a session: bakes its sky, and reads where it was trained and the images that the
-/// repair model compares with. `coverage_for` is the field of the request that needs to know where it was trained.
+/// Prepares a version for the frames of a session: bakes its sky, and reads where it was trained if the field
+/// `coverage_for` of the request needs to know.
 async fn prepare(
     engine: &Arc<Engine>,
     resident: Arc<Resident>,
@@ -321,11 +324,7 @@ async fn prepare(
         Some(field) => Some(training_coverage(&resident, field).await?),
         None => None,
     };
-    let references = match &settings.repair {
-        Some(repair) => references_of(engine, &resident, repair, settings.layout.clone()).await?,
-        None => None,
-    };
-    Ok(PinnedVersion::new(resident, profile, coverage).with_references(references))
+    Ok(PinnedVersion::new(resident, profile, coverage))
 }
 
 fn check_dt(dt_us: Option<i64>) -> Result<i64, SessionError> {
@@ -464,15 +463,14 @@ fn drive_to_follow<'a>(drives: &'a [Trajectory], start: Option<&Start>) -> Optio
 async fn references_of(
     engine: &Arc<Engine>,
     resident: &Arc<Resident>,
-    repair: &Arc<SessionRepair>,
-    layout: Arc<ObservationLayout>,
+    settings: &SessionSettings,
 ) -> Result<Option<Arc<ReferenceViews>>, SessionError> {
-    if !repair.needs_images() {
+    let Some(repair) = settings.repair.clone().filter(|repair| repair.needs_images()) else {
         return Ok(None);
-    }
+    };
     let engine = engine.clone();
     let resident = resident.clone();
-    let repair = repair.clone();
+    let layout = settings.layout.clone();
     let read = move || {
         let version = resident.version.clone();
         let table = engine.catalog().views(&version)?;

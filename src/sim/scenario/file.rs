@@ -275,7 +275,8 @@ pub enum ContactRule {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct VerdictSection {
-    /// The share of the route that must be driven, 0 to 1. If absent, 0.8.
+    /// Distance that a pass requires, as a share of what the recorded drive covers in the same time, 0 to 1. If absent,
+    /// 0.8.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub progress: Option<f64>,
 }

@@ -236,7 +236,7 @@ impl World {
             }
             _ => f64::NEG_INFINITY,
         };
-        // Distances to an actor that has not appeared yet are measured to the place where it will appear.
+        // While this actor has not appeared yet, its distances are measured from the place where it will appear.
         let own_m = match state.present {
             true => state.world_from_actor.position_m,
             false => {

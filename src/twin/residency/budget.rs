@@ -32,8 +32,8 @@ pub(super) struct Budget {
 pub struct FrameBytes {
     /// Intermediate buffers of a frame while it is rendered. All sessions share them.
     pub stages: u64,
-    /// Intermediate buffers of a small frame that is rendered while a large one is; 0 for large frames, which are not
-    /// rendered at the same time as another.
+    /// Intermediate buffers of a small frame that is rendered while a large one is; 0 for large frames, which are never
+    /// rendered while another large frame is.
     pub beside: u64,
     /// Whether it is a large frame, during which small ones are rendered.
     pub is_large: bool,

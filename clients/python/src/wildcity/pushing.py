@@ -127,8 +127,9 @@ def push(
             push = _finished_push(answer)
             if frame is None and push.report.get("aligned"):
                 warnings.warn(
-                    f"twin {twin} was aligned, and the files were taken to be in its axes: "
-                    'give frame="twin" if they are, or frame="capture" if they are in those of its capture',
+                    f"version {push.version} of twin {twin}: the twin was aligned, and the files were taken to be in its "
+                    'axes. If they are in the axes of its capture, roll back and push with frame="capture"; with '
+                    'frame="twin" there is no warning',
                     stacklevel=2,
                 )
             return push

@@ -45,7 +45,7 @@ class SharedMemory:
             gc.collect()
         if slot.is_in_use():
             raise SlotInUse(
-                f"the next observation overwrites the one of {len(self._slots)} observations ago, of which arrays "
+                f"the next observation overwrites the one that is {len(self._slots)} before it, of which arrays "
                 "still exist: copy what is to be kept, or connect without copy=False"
             )
 

@@ -50,7 +50,7 @@ pub(super) struct RefractionDerivatives<S: Simd> {
     /// Its derivatives by the x and the y of the unit direction outside.
     pub(super) by_x: Vec3x16<S>,
     pub(super) by_y: Vec3x16<S>,
-    /// Margin of the outside z within which the refraction is complete; not below 0 where it is complete.
+    /// How far the outside z is above the least one at which the refraction is complete: not below 0 where it is.
     pub(super) margin: f32x16<S>,
 }
 

@@ -48,7 +48,7 @@ pub(crate) struct ObservationBuilder {
     /// Where the next shown image's raw pixels go, in bytes from the buffer's start.
     raw_at: usize,
     captures: Vec<RigCapture>,
-    /// The images of all captures so far, in order of the cameras.
+    /// The images of all captures so far: capture by capture, and in each in the order of its cameras.
     encoded: Vec<EncodedImage>,
     timings: Timings,
     residency: ResidencyStats,
