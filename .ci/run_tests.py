@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Runs the test executables that cargo has built, and other commands, three at a time.
+"""Runs the test executables that cargo has built, and other commands, two at a time.
 
     cargo test --no-run --message-format=json-render-diagnostics >MESSAGES
     .ci/run_tests.py MESSAGES [NAME FOLDER COMMAND]...
 
-One after the other, as `cargo test` runs them, they leave a quarter of two cores unused, and two at a time a tenth: some
-wait for disks, sockets and time limits while others compute. Each runs in the folder of its package, as under cargo. What one prints appears when it
+One after the other, as `cargo test` runs them, they leave a quarter of two cores unused: some wait for disks, sockets and
+time limits while others compute. Each runs in the folder of its package, as under cargo. What one prints appears when it
 has ended. All run, whatever fails.
 """
 
@@ -25,7 +25,7 @@ from typing import NamedTuple
 ALONE = ["suite", "session"]
 # These take longest, and begin first. One that computes stands before one that waits.
 LONG = ["gpu", "command_line", "Python client", "stress", "store", "viewer", "render"]
-AT_ONCE = 3
+AT_ONCE = 2
 # Several times what the longest takes. One that takes longer is stopped, and has failed.
 LIMIT_S = 1800
 
