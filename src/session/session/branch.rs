@@ -6,7 +6,7 @@ use std::sync::Arc;
 use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
-use super::open::{frame_bytes, rig_extent, training_coverage};
+use super::open::{frame_bytes, prepare, rig_extent};
 use super::recording::traffic_lines;
 use super::requests::SimulationState;
 use crate::blocking::run_blocking;
@@ -21,7 +21,7 @@ use crate::record::continuation::{Continuation, KeptFrames};
 use crate::record::format::{FrameRequest, Line, RecordedOrigin, RecordedSettings};
 use crate::snapshot::Snapshot;
 use crate::start::EpisodeStart;
-use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
+use crate::state::{EpisodeState, SessionSettings};
 
 /// Name of the snapshot of the state in which a branch was opened.
 const FIRST_SNAPSHOT: &str = "start";
@@ -202,15 +202,10 @@ impl Session {
 
         // The state after the step, and the frames that coming observations show again.
         let driven = run_blocking(move || continuation.drive(&layout)).await??;
-        Engine::bake_sky(driven.version.clone(), driven.profile).await?;
-        let coverage = match recorded.trust {
-            true => Some(training_coverage(&driven.version, "outputs.trust").await?),
-            false => None,
-        };
-        let frame = frame_bytes(&engine, &settings.layout, coverage.is_some());
-        let resident = driven.version.clone();
-        let reservation = Engine::reserve(resident, extent, driven.profile, frame).await?;
-        let version = PinnedVersion::new(driven.version.clone(), driven.profile, coverage);
+        let coverage_for = recorded.trust.then_some("outputs.trust");
+        let version = prepare(driven.version.clone(), driven.profile, coverage_for).await?;
+        let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
+        let reservation = Engine::reserve(driven.version, extent, driven.profile, frame).await?;
         let state = EpisodeState::at_start(driven.episode.clone());
         let mut session =
             Self::assembled(engine, name, Arc::new(settings), reservation, version, state);
@@ -227,12 +222,8 @@ impl Session {
         recorded_by: &str,
     ) -> Result<(), SessionError> {
         for KeptFrames { episode, version, profile, frames } in kept {
-            Engine::bake_sky(version.clone(), profile).await?;
-            let coverage = match &self.version.coverage {
-                Some(_) => Some(training_coverage(&version, "outputs.trust").await?),
-                None => None,
-            };
-            let version = PinnedVersion::new(version, profile, coverage);
+            let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
+            let version = prepare(version, profile, coverage_for).await?;
             let history = Some(self.state.frame_history.clone());
             let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
             let simulation = SimulationState { episode: &episode, traffic: None };

@@ -9,7 +9,7 @@ use tokio::time::Instant;
 use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
-use wildcity_scene::{Manifest, Trajectory};
+use wildcity_scene::{Manifest, RenderProfile, Trajectory};
 use wildcity_sim::contact::Solids;
 use wildcity_sim::scenario::Scenario;
 use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urgency};
@@ -164,7 +164,8 @@ impl Session {
             (false, Some(_)) => Some("repair"),
             (false, None) => None,
         };
-        let version = prepare(&engine, resident.clone(), &settings, coverage_for).await?;
+        let profile = profile_of(&engine, &resident, &settings)?;
+        let version = prepare(resident.clone(), profile, coverage_for).await?;
         let version = version.with_solids(solids);
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
         let reservation = Engine::reserve(resident.clone(), extent, version.profile, frame).await?;
@@ -231,7 +232,8 @@ impl Session {
         }
         let extent = rig_extent(self.settings.layout.cameras());
         let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
-        let version = prepare(&self.engine, resident.clone(), &self.settings, coverage_for).await?;
+        let profile = profile_of(&self.engine, &resident, &self.settings)?;
+        let version = prepare(resident.clone(), profile, coverage_for).await?;
         let bytes = Engine::worst_case_bytes(resident.clone(), extent, version.profile).await?;
         let solids = match &self.state.traffic {
             None => None,
@@ -309,16 +311,27 @@ impl OpenedScenario {
     }
 }
 
-/// Prepares a version for the frames of a session: bakes its sky, and reads where it was trained if the field
-/// `coverage_for` of the request needs to know.
-async fn prepare(
-    engine: &Arc<Engine>,
-    resident: Arc<Resident>,
+/// The profile of a version with the session's overrides.
+///
+/// # Errors
+/// An override is out of range, or the backend cannot render the profile.
+fn profile_of(
+    engine: &Engine,
+    resident: &Resident,
     settings: &SessionSettings,
-    coverage_for: Option<&'static str>,
-) -> Result<PinnedVersion, SessionError> {
+) -> Result<RenderProfile, SessionError> {
     let profile = settings.profile_overrides.apply(resident.version.manifest.profile)?;
     engine.check_profile(&profile)?;
+    Ok(profile)
+}
+
+/// Prepares a version for the frames of a session: bakes its sky, and reads where it was trained if the field
+/// `coverage_for` of the request needs to know.
+pub(super) async fn prepare(
+    resident: Arc<Resident>,
+    profile: RenderProfile,
+    coverage_for: Option<&'static str>,
+) -> Result<PinnedVersion, SessionError> {
     Engine::bake_sky(resident.clone(), profile).await?;
     let coverage = match coverage_for {
         Some(field) => Some(training_coverage(&resident, field).await?),
@@ -482,7 +495,7 @@ async fn references_of(
 }
 
 /// Where a version of the twin was recorded and trained. `field` of the request needs it.
-pub(super) async fn training_coverage(
+async fn training_coverage(
     resident: &Arc<Resident>,
     field: &'static str,
 ) -> Result<Arc<TrainingCoverage>, SessionError> {

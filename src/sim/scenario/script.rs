@@ -75,7 +75,9 @@ fn condition_of(
             let actor = of.as_ref().map(|name| {
                 references.indices.get(name).copied().ok_or_else(|| {
                     let known = listed(references.indices.keys().map(String::as_str));
-                    let must = format!("there is no actor {name:?}; there is {known}; without `of`, the distance is to the ego");
+                    let must = format!(
+                        "there is no actor {name:?}; there is {known}; without `of`, the distance is to the ego"
+                    );
                     FileError::new("of", must)
                 })
             });
