@@ -142,7 +142,7 @@ pub struct Ego {
     pub history_count: u64,
 }
 
-/// Something that happened in a scenario.
+/// Something that happened in a step.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 pub struct Event {
@@ -177,7 +177,9 @@ pub enum EventKind {
     Appeared,
     /// An actor disappeared.
     Left,
-    /// A rule of the scenario ended the episode.
+    /// The ego left the area that the twin was trained on. Its images are not reliable from now on.
+    OffModel,
+    /// A rule ended the episode.
     End,
 }
 

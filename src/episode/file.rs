@@ -188,6 +188,15 @@ impl Frame {
 }
 
 impl EpisodeFile {
+    /// The name of a trigger of an actor's script; `None` if the scenario gives it none.
+    pub fn trigger_name(&self, actor: &str, trigger: u32) -> Option<String> {
+        let actors = self.scenario.as_ref()?.scenario.get("actors")?.as_array()?;
+        let is_named =
+            |entry: &&serde_json::Value| entry.get("name").is_some_and(|name| name == actor);
+        let script = actors.iter().find(is_named)?.get("script")?;
+        Some(script.get(trigger as usize)?.get("name")?.as_str()?.to_owned())
+    }
+
     /// The format that this build reads.
     pub const FORMAT: u32 = 0;
 

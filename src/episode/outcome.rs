@@ -35,7 +35,7 @@ pub fn result(episode: &EpisodeFile) -> Option<EpisodeResult> {
     Some(EpisodeResult {
         verdict: judgement.to_owned(),
         faults: verdict.faults.iter().map(fault).collect(),
-        not_judged: verdict.not_judged.iter().map(|&reason| reason.to_owned()).collect(),
+        not_judged: verdict.not_judged.iter().map(own::NotJudged::to_string).collect(),
         scores: score(&record).into_iter().map(line).collect(),
     })
 }

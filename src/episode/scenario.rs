@@ -6,7 +6,7 @@ use wildcity_scene::Trajectory;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::route::Route;
 use wildcity_sim::map::{AreaKind, LaneKind, LaneSurface, Map, SurfacePoint};
-use wildcity_sim::scenario::{ContactRule, EgoStart, Scenario};
+use wildcity_sim::scenario::{EgoStart, Scenario};
 
 use crate::lines::{ActorLine, EgoLine, GroundPoint, LaneLine, RoutePoint, ScenarioLine};
 
@@ -42,7 +42,7 @@ pub fn scenario_line(
         route,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
-        checks_static: resolved.end.contact == Some(ContactRule::Static),
+        checks_static: true,
     }
 }
 

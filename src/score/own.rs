@@ -1,9 +1,10 @@
-//! `wildcity.verdict@1`: whether an episode passed.
+//! `wildcity.verdict@2`: whether an episode passed.
 //!
 //! It passes if the ego had no contact at fault (`wildcity.fault@1`), with a pedestrian, or with the twin
-//! (`wildcity.static@1`), stayed on the drivable area, and made enough progress. Rules whose input is missing in the
-//! record are not judged, and the verdict lists them. An episode that left the trained area before its first fault
-//! neither passes nor fails, because its images were not reliable.
+//! (`wildcity.static@1`), stayed on the drivable area, and made enough progress. A criterion whose input is missing in the
+//! record is not judged. An episode without a fault then is not judged either: what was not looked for is no pass. An
+//! episode that left the trained area before its first fault neither passes nor fails, because its images were not
+//! reliable.
 
 use serde::Serialize;
 
@@ -14,7 +15,7 @@ use super::record::{DriveRecord, EgoSample, Track};
 use super::scored::{Missing, Score};
 
 /// The name of the score: 1 passed, 0 failed.
-pub const NAME: &str = "wildcity.verdict@1";
+pub const NAME: &str = "wildcity.verdict@2";
 
 /// Default for the progress that is required to pass.
 pub const LEAST_PROGRESS: f64 = 0.8;
@@ -31,7 +32,7 @@ pub enum Judgement {
     Failed,
     /// The ego left the trained area before any fault.
     OffModel,
-    /// The record lacks the input of the verdict.
+    /// No fault, but the record lacks the input of a criterion.
     NotJudged,
 }
 
@@ -55,6 +56,49 @@ pub enum Fault {
     Progress,
 }
 
+/// A part of the verdict, named after its fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Criterion {
+    /// Contacts with actors.
+    Contact,
+    /// Contact with the twin.
+    Static,
+    /// The ego on the drivable area.
+    OffRoad,
+    /// Progress along the recorded drive.
+    Progress,
+}
+
+impl Criterion {
+    /// All criteria.
+    pub const ALL: [Self; 4] = [Self::Contact, Self::Static, Self::OffRoad, Self::Progress];
+
+    /// The name in results: that of its fault, or the beginning of their names.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Contact => "contact",
+            Self::Static => "contact.static",
+            Self::OffRoad => "off_road",
+            Self::Progress => "progress",
+        }
+    }
+}
+
+/// A criterion that was not judged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NotJudged {
+    /// The criterion.
+    pub criterion: Criterion,
+    /// Why.
+    pub reason: &'static str,
+}
+
+impl std::fmt::Display for NotJudged {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {}", self.criterion.name(), self.reason)
+    }
+}
+
 /// A fault and when it happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct FaultAt {
@@ -74,8 +118,8 @@ pub struct Verdict {
     pub judgement: Judgement,
     /// All faults, by time.
     pub faults: Vec<FaultAt>,
-    /// The rules that were not judged, each with the reason.
-    pub not_judged: Vec<&'static str>,
+    /// The criteria that were not judged.
+    pub not_judged: Vec<NotJudged>,
     /// Distance along the recorded drive divided by that of the recording in the same time.
     pub progress: Option<f64>,
     /// Progress that is required to pass.
@@ -104,12 +148,13 @@ impl Fault {
 /// Judges an episode.
 pub fn verdict(record: &DriveRecord) -> Verdict {
     let mut not_judged = Vec::new();
+    let mut lacks = |criterion, reason| not_judged.push(NotJudged { criterion, reason });
     let mut faults = contact_faults(record);
     if record.tracks.is_none() {
-        not_judged.push("contacts: the record has no scenario");
+        lacks(Criterion::Contact, "the record has no scenario");
     }
     match &record.static_contacts {
-        None => not_judged.push("contact with the twin: it was not looked for"),
+        None => lacks(Criterion::Static, "contact with the twin was not looked for"),
         Some(contacts) => faults.extend(contacts.iter().map(|contact| FaultAt {
             fault: Fault::Static,
             time_us: contact.time_us,
@@ -126,11 +171,11 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
                 actor: None,
             }));
         }
-        _ => not_judged.push("drivable area: there is no map"),
+        _ => lacks(Criterion::OffRoad, "the scenario has no map"),
     }
     let progress = progress(record);
     match progress {
-        None => not_judged.push("progress: there is no recorded drive to follow"),
+        None => lacks(Criterion::Progress, "there is no recorded drive to follow"),
         Some(progress) if progress < record.least_progress => {
             faults.push(FaultAt { fault: Fault::Progress, time_us: record.end_us(), actor: None });
         }
@@ -139,7 +184,7 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
     faults.sort_by_key(|fault| fault.time_us);
     let impacts = record.contacts.iter().filter(|contact| !contact.at_start);
     Verdict {
-        judgement: judgement(record, &faults, progress),
+        judgement: judgement(record, &faults, &not_judged),
         faults,
         not_judged,
         progress,
@@ -150,15 +195,18 @@ pub fn verdict(record: &DriveRecord) -> Verdict {
     }
 }
 
-fn judgement(record: &DriveRecord, faults: &[FaultAt], progress: Option<f64>) -> Judgement {
+fn judgement(record: &DriveRecord, faults: &[FaultAt], not_judged: &[NotJudged]) -> Judgement {
     let first_us = faults.first().map(|fault| fault.time_us);
     let off_model =
         record.off_model_us.is_some_and(|off_us| first_us.is_none_or(|fault_us| off_us < fault_us));
-    match (off_model, faults.is_empty(), progress) {
-        (true, ..) => Judgement::OffModel,
-        (false, false, _) => Judgement::Failed,
-        (false, true, None) => Judgement::NotJudged,
-        (false, true, Some(_)) => Judgement::Passed,
+    if off_model {
+        Judgement::OffModel
+    } else if !faults.is_empty() {
+        Judgement::Failed
+    } else if !not_judged.is_empty() {
+        Judgement::NotJudged
+    } else {
+        Judgement::Passed
     }
 }
 
@@ -229,7 +277,11 @@ impl Verdict {
             Judgement::OffModel => {
                 Err(Missing::new("left the trained area of the twin before any fault"))
             }
-            Judgement::NotJudged => Err(Missing::new(self.not_judged.join("; "))),
+            Judgement::NotJudged => {
+                let reasons: Vec<String> =
+                    self.not_judged.iter().map(NotJudged::to_string).collect();
+                Err(Missing::new(reasons.join("; ")))
+            }
         };
         let [along, across] = match self.accelerations_mps2 {
             Some(accelerations) => accelerations.map(Some),

@@ -42,7 +42,10 @@ pub struct Episode {
     /// The least mean trust of an observation, of those that came with a trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     least_trust: Option<f64>,
-    /// Whether a rule of the scenario ended it because the ego failed.
+    /// Whether the ego has left the area that the twin was trained on.
+    #[serde(default, skip_serializing_if = "is_false")]
+    off_model: bool,
+    /// Whether a rule ended it because the ego failed.
     #[serde(default, skip_serializing_if = "is_false")]
     failed: bool,
     /// By camera, whether its images are being repaired; empty if none is.
@@ -66,10 +69,10 @@ fn is_false(value: &bool) -> bool {
 pub enum Outcome {
     /// The agent closed the session or terminated the episode.
     Completed,
-    /// As `Completed`, but the ego left the recorded area: the trust of an observation was below
-    /// [`limits::OFF_MODEL_TRUST`]. Only in sessions whose observations have a trust.
+    /// As `Completed`, but the ego left the recorded area: the trust of a pose, or the mean trust of an observation that has
+    /// one, was below [`limits::OFF_MODEL_TRUST`].
     OffModel,
-    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    /// A rule ended the episode: a contact, off the route, or stuck.
     DrivingFailure,
     /// The agent broke the protocol, and the connection was closed.
     AgentError,
@@ -131,6 +134,7 @@ impl Episode {
             track,
             begin_us,
             least_trust: None,
+            off_model: false,
             failed: false,
             repairing: Vec::new(),
             references: Vec::new(),
@@ -346,7 +350,9 @@ impl Episode {
             || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
         // A replay does not evaluate the rules of the scenario. It takes the outcome from the record.
         let failed = self.failed || outcome == Outcome::DrivingFailure;
-        let off_model = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
+        let off_model = self.off_model
+            || outcome == Outcome::OffModel
+            || least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model, failed) {
             (true, true, _) => Outcome::OffModel,
             (true, false, true) => Outcome::DrivingFailure,
@@ -362,24 +368,34 @@ impl Episode {
         }
     }
 
-    /// Ends the episode by a rule of the scenario.
+    /// Whether the ego has left the area that the twin was trained on.
+    pub(crate) fn is_off_model(&self) -> bool {
+        self.off_model
+    }
+
+    /// Notes that the ego has left the area that the twin was trained on.
+    pub(crate) fn leave_model(&mut self) {
+        self.off_model = true;
+    }
+
+    /// Ends the episode by a rule.
     pub(crate) fn end(&mut self, reason: EndReason) {
         self.terminated = true;
         self.failed = reason.is_failure();
     }
 
-    /// Takes the trusts of an observation's images, 0 to 1 each, into account; there may be none.
-    pub(crate) fn add_trusts(&mut self, trusts: impl Iterator<Item = f64>) {
+    /// Takes the trusts of an observation's images, 0 to 1 each, into account. Returns their mean; `None` if there are
+    /// none.
+    pub(crate) fn add_trusts(&mut self, trusts: impl Iterator<Item = f64>) -> Option<f64> {
         let mut sum = 0.0;
         let mut count = 0.0;
         for trust in trusts {
             sum += trust;
             count += 1.0;
         }
-        if count > 0.0 {
-            let mean = sum / count;
-            self.least_trust = Some(self.least_trust.map_or(mean, |least: f64| least.min(mean)));
-        }
+        let mean = (count > 0.0).then(|| sum / count)?;
+        self.least_trust = Some(self.least_trust.map_or(mean, |least: f64| least.min(mean)));
+        Some(mean)
     }
 
     /// State of the repair that continues from one observation to the next.

@@ -9,6 +9,7 @@
 //! | `session` | a session: opening it, answering its requests |
 //! | `options`, `start` | what a client requests when it opens a session; where episodes start |
 //! | `state`, `episode` | the parts of a session; the ego's pose, the simulated time, and the past poses |
+//! | `contact`, `spatial_index` | contact of the ego with the twin; what of a twin is near a place |
 //! | `snapshot` | named states, to return to and to open other sessions from |
 //! | `engine` | the twins in memory, the render queue, the budget for answers |
 //! | `observe` | which images are rendered, and how they become one message |
@@ -21,6 +22,7 @@
 //! | [`limits`] | limits and defaults |
 
 mod blocking;
+mod contact;
 mod engine;
 mod episode;
 mod error;
@@ -35,12 +37,14 @@ mod scenario;
 mod sensors;
 mod session;
 mod snapshot;
+mod spatial_index;
 mod start;
 mod state;
 mod stills;
 mod viewpoint;
 
 pub use blocking::run_blocking;
+pub use contact::ContactMode;
 pub use engine::answer_budget::BudgetShare;
 pub use engine::render_queue::{FrameCost, Scratch};
 pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};
@@ -54,7 +58,7 @@ pub use observe::layout::HEADER_PREFIX_BYTES;
 pub use observe::observation::{
     DType, ImageInfo, Observation, PastImageInfo, ResidencyStats, Tensor, TensorKind, Timings,
 };
-pub use observe::trust::{TrainingCoverage, Trust};
+pub use observe::trust::{RecordedPoses, TrainingCoverage, Trust};
 pub use options::{
     ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice,
     ScenarioOptions, SessionOptions, Start, StepOptions,

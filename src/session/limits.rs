@@ -26,8 +26,8 @@ pub const FAILED_EXPORTS: usize = 1024;
 /// Default simulated time per step, in microseconds: 10 Hz.
 pub const DT_US: i64 = 100_000;
 
-/// An episode ends as `off_model` if the mean trust of one of its observations was below this. It is reached at a
-/// lateral offset of 11.5 m from the recorded drive, two lanes beyond the neighbouring one.
+/// An episode ends as `off_model` if the trust of one of its poses, or the mean trust of one of its observations, was below
+/// this. It is reached at a lateral offset of 11.5 m from the recorded drive, two lanes beyond the neighbouring one.
 pub const OFF_MODEL_TRUST: f64 = 0.1;
 
 /// JPEG quality unless the session requests another.
@@ -127,6 +127,13 @@ pub const DT_MAX_US: i64 = 10_000_000;
 /// The renderer's intermediate buffers may use 1/`FRAME_SHARE` of the memory for twins. A frame that needs more is
 /// rendered in parts, which costs little: 128 MiB of 1 GiB are a million Gaussians at once.
 pub const FRAME_SHARE: u64 = 8;
+
+/// Solid Gaussians, with which contact is looked for, may use 1/`SOLID_SHARE` of the memory for twins in addition to it:
+/// 32 MiB of 1 GiB are 2 million places of 10 cm, the surfaces of 300 blocks of 16 m. Nine blocks are near an ego.
+pub const SOLID_SHARE: u64 = 32;
+
+/// Solid Gaussians are read ahead up to this far from the ego, in metres: 2 s at 20 m/s.
+pub const SOLIDS_AHEAD_M: f64 = 40.0;
 
 /// Bytes per pixel of a JPEG file for which memory is set aside: twice those of a street of quality 90.
 pub const JPEG_PIXEL_BYTES: u64 = 1;

@@ -10,6 +10,7 @@ use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
 use wildcity_sim::Dynamics;
 
+use crate::contact::ContactMode;
 use crate::observe::encode::Encoding;
 use crate::scenario::load::ScenarioSource;
 use crate::sensors::settings::Sensors;
@@ -49,6 +50,9 @@ pub struct SessionOptions {
     pub repair: Option<RepairOptions>,
     /// Effects of its sensors; none if absent.
     pub sensors: Option<Sensors>,
+    /// What contact with the twin does. If absent, the scenario decides; without a scenario, a contact of a teleported ego
+    /// is reported, and another one ends the episode.
+    pub contact: Option<ContactMode>,
 }
 
 /// A scenario, and which values of its ego section apply.
@@ -85,6 +89,7 @@ impl SessionOptions {
             scenario: None,
             repair: None,
             sensors: None,
+            contact: None,
         }
     }
 }

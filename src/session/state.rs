@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use wildcity_scene::{ProfileOverrides, RenderProfile};
 use wildcity_sim::Dynamics;
-use wildcity_sim::contact::Solids;
+use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::Resident;
 
+use crate::contact::{ContactMode, TwinSolids};
 use crate::engine::answer_budget::BudgetShare;
 use crate::episode::Episode;
 use crate::observe::frame_history::FrameHistory;
@@ -18,7 +19,8 @@ use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
 use crate::repair::references::ReferenceViews;
 use crate::repair::session_repair::SessionRepair;
-use crate::scenario::{EpisodeTraffic, SessionScenario};
+use crate::scenario::{EpisodeTraffic, Event, SessionScenario};
+use crate::spatial_index::SpatialIndex;
 use crate::start::EpisodeStart;
 
 /// Settings that `open` determines. Sessions that are branches of another one share its settings.
@@ -45,6 +47,10 @@ pub(crate) struct SessionSettings {
     pub(crate) reports_actors: bool,
     /// The repair of the images, if the session asked for it.
     pub(crate) repair: Option<Arc<SessionRepair>>,
+    /// What contact with the twin does; `None` leaves it to the dynamics of each episode, or to the scenario.
+    pub(crate) contact: Option<ContactMode>,
+    /// The size with which contact with the twin is looked for; `None` if it is not.
+    pub(crate) solid_ego: Option<EgoBox>,
 }
 
 /// The version of the twin that a session shows, and how.
@@ -56,8 +62,10 @@ pub(crate) struct PinnedVersion {
     pub(crate) profile_hash: blake3::Hash,
     /// Poses where the twin was recorded; only if images come with their trust or may be repaired.
     pub(crate) coverage: Option<Arc<TrainingCoverage>>,
-    /// Its solid Gaussians near the scenario's route; only if a contact with them ends an episode.
-    pub(crate) solids: Option<Arc<Solids>>,
+    /// What of it is near a place.
+    pub(crate) index: Arc<SpatialIndex>,
+    /// Its solid Gaussians; only if contact with them is looked for.
+    pub(crate) solids: Option<TwinSolids>,
     /// References of the views; only if the session's repair model needs some.
     pub(crate) references: Option<Arc<ReferenceViews>>,
 }
@@ -71,6 +79,8 @@ pub(crate) struct EpisodeState {
     pub(crate) frame_history: FrameHistory,
     /// The actors; only with a scenario.
     pub(crate) traffic: Option<EpisodeTraffic>,
+    /// Events of the last step, by time. With a scenario, those of the traffic.
+    pub(crate) events: Vec<Event>,
 }
 
 impl PinnedVersion {
@@ -78,13 +88,14 @@ impl PinnedVersion {
         resident: Arc<Resident>,
         profile: RenderProfile,
         coverage: Option<Arc<TrainingCoverage>>,
+        index: Arc<SpatialIndex>,
     ) -> Self {
         let profile_hash = profile_hash(&profile);
-        Self { resident, profile, profile_hash, coverage, solids: None, references: None }
+        Self { resident, profile, profile_hash, coverage, index, solids: None, references: None }
     }
 
     /// Sets the solid Gaussians.
-    pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>) -> Self {
+    pub(crate) fn with_solids(self, solids: Option<TwinSolids>) -> Self {
         Self { solids, ..self }
     }
 
@@ -103,6 +114,7 @@ impl PinnedVersion {
 impl EpisodeState {
     /// The state at the start of an episode.
     pub(crate) fn at_start(episode: Episode) -> Self {
-        Self { episode, frame_history: FrameHistory::default(), traffic: None }
+        let frame_history = FrameHistory::default();
+        Self { episode, frame_history, traffic: None, events: Vec::new() }
     }
 }

@@ -1,7 +1,7 @@
 //! How a run ended: its exit code, and why.
 
 use crate::compare::{CompareError, Comparison};
-use crate::limits;
+use crate::file::OFF_MODEL;
 use crate::result::SuiteResult;
 
 /// The exit code of a run.
@@ -13,10 +13,12 @@ pub enum ExitCode {
     Driving = 1,
     /// The command line, the suite, a scenario or the previous run is invalid.
     Usage = 2,
-    /// An episode was not driven, or more than a tenth were off the model.
+    /// An episode was not driven.
     Technical = 3,
     /// With `--verify`: an episode does not repeat.
     NotVerified = 4,
+    /// No episode failed more than is allowed, but some were not judged, or left the trained area.
+    NotJudged = 5,
 }
 
 /// How a run ended.
@@ -32,22 +34,28 @@ impl Ending {
     /// Decides how a run ended. Technical failures take precedence over driving failures, because an incomplete result
     /// says little about the driver.
     ///
-    /// Without a required pass rate and without a previous run, every episode must pass.
+    /// Without a required pass rate and without a previous run, every episode must pass. An episode without a verdict is
+    /// not a pass in any case: a driver that leaves the trained area would raise its rate.
     pub fn of(result: &SuiteResult, against: Option<&Result<Comparison, CompareError>>) -> Self {
         let counts = &result.counts;
-        let off_model = counts.off_model as f64;
-        let too_often_off = off_model > limits::OFF_MODEL_SHARE * counts.episodes as f64;
-        let all_passed = counts.failed == 0 && counts.not_judged == 0;
+        let has_failed = counts.failed > 0;
+        let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
+        let is_unjudged = counts.not_judged > 0 || (counts.off_model > 0 && !accepts_off_model);
         let low = result.pass_rate.interval[0];
         let rate_is_low = result.at_least.is_some_and(|least| low < least);
         let is_worse = matches!(against, Some(Ok(comparison)) if comparison.worse);
         let is_not_compared = matches!(against, Some(Err(_)));
         let must_all_pass = result.at_least.is_none() && against.is_none();
-        let code = match counts.technical > 0 || too_often_off {
-            true => ExitCode::Technical,
-            false if is_not_compared => ExitCode::Usage,
-            false if rate_is_low || is_worse || (must_all_pass && !all_passed) => ExitCode::Driving,
-            false => ExitCode::Passed,
+        let code = if counts.technical > 0 {
+            ExitCode::Technical
+        } else if is_not_compared {
+            ExitCode::Usage
+        } else if rate_is_low || is_worse || (must_all_pass && has_failed) {
+            ExitCode::Driving
+        } else if is_unjudged {
+            ExitCode::NotJudged
+        } else {
+            ExitCode::Passed
         };
         let mut why = vec![counted(result)];
         why.extend(result.at_least.map(|least| match rate_is_low {
@@ -74,7 +82,7 @@ fn counted(result: &SuiteResult) -> String {
         return format!("all {} episodes passed", counts.episodes);
     }
     format!(
-        "of {} episodes {} failed, {} were not judged, {} were not driven, {} left the trained area",
-        counts.episodes, counts.failed, counts.not_judged, counts.technical, counts.off_model
+        "of {} episodes {} were not judged, {} left the trained area, {} failed, {} were not driven",
+        counts.episodes, counts.not_judged, counts.off_model, counts.failed, counts.technical
     )
 }

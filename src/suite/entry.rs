@@ -33,7 +33,7 @@ pub struct EpisodeEntry {
     pub status: Status,
     /// The faults, by time.
     pub faults: Vec<FaultLine>,
-    /// What was not judged, and why.
+    /// Criteria that were not judged, and why: `off_road: the scenario has no map`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub not_judged: Vec<String>,
     /// The scores.
@@ -91,7 +91,13 @@ pub enum Status {
 }
 
 impl EpisodeEntry {
-    pub(crate) fn new(case: &Case, finished: Option<Finished>, errors: Vec<Technical>) -> Self {
+    /// The entry of a case. A pass need not be judged by the criteria `accept_unjudged`.
+    pub(crate) fn new(
+        case: &Case,
+        finished: Option<Finished>,
+        errors: Vec<Technical>,
+        accept_unjudged: &[String],
+    ) -> Self {
         let errors = errors.into_iter().map(|error| TechnicalEntry {
             kind: error.kind.to_owned(),
             message: error.message,
@@ -122,6 +128,7 @@ impl EpisodeEntry {
                 "passed" => Status::Passed,
                 "failed" => Status::Failed,
                 "off_model" => Status::OffModel,
+                _ if are_accepted(&result.not_judged, accept_unjudged) => Status::Passed,
                 _ => Status::NotJudged,
             };
             entry.faults = result.faults;
@@ -135,6 +142,15 @@ impl EpisodeEntry {
         }
         entry
     }
+}
+
+/// Whether all criteria of an episode that were not judged are accepted. Each text begins with the name of its criterion.
+/// Without a text, the record has no verdict that a suite could accept.
+fn are_accepted(not_judged: &[String], accept_unjudged: &[String]) -> bool {
+    let is_accepted = |text: &String| {
+        text.split_once(':').is_some_and(|(name, _)| accept_unjudged.iter().any(|one| one == name))
+    };
+    !not_judged.is_empty() && not_judged.iter().all(is_accepted)
 }
 
 impl EpisodeEntry {

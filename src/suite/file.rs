@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use wildcity_score::own::Criterion;
 use wildcity_sim::scenario::{Document, FileError, ScenarioFile, check_format};
 
 use crate::error::SuiteError;
@@ -47,10 +48,18 @@ pub struct SuiteFile {
     /// pass.
     #[serde(default)]
     pub at_least: Option<f64>,
+    /// Criteria that need not be judged for a pass, by their names ([`Criterion`]): scenarios without a map cannot be judged
+    /// by `off_road`. And `off_model`: episodes that leave the trained area are no mistake of the run. If absent, an
+    /// episode passes only if all criteria were judged.
+    #[serde(default)]
+    pub accept_unjudged: Vec<String>,
     /// Its own file.
     #[serde(skip)]
     pub path: PathBuf,
 }
+
+/// The name in [`SuiteFile::accept_unjudged`] for episodes that leave the trained area.
+pub(crate) const OFF_MODEL: &str = "off_model";
 
 /// A scenario of a suite.
 #[derive(Clone, Debug, PartialEq)]
@@ -113,6 +122,7 @@ impl SuiteFile {
             size: None,
             dt_us: None,
             at_least: None,
+            accept_unjudged: Vec::new(),
             path: path.to_owned(),
         }
     }
@@ -128,12 +138,24 @@ impl SuiteFile {
             let message = format!("[{first}, {last}]; write the first and the last seed");
             return Err(FileError::new("seeds", message));
         }
+        check_criteria(&self.accept_unjudged)
+            .map_err(|message| FileError::new("accept_unjudged", message))?;
         match self.at_least {
             Some(rate) if !(0.0..=1.0).contains(&rate) => {
                 Err(FileError::new("at_least", format!("{rate:?}; a rate is from 0 to 1")))
             }
             _ => Ok(()),
         }
+    }
+}
+
+/// Checks names of criteria that need not be judged. The error names the first that is none, and those that there are.
+pub fn check_criteria(names: &[String]) -> Result<(), String> {
+    let mut known = Criterion::ALL.map(Criterion::name).to_vec();
+    known.push(OFF_MODEL);
+    match names.iter().find(|name| !known.contains(&name.as_str())) {
+        None => Ok(()),
+        Some(unknown) => Err(format!("{unknown:?} is no criterion; there is {}", known.join(", "))),
     }
 }
 

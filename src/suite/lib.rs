@@ -53,7 +53,7 @@ pub use driver::BuiltIn;
 pub use ending::{Ending, ExitCode};
 pub use entry::{EpisodeEntry, Status, TechnicalEntry};
 pub use error::{AGENTS, SuiteError};
-pub use file::{SuiteFile, SuiteScenario};
+pub use file::{SuiteFile, SuiteScenario, check_criteria};
 pub use junit::junit;
 pub use page::page;
 pub use picture::{Picture, pictures};

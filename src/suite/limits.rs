@@ -29,9 +29,6 @@ pub const CLOSE_WAIT: Duration = Duration::from_secs(5);
 /// How long a run waits at its end for the MCAP files of its episodes.
 pub const EXPORT_WAIT: Duration = Duration::from_secs(60);
 
-/// Share of episodes that may end off the model.
-pub const OFF_MODEL_SHARE: f64 = 0.1;
-
 /// Worst episodes that the report shows with pictures.
 pub const WORST: usize = 12;
 

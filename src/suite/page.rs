@@ -23,11 +23,12 @@ pub fn page(
     let title = format!("{}: {}", result.suite, result.agent);
     let body = html! {
         (outcome(result, ending))
+        (unjudged(result))
+        (worst(result, pictures, episodes))
         h2 { "Scenarios" }
         (scenarios(result))
         h2 { "Scores" }
         (means(result))
-        (worst(result, pictures, episodes))
         h2 { "Episodes" }
         (table(result))
     };
@@ -38,14 +39,38 @@ fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
     let counts = &result.counts;
     html! {
         p {
-            (counts.episodes) " episodes: " (counts.passed) " passed, " (counts.failed) " failed, "
-            (counts.off_model) " off the model, " (counts.not_judged) " not judged, "
+            (counts.episodes) " episodes: " (counts.not_judged) " not judged, " (counts.off_model)
+            " left the trained area, " (counts.failed) " failed, " (counts.passed) " passed, "
             (counts.technical) " not driven for technical reasons."
         }
         p { "Pass rate: " (rate(&result.pass_rate)) "." }
         @if counts.duplicates > 0 { p.failed { (duplicates(result)) } }
         p { "Exit code " (ending.code as u8) ": " (ending.why) "." }
         @if result.latest { p { "Run on the latest versions of the twins, whatever the scenarios name." } }
+    }
+}
+
+/// Episodes without a verdict, with the reasons: they come first, since a run with them says less than it seems to.
+fn unjudged(result: &SuiteResult) -> Markup {
+    let is_unjudged =
+        |episode: &&EpisodeEntry| matches!(episode.status, Status::NotJudged | Status::OffModel);
+    let episodes: Vec<&EpisodeEntry> = result.episodes.iter().filter(is_unjudged).collect();
+    html! {
+        @if !episodes.is_empty() {
+            h2 { "Without a verdict" }
+            p { "These episodes are no passes. A suite that accepts a criterion which cannot be judged names it in "
+                code { "accept_unjudged" } "." }
+            table {
+                tr { th { "episode" } th { "result" } th { "why" } }
+                @for episode in episodes {
+                    tr {
+                        td { (episode.name) }
+                        td class=(episode.status.name()) { (episode.status.name()) }
+                        td { (why(episode)) }
+                    }
+                }
+            }
+        }
     }
 }
 
@@ -171,6 +196,9 @@ fn why(episode: &EpisodeEntry) -> Markup {
     let reasons = episode.not_judged.iter().filter(|_| is_not_judged);
     let mut texts = episode.fault_texts();
     texts.extend(reasons.cloned());
+    if episode.status == Status::OffModel {
+        texts.push("left the trained area of the twin before any fault".to_owned());
+    }
     texts.extend(episode.duplicate_text());
     html! {
         (texts.join("; "))

@@ -31,6 +31,9 @@ pub struct SuiteResult {
     /// The least pass rate that was asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub at_least: Option<f64>,
+    /// The criteria that needed not be judged for a pass.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub accept_unjudged: Vec<String>,
     /// How many episodes ended how.
     pub counts: Counts,
     /// The pass rate, of the episodes that were judged, without duplicates.
@@ -56,6 +59,8 @@ pub(crate) struct RunHead {
     pub(crate) dt_us: Option<i64>,
     /// The least pass rate that was asked for.
     pub(crate) at_least: Option<f64>,
+    /// The criteria that needed not be judged for a pass.
+    pub(crate) accept_unjudged: Vec<String>,
 }
 
 /// The header of a result file: only its format, which is checked first.
@@ -75,7 +80,7 @@ pub struct Counts {
     pub failed: u64,
     /// Left the trained area before any fault.
     pub off_model: u64,
-    /// Episodes without the inputs of a verdict.
+    /// Without a fault, but not judged by every criterion.
     pub not_judged: u64,
     /// Not driven, for technical reasons.
     pub technical: u64,
@@ -139,6 +144,7 @@ impl SuiteResult {
             latest: head.latest,
             dt_us: head.dt_us,
             at_least: head.at_least,
+            accept_unjudged: head.accept_unjudged,
             counts,
             pass_rate: Rate::of(episodes.iter()),
             means: means(&by_scenario),

@@ -63,6 +63,8 @@ pub struct RunSettings {
     pub latest: bool,
     /// Lower limit of the pass rate, which the lower end of its interval must reach. `None`: every episode must pass.
     pub at_least: Option<f64>,
+    /// Criteria that need not be judged for a pass ([`SuiteFile::accept_unjudged`](crate::SuiteFile::accept_unjudged)).
+    pub accept_unjudged: Vec<String>,
     /// The twins.
     pub catalog: Catalog,
     /// Directory or URL of the twins, for the server that external agents connect to.
@@ -86,6 +88,7 @@ struct Shared {
     agent: AgentChoice,
     retries: u32,
     agent_timeout: Duration,
+    accept_unjudged: Vec<String>,
     episodes: PathBuf,
     host: Host,
     progress: Box<dyn Fn(&EpisodeEntry) + Send + Sync>,
@@ -128,12 +131,14 @@ pub async fn run(settings: RunSettings, cases: Vec<Case>) -> Result<SuiteResult,
         // The step of the suite, which is the same for all cases.
         dt_us: cases.first().and_then(|case| case.options.dt_us),
         at_least: settings.at_least,
+        accept_unjudged: settings.accept_unjudged.clone(),
     };
     let permits = Arc::new(Semaphore::new(settings.jobs.clamp(1, limits::JOBS)));
     let shared = Arc::new(Shared {
         agent: settings.agent,
         retries: settings.retries,
         agent_timeout: settings.agent_timeout,
+        accept_unjudged: settings.accept_unjudged,
         episodes: settings.episodes,
         host,
         progress: settings.progress,
@@ -256,7 +261,14 @@ impl Shared {
                 }
             };
             match finished {
-                Ok(finished) => return Ok(EpisodeEntry::new(case, Some(finished), errors)),
+                Ok(finished) => {
+                    return Ok(EpisodeEntry::new(
+                        case,
+                        Some(finished),
+                        errors,
+                        &self.accept_unjudged,
+                    ));
+                }
                 Err(technical) => {
                     tracing::warn!(
                         episode = case.name,
@@ -268,7 +280,7 @@ impl Shared {
                 }
             }
         }
-        Ok(EpisodeEntry::new(case, None, errors))
+        Ok(EpisodeEntry::new(case, None, errors, &self.accept_unjudged))
     }
 
     /// Drives a case. Returns the file of its record.

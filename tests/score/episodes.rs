@@ -300,7 +300,7 @@ fn off_model_counts_only_before_the_fault() {
     assert_eq!(verdict(&record).judgement, Judgement::OffModel);
     record.off_model_us = Some(2_000_000);
     assert_eq!(verdict(&record).judgement, Judgement::Failed);
-    assert!(value(&record, "wildcity.verdict@1") == Some(0.0));
+    assert!(value(&record, "wildcity.verdict@2") == Some(0.0));
 }
 
 #[test]
@@ -354,7 +354,7 @@ fn every_score_has_a_range_and_stays_in_it() {
         }
     }
     // Shares, stars, percents and metres.
-    assert_eq!(range_of("wildcity.verdict@1"), [0.0, 1.0]);
+    assert_eq!(range_of("wildcity.verdict@2"), [0.0, 1.0]);
     assert_eq!(range_of("neuroncap.score@ecdcf28"), [0.0, 5.0]);
     assert_eq!(range_of("bench2drive.driving@7ec25d1"), [0.0, 100.0]);
     assert_eq!(range_of("alpasim.open_loop_collision@3032e0c"), [0.0, 1.0]);

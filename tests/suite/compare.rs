@@ -10,7 +10,7 @@ use crate::street::Bench;
 
 const DRIVING: &str = "bench2drive.driving@7ec25d1";
 const ADE: &str = "alpasim.min_ade_5s@3032e0c";
-const VERDICT: &str = "wildcity.verdict@1";
+const VERDICT: &str = "wildcity.verdict@2";
 
 /// A result by hand: episodes of the scenario `s` with the seeds 0, 1, .. and these statuses.
 struct Made {

@@ -331,10 +331,10 @@ pub struct Summary {
 pub enum Outcome {
     /// The agent closed the session, or ended the episode with `terminate`.
     Completed,
-    /// As `completed`, but the images of a reset or a step had a mean confidence below 0.1: the agent left
-    /// the recorded area. Only with `outputs.trust`.
+    /// As `completed`, but the agent left the recorded area: the trust of a pose was below 0.1, or, with
+    /// `outputs.trust`, the mean trust of the images of a reset or a step.
     OffModel,
-    /// A rule of the scenario ended the episode: a contact, off the route, or stuck.
+    /// A rule ended the episode: a contact, off the route, or stuck.
     DrivingFailure,
     /// The agent violated the protocol in a way that ended the connection.
     AgentError,

@@ -19,8 +19,8 @@ pub use answer::{
 pub use branch::{Branch, BranchPoint};
 pub use drive::{Drive, DrivePose, DriveSection};
 pub use open::{
-    Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, OnFailure, Open, Outputs,
-    RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice, Start,
+    ContactMode, Dynamics, DynamicsChoice, DynamicsModel, Encoding, ImagePart, OnFailure, Open,
+    Outputs, RandomStart, Repair, Rig, RigCamera, RigChoice, ScenarioChoice, Start,
 };
 pub use pose::Pose;
 pub use request::{Action, ClientInfo, Request, SessionStep, TimedPose};

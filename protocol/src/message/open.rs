@@ -93,6 +93,10 @@ pub struct Open {
     /// Effects of the sensors, and the delay of the planner. If absent, none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensors: Option<Sensors>,
+    /// What contact with the twin does. If absent, the scenario decides. Without a scenario, a contact of a teleported ego is
+    /// reported, and another one ends the episode.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub contact: Option<ContactMode>,
     /// The scenario to drive. If absent, there are no actors and no route.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<ScenarioChoice>,
@@ -136,6 +140,7 @@ impl Open {
             decision_us: None,
             repair: None,
             sensors: None,
+            contact: None,
             scenario: None,
             warm_up_us: None,
             trajectory: None,
@@ -180,6 +185,19 @@ pub enum OnFailure {
     Unrepaired,
     /// The request is refused with `repair_failed`, and nothing changed.
     Error,
+}
+
+/// What contact with the twin does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum ContactMode {
+    /// It is an event, and ends the episode. Only without a scenario.
+    End,
+    /// It is an event, and the episode goes on. Only without a scenario.
+    Report,
+    /// It is not looked for.
+    Off,
 }
 
 /// Where an episode starts.

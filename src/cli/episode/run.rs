@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use wildcity_render::Backend;
 use wildcity_suite::{
-    CaseOptions, CompareError, Comparison, Ending, ExitCode, Rule, RunSettings, SuiteError,
-    SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases, junit, page, pictures, verify,
+    CaseOptions, CompareError, Comparison, Ending, ExitCode, Rule, RunSettings, Status, SuiteError,
+    SuiteFile, SuiteResult, TechnicalEntry, Tolerance, cases, check_criteria, junit, page,
+    pictures, verify,
 };
 use wildcity_twin::store::Catalog;
 
@@ -23,9 +24,10 @@ use super::{bad_input, exit};
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
 /// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if every
-/// episode was judged and none failed by driving, and 1 otherwise. It is 2 if the command line, the suite, a scenario or the run of
-/// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for technical reasons, or
-/// more than a tenth of the episodes left the trained area. It is 4 if an episode does not repeat (--verify).
+/// episode passed, and 1 if one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
+/// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for technical reasons. It is 4
+/// if an episode does not repeat (--verify). It is 5 if none failed, but one has no verdict: a criterion could not be
+/// judged, or the ego left the trained area. A suite, or --accept-unjudged, may accept that by name.
 ///
 /// With --at-least or --against, the exit code can be 0 although episodes failed. --at-least requires a pass rate, and
 /// --against that the run is not worse than an earlier one, as `wildcity episode compare` judges; it also writes
@@ -70,6 +72,11 @@ pub(super) struct Run {
     /// the suite; without one every episode must pass]
     #[arg(long, value_name = "RATE")]
     at_least: Option<f64>,
+
+    /// A criterion that need not be judged for a pass: contact, contact.static, off_road (a scenario without a map) or
+    /// progress; or off_model, for episodes that leave the trained area. In addition to those of the suite.
+    #[arg(long, value_name = "CRITERION")]
+    accept_unjudged: Vec<String>,
 
     /// Compare with an earlier run: its result.json, or its folder.
     #[arg(long, value_name = "RUN")]
@@ -120,6 +127,10 @@ impl Run {
         if at_least.is_some_and(|rate| !(0.0..=1.0).contains(&rate)) {
             return Err(bad_input("--at-least is a rate from 0 to 1"));
         }
+        check_criteria(&self.accept_unjudged)
+            .map_err(|reason| bad_input(format!("--accept-unjudged: {reason}")))?;
+        let accept_unjudged =
+            [suite.accept_unjudged.clone(), self.accept_unjudged.clone()].concat();
         let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
         let agent = choice(&agent)?;
         let catalog = self.twins.catalog()?;
@@ -147,6 +158,7 @@ impl Run {
             agent_timeout: Duration::from_secs(self.agent_timeout_s),
             latest: self.latest,
             at_least,
+            accept_unjudged,
             catalog: catalog.clone(),
             twins: self.twins.dir()?,
             cache: self.twins.cache(),
@@ -234,6 +246,9 @@ impl Run {
         for episode in &result.episodes {
             let mut why: Vec<String> =
                 episode.faults.iter().map(|fault| fault.fault.clone()).collect();
+            if episode.status == Status::NotJudged {
+                why.extend(episode.not_judged.iter().cloned());
+            }
             why.extend(episode.errors.last().map(TechnicalEntry::text));
             why.extend(episode.duplicate_text());
             let status = episode.status.name();

@@ -113,7 +113,11 @@ fn text(event: &Event, episode: &EpisodeFile) -> String {
             format!("contact with the twin at {impact_mps:.2} m/s, {area_m2:.3} m²")
         }
         Event::OffModel { trust } => format!("left the trained area: trust {trust:.3}"),
-        Event::Triggered { actor, trigger } => format!("{} fires trigger {trigger}", name(*actor)),
+        Event::Triggered { actor, trigger } => {
+            let actor = name(*actor);
+            let trigger = episode.trigger_name(&actor, *trigger).unwrap_or(trigger.to_string());
+            format!("{actor} fires trigger {trigger}")
+        }
         Event::Appeared { actor } => format!("{} appears", name(*actor)),
         Event::Left { actor } => format!("{} leaves", name(*actor)),
         Event::Ended { rule } => format!("ended by the rule {rule}"),

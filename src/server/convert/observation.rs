@@ -190,7 +190,7 @@ fn metadata(
         geo: located.map(geo),
         images: frame.images.iter().zip(image_names).map(drawn).collect(),
         history: frame.history.iter().map(past).collect(),
-        events: session.traffic().map(events).unwrap_or_default(),
+        events: events(session),
         route: session.traffic().and_then(|traffic| route(traffic, episode)),
         actors: session.traffic().filter(|_| session.reports_actors()).map(actors),
         timings: Timings {
@@ -219,8 +219,9 @@ fn geo(located: GeoPose) -> Geo {
     }
 }
 
-fn events(traffic: &EpisodeTraffic) -> Vec<Event> {
-    let name_of = |actor: u16| traffic.specs()[usize::from(actor)].name.clone();
+fn events(session: &Session) -> Vec<Event> {
+    let traffic = session.traffic();
+    let name_of = |actor: u16| Some(traffic?.specs().get(usize::from(actor))?.name.clone());
     let event = |event: &wildcity_session::Event| {
         let mut told = Event {
             time_us: event.time_us,
@@ -233,7 +234,7 @@ fn events(traffic: &EpisodeTraffic) -> Vec<Event> {
         match &event.kind {
             EventKind::Contact(contact) => {
                 told.kind = wire::EventKind::Contact;
-                told.actor = Some(name_of(contact.actor));
+                told.actor = name_of(contact.actor);
                 told.at_fault = (!contact.at_start).then_some(contact.ego_at_fault);
                 told.impact = Some(contact.impact_mps);
             }
@@ -244,23 +245,24 @@ fn events(traffic: &EpisodeTraffic) -> Vec<Event> {
             }
             EventKind::Trigger { actor, trigger } => {
                 told.kind = wire::EventKind::Trigger;
-                told.actor = Some(name_of(*actor));
-                let name = traffic.trigger_name(*actor, *trigger);
+                told.actor = name_of(*actor);
+                let name = traffic.map_or("", |traffic| traffic.trigger_name(*actor, *trigger));
                 told.name = (!name.is_empty()).then(|| name.to_owned());
             }
             EventKind::Appeared { actor } => {
                 told.kind = wire::EventKind::Appeared;
-                told.actor = Some(name_of(*actor));
+                told.actor = name_of(*actor);
             }
             EventKind::Left { actor } => {
                 told.kind = wire::EventKind::Left;
-                told.actor = Some(name_of(*actor));
+                told.actor = name_of(*actor);
             }
+            EventKind::OffModel { .. } => told.kind = wire::EventKind::OffModel,
             EventKind::End(reason) => told.name = Some(reason.name().to_owned()),
         }
         told
     };
-    traffic.events().iter().map(event).collect()
+    session.events().iter().map(event).collect()
 }
 
 fn route(traffic: &EpisodeTraffic, episode: &Episode) -> Option<Route> {

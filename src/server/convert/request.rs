@@ -14,8 +14,9 @@ use wildcity_scene::ProfileOverrides;
 use wildcity_scene::geometry::Pose;
 use wildcity_session::is_episode_name;
 use wildcity_session::{
-    Encoding, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions,
-    RigChoice, ScenarioOptions, ScenarioSource, SessionError, SessionOptions, Start, StepOptions,
+    ContactMode, Encoding, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions,
+    ResetOptions, RigChoice, ScenarioOptions, ScenarioSource, SessionError, SessionOptions, Start,
+    StepOptions,
 };
 use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::{Dynamics, EgoModel};
@@ -342,6 +343,11 @@ fn open_command(open: message::Open) -> Result<Command, Fault> {
         decision_us: open.decision_us,
         repair: open.repair.map(repair_of),
         sensors: open.sensors.map(sensors_of),
+        contact: open.contact.map(|contact| match contact {
+            message::ContactMode::End => ContactMode::End,
+            message::ContactMode::Report => ContactMode::Report,
+            message::ContactMode::Off => ContactMode::Off,
+        }),
         warm_up_us: open.warm_up_us.unwrap_or(0),
     };
     Ok(Command::Open { name, opening: Box::new(opening), drive: open.trajectory.map(Into::into) })

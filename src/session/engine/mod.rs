@@ -4,13 +4,14 @@ pub(crate) mod answer_budget;
 mod exports;
 mod leases;
 pub(crate) mod render_queue;
+pub(crate) mod solid_blocks;
 pub(crate) mod spare_memory;
 pub(crate) mod twin_summaries;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use parking_lot::Mutex;
@@ -20,6 +21,7 @@ use wildcity_render::{Backend, RenderError, View};
 use wildcity_repair::Models;
 use wildcity_scene::actor::ActorAsset;
 use wildcity_scene::{Rays, RenderProfile};
+use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::{
     Cache, FrameBytes, Prefetcher, Reservation, ResidencyError, Resident, ResidentActor, RigExtent,
     Stats, Urgency, Viewpoint,
@@ -30,11 +32,14 @@ use self::answer_budget::{AnswerBudget, BudgetShare};
 use self::exports::Exports;
 use self::leases::Leases;
 use self::render_queue::{FrameCost, RenderQueue, Scratch};
+use self::solid_blocks::SolidBlocks;
 use self::twin_summaries::{SummaryCache, TwinSummaries};
 use crate::blocking::run_blocking;
+use crate::contact::TwinSolids;
 use crate::error::SessionError;
 use crate::limits;
 use crate::scenario::load::Scenarios;
+use crate::spatial_index::SpatialIndex;
 
 /// The [`FrameCost::session`] of frames that are rendered for pushes.
 pub const PUSHES: u64 = 0;
@@ -69,6 +74,9 @@ pub struct Engine {
     queue: RenderQueue,
     session_numbers: AtomicU64,
     answer_budget: AnswerBudget,
+    /// The versions that are open, by place; by the hashes of the versions.
+    indexes: Mutex<BTreeMap<String, Weak<SpatialIndex>>>,
+    solid_blocks: Arc<SolidBlocks>,
     /// The export of ended episodes as MCAP files; `None` if episodes are not exported.
     exports: Option<Exports>,
     /// For each twin, the version that counts as its latest while a newer one is loaded.
@@ -95,6 +103,10 @@ impl Engine {
         Ok(Arc::new(Self {
             summaries: Arc::new(SummaryCache::new(cache.catalog().clone())),
             leases: Arc::new(Leases::new(cache.catalog().clone())),
+            indexes: Mutex::default(),
+            solid_blocks: Arc::new(SolidBlocks::new(
+                (cache.limit_bytes() / limits::SOLID_SHARE) as usize,
+            )),
             cache,
             episodes,
             scenarios,
@@ -294,6 +306,26 @@ impl Engine {
         let Some(sky) = resident.sky().cloned() else { return Ok(()) };
         let baked = run_blocking(move || sky.drawable(profile.sky_error).map(|_| ())).await?;
         baked.map_err(SessionError::Sky)
+    }
+
+    /// What of a version is near a place. Sessions of the same version share it. Blocks: a long drive has half a million
+    /// keyframes and sections.
+    pub(crate) fn spatial_index(&self, resident: &Resident) -> Arc<SpatialIndex> {
+        let hash = &resident.version.hash;
+        if let Some(index) = self.indexes.lock().get(hash).and_then(Weak::upgrade) {
+            return index;
+        }
+        // Built without the lock: another session may build the same one, and then one of both is dropped.
+        let index = Arc::new(SpatialIndex::new(resident.version.clone()));
+        let mut indexes = self.indexes.lock();
+        indexes.retain(|_, index| index.strong_count() > 0);
+        indexes.insert(hash.clone(), Arc::downgrade(&index));
+        index
+    }
+
+    /// The solid Gaussians of a version, for an ego of a size.
+    pub(crate) fn solids(&self, index: Arc<SpatialIndex>, ego_box: EgoBox) -> TwinSolids {
+        TwinSolids::new(self.catalog().clone(), index, self.solid_blocks.clone(), ego_box)
     }
 
     /// Reserves the memory that the worst frame of a rig needs, wherever in the twin the ego is, and the buffers and

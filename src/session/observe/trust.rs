@@ -9,9 +9,10 @@
 //!
 //! It is computed on the render thread that finishes an image, from one in 256 of its pixels, while other
 //! cameras are still rendered. The nearest keyframe is found in an index of boxes of 64 keyframes
-//! ([`wildcity_scene::route`]), so that 84 km of keyframes are not searched one by one. An episode keeps
-//! the least trust of its observations, and ends as `off_model` if that was below
-//! [`limits::OFF_MODEL_TRUST`](crate::limits::OFF_MODEL_TRUST).
+//! ([`wildcity_scene::route`]), so that 84 km of keyframes are not searched one by one. An episode
+//! ends as `off_model` if the first factor of one of its poses was below
+//! [`limits::OFF_MODEL_TRUST`](crate::limits::OFF_MODEL_TRUST), whether or not images have a trust; and if the mean trust
+//! of an observation was, where they have one.
 
 use std::collections::HashMap;
 
@@ -68,11 +69,17 @@ pub struct Trust {
     pub outside: f64,
 }
 
+/// The poses at which a twin was recorded.
+#[derive(Debug)]
+pub struct RecordedPoses {
+    keyframes: Vec<Pose>,
+    boxes: BoxIndex,
+}
+
 /// Where a twin was recorded and trained.
 #[derive(Debug)]
 pub struct TrainingCoverage {
-    keyframes: Vec<Pose>,
-    boxes: BoxIndex,
+    recorded: RecordedPoses,
     /// Lowest and highest content of each 16 m block of the map, in metres.
     heights_m: HashMap<[i64; 2], [f64; 2]>,
 }
@@ -91,8 +98,8 @@ struct GroundShares {
     outside: f64,
 }
 
-impl TrainingCoverage {
-    /// The coverage of a version of a twin; `None` without a recorded drive.
+impl RecordedPoses {
+    /// The poses of all recorded drives of a version of a twin; `None` if there is no drive.
     pub fn new(manifest: &Manifest) -> Option<Self> {
         let drives = manifest.trajectories.iter();
         let keyframes: Vec<Pose> =
@@ -102,28 +109,12 @@ impl TrainingCoverage {
         }
         let point = |pose: &Pose| Bounds { min_m: pose.position_m, max_m: pose.position_m };
         let boxes = BoxIndex::new(&keyframes.iter().map(point).collect::<Vec<_>>());
-        let mut heights_m: HashMap<[i64; 2], [f64; 2]> = HashMap::new();
-        for chunk in &manifest.chunks {
-            for section in chunk.full_detail() {
-                let bounds = chunk.section_bounds(section);
-                // A cell of 64 m has 4 x 4 blocks.
-                let block_in_cell = [section.block % 4, section.block / 4].map(i64::from);
-                let block =
-                    [0, 1].map(|axis| 4 * i64::from(chunk.cell[axis]) + block_in_cell[axis]);
-                let height = heights_m.entry(block).or_insert([f64::INFINITY, f64::NEG_INFINITY]);
-                *height = [height[0].min(bounds.min_m.z), height[1].max(bounds.max_m.z)];
-            }
-        }
-        Some(Self { keyframes, boxes, heights_m })
+        Some(Self { keyframes, boxes })
     }
 
-    /// The trust of one image of a rig. `opacity` is the image's opacity map, row by row.
-    pub fn trust(&self, world_from_rig: &Pose, view: &View, opacity: &[f32]) -> Trust {
-        let Deviation { distance_m, angle_rad } = self.deviation(world_from_rig);
-        let GroundShares { holes, outside } = self.ground_shares(view, opacity);
-        let as_recorded = (-distance_m / DECAY_M - angle_rad / DECAY_RAD).exp();
-        let value = as_recorded * (1.0 - holes) * (1.0 - outside);
-        Trust { value, distance_m, angle_rad, low_coverage: holes, outside }
+    /// The trust of a pose of the rig, 0 to 1: that of an image without holes in it.
+    pub fn trust(&self, world_from_rig: &Pose) -> f64 {
+        self.deviation(world_from_rig).trust()
     }
 
     /// Distance and angle from the nearest keyframe.
@@ -143,6 +134,41 @@ impl TrainingCoverage {
         // There is at least one keyframe, so the search finds one; 0 is never used.
         let nearest = self.boxes.min_cost(here_m, cost_m).map_or(0, |(index, _)| index);
         deviation_from(nearest)
+    }
+}
+
+impl Deviation {
+    fn trust(&self) -> f64 {
+        (-self.distance_m / DECAY_M - self.angle_rad / DECAY_RAD).exp()
+    }
+}
+
+impl TrainingCoverage {
+    /// The coverage of a version of a twin; `None` without a recorded drive.
+    pub fn new(manifest: &Manifest) -> Option<Self> {
+        let recorded = RecordedPoses::new(manifest)?;
+        let mut heights_m: HashMap<[i64; 2], [f64; 2]> = HashMap::new();
+        for chunk in &manifest.chunks {
+            for section in chunk.full_detail() {
+                let bounds = chunk.section_bounds(section);
+                // A cell of 64 m has 4 x 4 blocks.
+                let block_in_cell = [section.block % 4, section.block / 4].map(i64::from);
+                let block =
+                    [0, 1].map(|axis| 4 * i64::from(chunk.cell[axis]) + block_in_cell[axis]);
+                let height = heights_m.entry(block).or_insert([f64::INFINITY, f64::NEG_INFINITY]);
+                *height = [height[0].min(bounds.min_m.z), height[1].max(bounds.max_m.z)];
+            }
+        }
+        Some(Self { recorded, heights_m })
+    }
+
+    /// The trust of one image of a rig. `opacity` is the image's opacity map, row by row.
+    pub fn trust(&self, world_from_rig: &Pose, view: &View, opacity: &[f32]) -> Trust {
+        let deviation = self.recorded.deviation(world_from_rig);
+        let GroundShares { holes, outside } = self.ground_shares(view, opacity);
+        let value = deviation.trust() * (1.0 - holes) * (1.0 - outside);
+        let Deviation { distance_m, angle_rad } = deviation;
+        Trust { value, distance_m, angle_rad, low_coverage: holes, outside }
     }
 
     /// Samples the pixels that look down at the ground.

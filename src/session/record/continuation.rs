@@ -150,7 +150,10 @@ impl Continuation {
             kept.push(KeptFrames { episode, version: version.clone(), profile, frames: taken });
             drop_unneeded(layout, &mut kept, time_us);
         }
-        let episode = ego.into_episode();
+        let mut episode = ego.into_episode();
+        if self.record.off_model_step.is_some_and(|left| left <= self.origin.step) {
+            episode.leave_model();
+        }
         let (reached, step) = (episode.step(), self.origin.step);
         if reached != step {
             let reason = format!("its steps lead to step {reached} and not to {step}");

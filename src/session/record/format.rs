@@ -19,6 +19,7 @@ use wildcity_scene::rig::is_name;
 use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
 use wildcity_sim::{Dynamics, Ego};
 
+use crate::contact::ContactMode;
 use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
 use crate::observe::schedule::Schedule;
@@ -99,6 +100,9 @@ pub struct RecordedSettings {
     /// Effects of the sensors; absent without.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sensors: Option<Sensors>,
+    /// What contact with the twin does; absent if the session left it to the dynamics.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub contact: Option<ContactMode>,
 }
 
 /// Where a branch begins.
@@ -233,6 +237,7 @@ impl RecordedSettings {
             trust: false,
             warm_up_us: 0,
             sensors: None,
+            contact: None,
         }
     }
 }

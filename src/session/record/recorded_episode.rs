@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::Path;
 
-use wildcity_episode::{ActorsLine, ScenarioLine, check_no_mcap};
+use wildcity_episode::{ActorsLine, Event, ScenarioLine, check_no_mcap};
 use wildcity_scene::appearance::Overlay;
 
 use super::format::{EpisodeHeader, FrameRecord, Line, RecordedVersion};
@@ -30,6 +30,8 @@ pub struct RecordedEpisode {
     pub scenario: Option<Box<ScenarioLine>>,
     /// The actors of the next frame, each with the number of frames before it.
     pub actors: Vec<(usize, ActorsLine)>,
+    /// The steps that were done when the ego had left the area that the twin was trained on, if it left it.
+    pub off_model_step: Option<u64>,
     /// Lines of the file, from 1, at which the frames are.
     pub frame_lines: Vec<usize>,
     /// Line of the file, from 1, at which the end is; 0 without one.
@@ -51,6 +53,7 @@ impl RecordedEpisode {
         let mut versions = Vec::new();
         let mut scenario: Option<Box<ScenarioLine>> = None;
         let mut actors = Vec::new();
+        let mut off_model_step = None;
         let mut frame_lines = Vec::new();
         let mut end_line = 0;
         let mut end = None;
@@ -106,7 +109,12 @@ impl RecordedEpisode {
                     line.check(actor_count).map_err(wrong)?;
                     actors.push((frames.len(), line));
                 }
-                Line::Event(event) if number > 1 => event.check(actor_count).map_err(wrong)?,
+                Line::Event(event) if number > 1 => {
+                    event.check(actor_count).map_err(wrong)?;
+                    if let Event::OffModel { .. } = event.event {
+                        off_model_step = off_model_step.or(Some(event.step));
+                    }
+                }
                 Line::Result(_) if number > 1 => {}
                 Line::Version(version) if number > 1 => versions.push((frames.len(), version)),
                 Line::End(summary) if number > 1 => {
@@ -122,7 +130,17 @@ impl RecordedEpisode {
         let empty =
             || ReplayError::Line { path: path.to_owned(), line: 1, reason: "empty".to_owned() };
         let header = header.ok_or_else(empty)?;
-        Ok(Self { header, frames, versions, scenario, actors, frame_lines, end_line, end })
+        Ok(Self {
+            header,
+            frames,
+            versions,
+            scenario,
+            actors,
+            off_model_step,
+            frame_lines,
+            end_line,
+            end,
+        })
     }
 }
 

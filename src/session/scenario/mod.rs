@@ -3,7 +3,6 @@
 pub(crate) mod assets;
 pub(crate) mod load;
 pub(crate) mod past;
-mod solids;
 mod traffic;
 
 use std::cell::RefCell;
@@ -18,7 +17,6 @@ use wildcity_twin::store::Version;
 
 pub use assets::asset_info;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
-pub(crate) use solids::solids_of;
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
 use self::assets::ActorAssets;

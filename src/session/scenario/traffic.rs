@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use wildcity_scene::ActorClass;
 use wildcity_scene::actor::PlacedChunk;
-use wildcity_sim::contact::{Body, Contact, Detector, LanePosition, Solids};
+use wildcity_sim::Ego;
+use wildcity_sim::contact::{Body, Contact, Detector, LanePosition};
 use wildcity_sim::map::Map;
 use wildcity_sim::route::{NavigationRoute, RouteProgress, RouteView};
 use wildcity_sim::scenario::{ContactRule, EndInput, EndReason, Stuck};
 use wildcity_sim::traffic::{ActorSpec, ActorState, EgoBox, EgoMotion, EgoState, World};
-use wildcity_sim::{Ego, EgoModel};
 
 use super::assets::{ActorAssets, FrameDetail, exposure_start_us};
 use super::load::LoadedScenario;
@@ -27,10 +27,6 @@ pub struct EpisodeTraffic {
     stuck: Stuck,
     events: Vec<Event>,
     ended: Option<EndReason>,
-    /// The twin's solid Gaussians; only if a contact with them ends an episode.
-    solids: Option<Arc<Solids>>,
-    /// Whether the ego meets them now.
-    meets_twin: bool,
     assets: ActorAssets,
     /// The longest exposure of a camera, in microseconds.
     exposure_us: i64,
@@ -79,7 +75,13 @@ pub enum EventKind {
         /// Its index.
         actor: u16,
     },
-    /// A rule of the scenario ended the episode.
+    /// The ego left the area that the twin was trained on: the trust of its pose fell below
+    /// [`limits::OFF_MODEL_TRUST`].
+    OffModel {
+        /// The trust of its pose.
+        trust: f64,
+    },
+    /// A rule ended the episode.
     End(EndReason),
 }
 
@@ -95,7 +97,7 @@ impl EpisodeTraffic {
         let specs: Arc<Vec<ActorSpec>> =
             Arc::new(traffic.actors.iter().map(|actor| actor.spec.clone()).collect());
         let world = World::new(traffic.clone());
-        let state = ego_state(ego);
+        let state = EgoState::new(ego);
         let (detector, contacts) =
             Detector::at_start(traffic.ego_box, &specs, &state, world.states());
         let route = loaded.scenario.route.as_ref();
@@ -114,8 +116,6 @@ impl EpisodeTraffic {
             stuck: Stuck::default(),
             events: contacts.into_iter().map(contact).collect(),
             ended: None,
-            solids: None,
-            meets_twin: false,
             assets,
             exposure_us,
             reach_us: 0,
@@ -124,51 +124,26 @@ impl EpisodeTraffic {
         }
     }
 
-    /// Also detects contact with these solid Gaussians, which belong to the version of the twin that is shown.
-    /// Gaussians that the ego overlaps already, at the start or when the version changes, are not a new contact.
-    pub(crate) fn with_solids(self, solids: Option<Arc<Solids>>, ego: &Ego) -> Self {
-        let ego_box = self.loaded.scenario.traffic.ego_box;
-        let area_m2 = |solids: &Arc<Solids>| solids.area_m2(&ego.world_from_rig(), &ego_box);
-        let is_met = |solids: &Arc<Solids>| solids.limit().is_exceeded_by(area_m2(solids));
-        let meets_twin = solids.as_ref().is_some_and(is_met);
-        Self { solids, meets_twin, ..self }
-    }
-
     /// Sets how old the pictures of sensors may be, in microseconds.
     pub(crate) fn with_reach(self, reach_us: i64) -> Self {
         Self { reach_us, ..self }
     }
 
-    /// The traffic after a step of `dt_us` in which the ego went from one state to another.
-    fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64) -> Self {
+    /// The traffic after a step of `dt_us` in which the ego went from one state to another. `with_twin` has the contacts
+    /// with the twin that began in the step.
+    fn stepped(&self, from: &Ego, to: &Ego, dt_us: i64, with_twin: &[Event]) -> Self {
         let mut next = self.clone();
         next.events.clear();
-        let motion = EgoMotion {
-            from: ego_state(from),
-            to: ego_state(to),
-            smooth: to.dynamics().model != EgoModel::Teleport,
-        };
+        let motion = EgoMotion::new(EgoState::new(from), to);
         let ego_box = self.loaded.scenario.traffic.ego_box;
         let map = self.loaded.map.as_ref();
         let specs = &self.specs;
         let mut contacts: Vec<Contact> = Vec::new();
         let mut presence: Vec<Event> = Vec::new();
-        let mut with_twin: Vec<Event> = Vec::new();
         let before: Vec<Vec<Option<i64>>> = next.fired_us();
         next.world.step(dt_us, &motion, &mut |sub_step| {
             let lanes = map.map(|map| lane_position(map, &sub_step.ego[1], &ego_box));
             contacts.extend(next.detector.advance(sub_step, specs, lanes));
-            if let Some(solids) = &self.solids {
-                let [_, ego] = sub_step.ego;
-                let area_m2 = solids.area_m2(&ego.world_from_rig, &ego_box);
-                let is_met = solids.limit().is_exceeded_by(area_m2);
-                if is_met && !next.meets_twin {
-                    let impact_mps = ego.velocity_mps.length();
-                    let kind = EventKind::StaticContact { area_m2, impact_mps };
-                    with_twin.push(Event { time_us: sub_step.end_us, kind });
-                }
-                next.meets_twin = is_met;
-            }
             for (before, after) in sub_step.before.iter().zip(sub_step.after) {
                 let kind = match (before.present, after.present) {
                     (false, true) => EventKind::Appeared { actor: after.index },
@@ -189,9 +164,9 @@ impl EpisodeTraffic {
             }
         }
         next.events.append(&mut presence);
-        let has_contact =
-            !with_twin.is_empty() || contacts.iter().any(|contact| self.ends_episode(contact));
-        next.events.append(&mut with_twin);
+        let has_contact = (self.twin_ends_episode() && !with_twin.is_empty())
+            || contacts.iter().any(|contact| self.ends_episode(contact));
+        next.events.extend_from_slice(with_twin);
         next.events.extend(
             contacts.into_iter().map(|contact| Event {
                 time_us: contact.time_us,
@@ -205,15 +180,21 @@ impl EpisodeTraffic {
         next
     }
 
-    /// The traffic after the steps of a plan, each of `dt_us`, in which the ego went through `egos`. Its events are
-    /// those of all steps.
-    pub(crate) fn followed(&self, from: &Ego, egos: &[Ego], dt_us: i64) -> Self {
+    /// The traffic after the steps of a plan, each of `dt_us`, in which the ego went through `egos`. `with_twin` has the
+    /// contacts with the twin that began in each step. Its events are those of all steps.
+    pub(crate) fn followed(
+        &self,
+        from: &Ego,
+        egos: &[Ego],
+        dt_us: i64,
+        with_twin: &[Vec<Event>],
+    ) -> Self {
         let mut next = self.clone();
         next.past.drop_before(self.world.time_us() - self.exposure_us - self.reach_us);
         let mut from = from;
         let mut events = Vec::new();
-        for ego in egos {
-            next = next.stepped(from, ego, dt_us);
+        for (ego, with_twin) in egos.iter().zip(with_twin) {
+            next = next.stepped(from, ego, dt_us, with_twin);
             events.append(&mut next.events);
             from = ego;
         }
@@ -246,6 +227,12 @@ impl EpisodeTraffic {
             let event = Event { time_us: input.time_us, kind: EventKind::End(reason) };
             self.events.push(event);
         }
+    }
+
+    /// Whether the scenario's rule is about contact with the twin.
+    fn twin_ends_episode(&self) -> bool {
+        use ContactRule::{Any, AtFault, Static};
+        matches!(self.loaded.scenario.end.contact, Some(Any | AtFault | Static))
     }
 
     /// Whether the scenario's rule is about such a contact. Boxes that overlapped from the start are not judged.
@@ -308,6 +295,14 @@ impl EpisodeTraffic {
         self.assets.placed(&poses_at(taken_us), &at_start, frame)
     }
 
+    /// Adds an event to those of the last step.
+    pub(crate) fn add_event(&mut self, event: Event) {
+        if self.events.len() < limits::EVENTS {
+            self.events.push(event);
+            self.events.sort_by_key(|event| event.time_us);
+        }
+    }
+
     /// Events of the last step, by time; at most [`limits::EVENTS`].
     pub fn events(&self) -> &[Event] {
         &self.events
@@ -334,15 +329,6 @@ impl EpisodeTraffic {
     /// Why a rule ended the episode, if one did.
     pub fn ended(&self) -> Option<EndReason> {
         self.ended
-    }
-}
-
-/// The ego as actors see it.
-fn ego_state(ego: &Ego) -> EgoState {
-    EgoState {
-        world_from_rig: ego.world_from_rig(),
-        velocity_mps: ego.velocity_m_s(),
-        yaw_rate_radps: ego.yaw_rate_rad_s(),
     }
 }
 

@@ -6,8 +6,8 @@ use std::sync::Arc;
 use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
-use super::open::{frame_bytes, prepare, rig_extent};
-use super::recording::traffic_lines;
+use super::open::{frame_bytes, prepare, rig_extent, solid_ego};
+use super::recording::simulation_lines;
 use super::requests::SimulationState;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
@@ -76,7 +76,7 @@ impl Session {
 
         let record = self.frame_record(FrameRequest::Restore, &episode, &rendered);
         let traffic = state.traffic.as_ref();
-        let mut lines = traffic.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record, true));
+        let mut lines = simulation_lines(traffic, &state.events, &record, true);
         lines.push(Line::Frame(record));
         let file = self.create_file(version, origin.clone(), traffic, &episode, lines).await?;
         if let Some(bytes) = bytes
@@ -88,12 +88,13 @@ impl Session {
         self.version = version.clone();
         self.end_recording(Outcome::Completed).await;
 
-        episode.add_trusts(rendered.trusts());
+        let _mean = episode.add_trusts(rendered.trusts());
         episode.set_repair_state(rendered.repair_state);
         self.begin(file, origin.clone());
         // After a switch of version, the frames of the present are as the original has them.
         let frame_history = state.frame_history.clone().or(&rendered.frame_history);
-        self.state = EpisodeState { episode, frame_history, traffic: state.traffic.clone() };
+        let (traffic, events) = (state.traffic.clone(), state.events.clone());
+        self.state = EpisodeState { episode, frame_history, traffic, events };
         self.look_ahead();
         Ok(rendered.observation)
     }
@@ -198,12 +199,21 @@ impl Session {
             scenario: None,
             reports_actors: false,
             repair: None,
+            contact: recorded.contact,
+            solid_ego: solid_ego(recorded.contact, None),
         };
 
         // The state after the step, and the frames that coming observations show again.
         let driven = run_blocking(move || continuation.drive(&layout)).await??;
         let coverage_for = recorded.trust.then_some("outputs.trust");
-        let version = prepare(driven.version.clone(), driven.profile, coverage_for).await?;
+        let version = prepare(
+            &engine,
+            driven.version.clone(),
+            driven.profile,
+            coverage_for,
+            settings.solid_ego,
+        )
+        .await?;
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
         let reservation = Engine::reserve(driven.version, extent, driven.profile, frame).await?;
         let state = EpisodeState::at_start(driven.episode.clone());
@@ -223,7 +233,7 @@ impl Session {
     ) -> Result<(), SessionError> {
         for KeptFrames { episode, version, profile, frames } in kept {
             let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
-            let version = prepare(version, profile, coverage_for).await?;
+            let version = prepare(&self.engine, version, profile, coverage_for, None).await?;
             let history = Some(self.state.frame_history.clone());
             let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
             let simulation = SimulationState { episode: &episode, traffic: None };

@@ -36,7 +36,7 @@ use crate::record::format::RecordedOrigin;
 use crate::record::recorder::Recorder;
 use crate::repair::references::ReferenceSource;
 use crate::repair::session_repair::SessionRepair;
-use crate::scenario::EpisodeTraffic;
+use crate::scenario::{EpisodeTraffic, Event};
 use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::state::{EpisodeState, PinnedVersion, SessionSettings};
@@ -209,6 +209,11 @@ impl Session {
     /// The actors and the route of the current episode; only with a scenario.
     pub fn traffic(&self) -> Option<&EpisodeTraffic> {
         self.state.traffic.as_ref()
+    }
+
+    /// Events of the last step or reset, by time.
+    pub fn events(&self) -> &[Event] {
+        self.state.traffic.as_ref().map_or(&self.state.events, EpisodeTraffic::events)
     }
 
     /// Whether observations contain the poses of the actors.

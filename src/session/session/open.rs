@@ -10,12 +10,13 @@ use wildcity_render::View;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::rig::{Rig, RigCamera, check_overlay_pixels, overlay_bytes};
 use wildcity_scene::{Manifest, RenderProfile, Trajectory};
-use wildcity_sim::contact::Solids;
 use wildcity_sim::scenario::Scenario;
+use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urgency};
 
 use super::Session;
 use crate::blocking::run_blocking;
+use crate::contact::ContactMode;
 use crate::engine::Engine;
 use crate::error::SessionError;
 use crate::limits;
@@ -29,7 +30,7 @@ use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::repair::references::ReferenceViews;
 use crate::repair::session_repair::SessionRepair;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario, solids_of};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, SessionScenario};
 use crate::sensors::settings::Sensors;
 use crate::snapshot::Snapshots;
 use crate::start::EpisodeStart;
@@ -49,6 +50,7 @@ impl Session {
         // How long a step takes in simulated time, and an answer in real time.
         let dt_us = check_dt(options.dt_us)?;
         let deadline = check_deadline(options.deadline, engine.step_timeout())?;
+        check_contact(options.contact, options.scenario.is_some())?;
 
         // The version of the twin. Its Gaussians are loaded frame by frame.
         let resident = engine.open_version(options.twin.clone(), options.version).await?;
@@ -132,11 +134,10 @@ impl Session {
             .episode(options.seed, options.dynamics, dt_us)
             .with_sensors(layout.episode_sensors());
         let reports_actors = opened.as_ref().is_some_and(|opened| opened.asked.actors);
-        let (scenario, loaded, solids) = match opened {
-            Some(OpenedScenario { scenario, episode, solids, .. }) => {
-                (Some(scenario), Some(episode), solids)
-            }
-            None => (None, None, None),
+        let solid_ego = solid_ego(options.contact, opened.as_ref().map(OpenedScenario::resolved));
+        let (scenario, loaded) = match opened {
+            Some(OpenedScenario { scenario, episode, .. }) => (Some(scenario), Some(episode)),
+            None => (None, None),
         };
         let settings = SessionSettings {
             profile_overrides: options.profile,
@@ -156,6 +157,8 @@ impl Session {
             scenario,
             reports_actors,
             repair,
+            contact: options.contact,
+            solid_ego,
         };
 
         // Prepare the version for its frames, and reserve the memory for the worst frame anywhere in the twin.
@@ -165,8 +168,7 @@ impl Session {
             (false, None) => None,
         };
         let profile = profile_of(&engine, &resident, &settings)?;
-        let version = prepare(resident.clone(), profile, coverage_for).await?;
-        let version = version.with_solids(solids);
+        let version = prepare(&engine, resident.clone(), profile, coverage_for, solid_ego).await?;
         let frame = frame_bytes(&engine, &settings.layout, version.coverage.is_some());
         let reservation = Engine::reserve(resident.clone(), extent, version.profile, frame).await?;
         let references = references_of(&engine, &resident, &settings).await?;
@@ -175,7 +177,6 @@ impl Session {
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
         let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             EpisodeTraffic::at_start(loaded, assets, episode.ego(), exposure_us)
-                .with_solids(version.solids.clone(), episode.ego())
                 .with_reach(episode.reach_us())
         });
         let state = EpisodeState { traffic, ..EpisodeState::at_start(episode) };
@@ -233,25 +234,14 @@ impl Session {
         let extent = rig_extent(self.settings.layout.cameras());
         let coverage_for = self.version.coverage.as_ref().map(|_| "outputs.trust");
         let profile = profile_of(&self.engine, &resident, &self.settings)?;
-        let version = prepare(resident.clone(), profile, coverage_for).await?;
+        let solid_ego = self.settings.solid_ego;
+        let version =
+            prepare(&self.engine, resident.clone(), profile, coverage_for, solid_ego).await?;
         let bytes = Engine::worst_case_bytes(resident.clone(), extent, version.profile).await?;
-        let solids = match &self.state.traffic {
-            None => None,
-            Some(traffic) => {
-                let scenario = traffic.loaded().clone();
-                let catalog = self.engine.cache().catalog().clone();
-                let version = resident.version.clone();
-                let find = move || solids_of(&scenario.scenario, &catalog, &version);
-                run_blocking(find).await??
-            }
-        };
         let references = references_of(&self.engine, &resident, &self.settings).await?;
         // There is no `await` from here on, so that a dropped future cannot leave half a switch.
         self.reservation.exchange(resident, bytes)?;
-        self.version = version.with_solids(solids.clone()).with_references(references);
-        if let Some(traffic) = self.state.traffic.take() {
-            self.state.traffic = Some(traffic.with_solids(solids, self.state.episode.ego()));
-        }
+        self.version = version.with_references(references);
         self.version_switched = true;
         let mut places = vec![(Urgency::Imminent, self.state.episode.world_from_rig())];
         places.extend(self.forecast().places());
@@ -265,8 +255,6 @@ struct OpenedScenario {
     asked: ScenarioOptions,
     scenario: SessionScenario,
     episode: EpisodeScenario,
-    /// The solid Gaussians beside its route; only if a contact with them ends an episode.
-    solids: Option<Arc<Solids>>,
 }
 
 impl OpenedScenario {
@@ -286,9 +274,7 @@ impl OpenedScenario {
                 SessionScenario::read(scenarios, &asked.source, &asked.values, gives_start)?;
             let episode = scenario.of_episode(seed, &version, engine.cache())?;
             scenario.pin_assets(&episode.loaded);
-            let catalog = engine.cache().catalog();
-            let solids = solids_of(&episode.loaded.scenario, catalog, &version)?;
-            Ok(Self { asked, scenario, episode, solids })
+            Ok(Self { asked, scenario, episode })
         })
         .await?
     }
@@ -325,19 +311,49 @@ fn profile_of(
     Ok(profile)
 }
 
-/// Prepares a version for the frames of a session: bakes its sky, and reads where it was trained if the field
-/// `coverage_for` of the request needs to know.
+/// Prepares a version for the episodes of a session: bakes its sky, finds what is where, and reads where it was trained if
+/// the field `coverage_for` of the request needs to know. With the box `solid_ego`, contact with the twin is looked for.
 pub(super) async fn prepare(
+    engine: &Arc<Engine>,
     resident: Arc<Resident>,
     profile: RenderProfile,
     coverage_for: Option<&'static str>,
+    solid_ego: Option<EgoBox>,
 ) -> Result<PinnedVersion, SessionError> {
     Engine::bake_sky(resident.clone(), profile).await?;
+    let index = {
+        let (engine, resident) = (engine.clone(), resident.clone());
+        run_blocking(move || engine.spatial_index(&resident)).await?
+    };
+    let solids = solid_ego.map(|ego_box| engine.solids(index.clone(), ego_box));
     let coverage = match coverage_for {
         Some(field) => Some(training_coverage(&resident, field).await?),
         None => None,
     };
-    Ok(PinnedVersion::new(resident, profile, coverage))
+    Ok(PinnedVersion::new(resident, profile, coverage, index).with_solids(solids))
+}
+
+/// With a scenario, only the scenario says what a contact does.
+fn check_contact(contact: Option<ContactMode>, has_scenario: bool) -> Result<(), SessionError> {
+    match contact {
+        Some(ContactMode::End | ContactMode::Report) if has_scenario => {
+            let must =
+                "given with a scenario, which decides: write end.contact there, or \"off\" here";
+            Err(SessionError::OutOfRange { field: "contact", must: must.to_owned() })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The box of the ego with which contact with the twin is looked for; `None` if it is not.
+pub(super) fn solid_ego(
+    contact: Option<ContactMode>,
+    scenario: Option<&Scenario>,
+) -> Option<EgoBox> {
+    let is_off = contact == Some(ContactMode::Off)
+        || scenario.is_some_and(|scenario| scenario.file.verdict.twin_contact == Some(false));
+    let ego_box = scenario.map_or_else(EgoBox::default, |scenario| scenario.traffic.ego_box);
+    (!is_off).then_some(ego_box)
 }
 
 fn check_dt(dt_us: Option<i64>) -> Result<i64, SessionError> {

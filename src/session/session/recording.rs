@@ -1,6 +1,6 @@
 //! Writes the files of a session's episodes.
 
-use wildcity_episode::{self as episode, ActorsLine, EventLine, scenario_line};
+use wildcity_episode::{self as episode, ActorsLine, EventLine, ScenarioLine, scenario_line};
 use wildcity_scene::Rig;
 
 use super::Session;
@@ -21,15 +21,16 @@ use crate::state::{PinnedVersion, SessionSettings};
 
 impl Session {
     /// Appends a frame to the episode's file. The first frame of an episode creates the file. `traffic` is that after a
-    /// step; `None` for a frame that is not a step.
+    /// step; `None` for a frame that is not a step. `events` are those of a step without a scenario.
     pub(super) async fn record(
         &mut self,
         frame: FrameRecord,
         traffic: Option<&EpisodeTraffic>,
+        events: &[Event],
     ) -> Result<(), SessionError> {
         let is_first = self.recorder.is_none();
         let shown = traffic.or(self.state.traffic.as_ref().filter(|_| is_first));
-        let mut lines = shown.map_or(Vec::new(), |shown| traffic_lines(shown, &frame, is_first));
+        let mut lines = simulation_lines(shown, events, &frame, is_first);
         lines.push(Line::Frame(frame));
         match self.recorder.clone() {
             Some(recorder) => {
@@ -151,7 +152,10 @@ impl Session {
         let scenario = traffic.map(|traffic| {
             let loaded = traffic.loaded();
             let drives = &version.manifest.trajectories;
-            let line = scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives);
+            let line = ScenarioLine {
+                checks_static: pinned.solids.is_some(),
+                ..scenario_line(&loaded.scenario, loaded.map.as_ref(), &loaded.hash, drives)
+            };
             Line::Scenario(Box::new(line))
         });
         let head = [Line::Episode(Box::new(header))].into_iter().chain(scenario);
@@ -184,14 +188,23 @@ impl Session {
     }
 }
 
-/// The lines before the frame of a request: the poses of the actors at each frame of a warm-up and after each step, and
-/// the events. Before the first frame of a file also the poses in the earlier steps that its frames show, as in a
-/// branch, or if the first request is not a reset.
-pub(super) fn traffic_lines(
-    traffic: &EpisodeTraffic,
+/// The lines before the frame of a request: with a scenario those of its traffic, otherwise its events.
+pub(super) fn simulation_lines(
+    traffic: Option<&EpisodeTraffic>,
+    events: &[Event],
     frame: &FrameRecord,
     is_first: bool,
 ) -> Vec<Line> {
+    match traffic {
+        Some(traffic) => traffic_lines(traffic, frame, is_first),
+        None => events.iter().map(|event| event_line(frame.step, event)).collect(),
+    }
+}
+
+/// The lines before the frame of a request: the poses of the actors at each frame of a warm-up and after each step, and
+/// the events. Before the first frame of a file also the poses in the earlier steps that its frames show, as in a
+/// branch, or if the first request is not a reset.
+fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord, is_first: bool) -> Vec<Line> {
     let FrameRecord { step, steps, .. } = *frame;
     let warm_up_us = frame.times_us.iter().copied().filter(|time_us| *time_us < 0);
     let warm_up =
@@ -201,23 +214,25 @@ pub(super) fn traffic_lines(
     let of_steps = (before..).zip(traffic.last_steps(count));
     let of_steps = of_steps.map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
     let actors = warm_up.chain(of_steps).map(Line::Actors);
-    let event = |happened: &Event| {
-        let event = match &happened.kind {
-            EventKind::Contact(contact) => return EventLine::contact(step, contact),
-            EventKind::StaticContact { area_m2, impact_mps } => {
-                episode::Event::StaticContact { area_m2: *area_m2, impact_mps: *impact_mps }
-            }
-            EventKind::Trigger { actor, trigger } => {
-                episode::Event::Triggered { actor: *actor, trigger: *trigger as u32 }
-            }
-            EventKind::Appeared { actor } => episode::Event::Appeared { actor: *actor },
-            EventKind::Left { actor } => episode::Event::Left { actor: *actor },
-            EventKind::End(reason) => episode::Event::Ended { rule: reason.name().to_owned() },
-        };
-        EventLine { step, time_us: happened.time_us, event }
-    };
-    let events = traffic.events().iter().map(|happened| Line::Event(event(happened)));
+    let events = traffic.events().iter().map(|event| event_line(step, event));
     actors.chain(events).collect()
+}
+
+fn event_line(step: u64, happened: &Event) -> Line {
+    let event = match &happened.kind {
+        EventKind::Contact(contact) => return Line::Event(EventLine::contact(step, contact)),
+        EventKind::StaticContact { area_m2, impact_mps } => {
+            episode::Event::StaticContact { area_m2: *area_m2, impact_mps: *impact_mps }
+        }
+        EventKind::OffModel { trust } => episode::Event::OffModel { trust: *trust },
+        EventKind::Trigger { actor, trigger } => {
+            episode::Event::Triggered { actor: *actor, trigger: *trigger as u32 }
+        }
+        EventKind::Appeared { actor } => episode::Event::Appeared { actor: *actor },
+        EventKind::Left { actor } => episode::Event::Left { actor: *actor },
+        EventKind::End(reason) => episode::Event::Ended { rule: reason.name().to_owned() },
+    };
+    Line::Event(EventLine { step, time_us: happened.time_us, event })
 }
 
 /// The settings that the header does not have otherwise; `None` if all are the defaults.
@@ -228,6 +243,7 @@ fn recorded_settings(settings: &SessionSettings, trust: bool) -> Option<Recorded
         trust,
         warm_up_us: settings.warm_up_us,
         sensors: settings.layout.sensors().cloned(),
+        contact: settings.contact,
     };
     let cameras = settings.layout.cameras().len();
     (recorded != RecordedSettings::default_of(cameras, settings.dt_us)).then_some(recorded)

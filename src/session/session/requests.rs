@@ -9,11 +9,13 @@ use tracing::{Instrument as _, debug_span};
 
 use wildcity_render::{Backend, Frame, View};
 use wildcity_scene::geometry::Pose;
-use wildcity_sim::{Command, Ground};
+use wildcity_sim::scenario::EndReason;
+use wildcity_sim::{Command, Ego, Ground};
 
 use super::Session;
-use super::recording::traffic_lines;
+use super::recording::simulation_lines;
 use crate::blocking::run_blocking;
+use crate::contact::ContactMode;
 use crate::engine::render_queue::{FrameCost, Scratch};
 use crate::episode::{Episode, EpisodeSummary, Outcome};
 use crate::error::SessionError;
@@ -30,7 +32,7 @@ use crate::record::command::RecordedCommand;
 use crate::record::format::{FrameRequest, Line, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 
@@ -39,6 +41,14 @@ use crate::state::{EpisodeState, PinnedVersion};
 pub(super) struct SimulationState<'a> {
     pub(super) episode: &'a Episode,
     pub(super) traffic: Option<&'a EpisodeTraffic>,
+}
+
+/// What the steps of a request meet.
+struct Meetings {
+    /// The contacts with the twin that begin in each step.
+    contacts: Vec<Vec<Event>>,
+    /// When the ego first is off the trained area, in microseconds, and the trust of its pose.
+    off_model: Option<(i64, f64)>,
 }
 
 impl Session {
@@ -68,15 +78,27 @@ impl Session {
         let steps = self.plan_steps(&command, options.until_us)?;
         check_notes(options.notes.as_ref())?;
         let now = &self.state.episode;
-        let lanes = self.state.traffic.as_ref().and_then(|traffic| traffic.loaded().lanes());
-        let ground =
-            Ground::from_drives(&self.resident().version.manifest.trajectories).and_lanes(lanes);
-        let (mut next, egos) = now.followed(&command, steps, &ground, options.terminate)?;
+        let (mut next, egos) = self.moved(&command, steps, options.terminate)?;
+        let met = self.meetings(now, egos.clone()).await?;
         let traffic = self.state.traffic.as_ref();
-        let traffic =
-            traffic.map(|traffic| traffic.followed(now.ego(), &egos, self.settings.dt_us));
-        if let Some(reason) = traffic.as_ref().and_then(EpisodeTraffic::ended) {
-            next.end(reason);
+        let dt_us = self.settings.dt_us;
+        let mut traffic =
+            traffic.map(|traffic| traffic.followed(now.ego(), &egos, dt_us, &met.contacts));
+        let mut events = Vec::new();
+        match &traffic {
+            Some(traffic) => {
+                if let Some(reason) = traffic.ended() {
+                    next.end(reason);
+                }
+            }
+            None => {
+                events = met.contacts.into_iter().flatten().take(limits::EVENTS).collect();
+                if !events.is_empty() && self.contact_mode(&next) == ContactMode::End {
+                    next.end(EndReason::Contact);
+                    let kind = EventKind::End(EndReason::Contact);
+                    events.push(Event { time_us: next.time_us(), kind });
+                }
+            }
         }
 
         let frame_history = self.state.frame_history.clone();
@@ -84,6 +106,11 @@ impl Session {
         let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history)).await?;
+        let left = left_model(&mut next, met.off_model, &rendered);
+        match &mut traffic {
+            Some(traffic) => left.into_iter().for_each(|event| traffic.add_event(event)),
+            None => events.extend(left),
+        }
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = match now.is_delayed() {
@@ -95,14 +122,55 @@ impl Session {
             record.steps = steps as u64;
             record.times_us = rendered.captures.iter().map(|capture| capture.time_us).collect();
         }
-        self.record(record, traffic.as_ref()).instrument(debug_span!("record")).await?;
+        self.record(record, traffic.as_ref(), &events).instrument(debug_span!("record")).await?;
 
-        next.add_trusts(rendered.trusts());
         next.set_repair_state(rendered.repair_state);
         let frame_history = rendered.frame_history;
-        self.state = EpisodeState { episode: next, frame_history, traffic };
+        self.state = EpisodeState { episode: next, frame_history, traffic, events };
         self.look_ahead();
         Ok(rendered.observation)
+    }
+
+    /// The episode after some steps along a command, and the ego after each of them.
+    fn moved(
+        &self,
+        command: &Command,
+        steps: usize,
+        terminate: bool,
+    ) -> Result<(Episode, Vec<Ego>), SessionError> {
+        let lanes = self.state.traffic.as_ref().and_then(|traffic| traffic.loaded().lanes());
+        let drives = &self.resident().version.manifest.trajectories;
+        let ground = Ground::from_drives(drives).and_lanes(lanes);
+        self.state.episode.followed(command, steps, &ground, terminate)
+    }
+
+    /// What the ego meets of the twin while it goes through `egos`, and whether it leaves the trained area. Off the
+    /// threads that answer requests: it may have to read the twin.
+    async fn meetings(&self, now: &Episode, egos: Vec<Ego>) -> Result<Meetings, SessionError> {
+        let solids = self.version.solids.clone();
+        let recorded = self.version.index.recorded().filter(|_| !now.is_off_model()).cloned();
+        let from = now.ego().clone();
+        let (begin_us, dt_us) = (now.time_us(), self.settings.dt_us);
+        let find = move || {
+            let contacts = match solids {
+                Some(solids) => solids.contacts(&from, &egos, begin_us, dt_us)?,
+                None => vec![Vec::new(); egos.len()],
+            };
+            let trusts = egos.iter().zip(1..).filter_map(|(ego, step)| {
+                Some((begin_us + step * dt_us, recorded.as_ref()?.trust(&ego.world_from_rig())))
+            });
+            let off_model = trusts.into_iter().find(|(_, trust)| *trust < limits::OFF_MODEL_TRUST);
+            Ok::<_, SessionError>(Meetings { contacts, off_model })
+        };
+        let deadline = Instant::now() + self.settings.deadline;
+        let found = timeout_at(deadline, run_blocking(find)).await;
+        found.map_err(|_| SessionError::DeadlineExceeded)??
+    }
+
+    /// What contact with the twin does in an episode without a scenario.
+    fn contact_mode(&self, episode: &Episode) -> ContactMode {
+        let model = episode.ego().dynamics().model;
+        self.settings.contact.unwrap_or_else(|| ContactMode::default_for(model))
     }
 
     /// Number of steps of a plan that is followed for `until_us`.
@@ -140,7 +208,7 @@ impl Session {
             SimulationState { episode: &episode, traffic: self.state.traffic.as_ref() };
         let rendered = self.render(&self.version, simulation, captures, None).await?;
         let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
-        self.record(record, None).instrument(debug_span!("record")).await?;
+        self.record(record, None, &[]).instrument(debug_span!("record")).await?;
         Ok(rendered.observation)
     }
 
@@ -204,9 +272,8 @@ impl Session {
             .episode(seed, dynamics, settings.dt_us)
             .with_sensors(settings.layout.episode_sensors());
         let exposure_us = View::longest_exposure_us(settings.layout.cameras());
-        let traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
+        let mut traffic = loaded.map(|EpisodeScenario { loaded, assets }| {
             EpisodeTraffic::at_start(loaded, assets, next.ego(), exposure_us)
-                .with_solids(self.version.solids.clone(), next.ego())
                 .with_reach(next.reach_us())
         });
 
@@ -215,19 +282,27 @@ impl Session {
         let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history)).await?;
+        let trust = self.version.index.recorded().map(|at| at.trust(&next.world_from_rig()));
+        let off_model =
+            trust.filter(|trust| *trust < limits::OFF_MODEL_TRUST).map(|trust| (0, trust));
+        let left = left_model(&mut next, off_model, &rendered);
+        let mut events = Vec::new();
+        match &mut traffic {
+            Some(traffic) => left.into_iter().for_each(|event| traffic.add_event(event)),
+            None => events.extend(left),
+        }
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
         let before = traffic.as_ref();
-        let mut lines = before.map_or(Vec::new(), |traffic| traffic_lines(traffic, &record, true));
+        let mut lines = simulation_lines(before, &events, &record, true);
         lines.push(Line::Frame(record));
         let file = self.create_file(&self.version, None, before, &next, lines).await?;
         self.end_recording(Outcome::Completed).await;
 
-        next.add_trusts(rendered.trusts());
         next.set_repair_state(rendered.repair_state);
         self.begin(file, None);
         let frame_history = rendered.frame_history;
-        self.state = EpisodeState { episode: next, frame_history, traffic };
+        self.state = EpisodeState { episode: next, frame_history, traffic, events };
         self.look_ahead();
         Ok(rendered.observation)
     }
@@ -313,6 +388,23 @@ impl Session {
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
     }
+}
+
+/// The event that an episode leaves the area that the twin was trained on, by a pose or by the images of an observation;
+/// `None` if it does not, or has left it before.
+fn left_model(
+    next: &mut Episode,
+    off_model: Option<(i64, f64)>,
+    rendered: &RenderedObservation,
+) -> Option<Event> {
+    let of_images = next.add_trusts(rendered.trusts());
+    let is_low = of_images.filter(|trust| *trust < limits::OFF_MODEL_TRUST);
+    let (time_us, trust) = off_model.or(is_low.map(|trust| (next.time_us(), trust)))?;
+    if next.is_off_model() {
+        return None;
+    }
+    next.leave_model();
+    Some(Event { time_us, kind: EventKind::OffModel { trust } })
 }
 
 fn check_notes(notes: Option<&Value>) -> Result<(), SessionError> {

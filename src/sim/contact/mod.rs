@@ -8,7 +8,7 @@
 //! | `detector.rs` | the contacts of the ego, sub-step by sub-step |
 //! | `fault.rs` | which side of the ego was hit, and the fault |
 //! | `solid.rs` | contact with the twin's own Gaussians |
-//! | `solids.rs` | these Gaussians in a grid, and the area that recorded drives overlap |
+//! | `solids.rs` | these Gaussians in a grid, and the area of them that the ego overlaps at a pose |
 //!
 //! All of it is f64 and relative to the ego, so that a decision is the same at any distance from the world's
 //! origin. Boxes are closed sets: boxes that touch are in contact.
@@ -31,5 +31,5 @@ pub use solid::{
     FREE_AREA_M2, GROUND_MARGIN_M, SIDE_MARGIN_M, SOLID_OPACITY, SolidPoint, StaticLimit,
     solid_area_m2,
 };
-pub use solids::Solids;
+pub use solids::{Solids, TestedBox};
 pub use sweep::{Moving, overlap_s, time_to_contact_s};

@@ -29,10 +29,10 @@ pub struct SolidPoint {
 }
 
 /// The area of Gaussians in the ego's box that counts as a contact.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StaticLimit {
-    /// The largest area of Gaussians inside the ego's box anywhere on the recorded drives, in m². The recorded car
-    /// drove there, so this much area is no obstacle.
+    /// The largest area of Gaussians inside the ego's box on the recorded drives near by, in m²; 0 if there is none. The
+    /// recorded car drove there, so this much area is no obstacle.
     pub most_on_drive_m2: f64,
 }
 

@@ -260,13 +260,13 @@ pub struct EndSection {
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum ContactRule {
-    /// Every contact with an actor.
+    /// Every contact, with an actor or with the twin.
     Any,
-    /// One that is the ego's fault.
+    /// One that is the ego's fault, as every contact with the twin is.
     AtFault,
     /// One with a pedestrian.
     Pedestrian,
-    /// One with the twin's Gaussians near the route. Only this rule tests them.
+    /// One with the twin.
     Static,
 }
 
@@ -279,6 +279,9 @@ pub struct VerdictSection {
     /// 0.8.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub progress: Option<f64>,
+    /// Whether contact with the twin is looked for. If absent, true. If false, `contact.static` is not judged.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub twin_contact: Option<bool>,
 }
 
 impl ScenarioFile {

@@ -42,10 +42,6 @@ pub struct Scenario {
     pub warm_up_us: Option<i64>,
 }
 
-/// The ego's box unless a scenario says otherwise: AlpaSim's vehicle.
-const EGO_BOX: EgoBox =
-    EgoBox { box_: ActorBox { length_m: 5.393, width_m: 2.109, height_m: 1.503 }, center_x_m: 1.3 };
-
 /// A frame of NeuroNCAP, by which a start is shifted, in microseconds.
 const START_FRAME_US: i64 = 500_000;
 
@@ -72,7 +68,7 @@ impl Scenario {
         let dynamics = file.ego.dynamics.as_ref().map(dynamics_of).transpose();
         let dynamics = dynamics.map_err(|error| error.within("ego"))?;
         let ego_box = match &file.ego.box_ {
-            None => EGO_BOX,
+            None => EgoBox::default(),
             Some(section) => {
                 let box_ = box_of("ego.box.size", section.size)?;
                 let most_m = ActorBox::MOST_M;

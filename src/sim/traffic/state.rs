@@ -5,6 +5,8 @@ use glam::DVec3;
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::{ActorBox, ActorClass};
 
+use crate::Ego;
+
 /// The constant properties of an actor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ActorSpec {
@@ -51,6 +53,25 @@ pub struct EgoBox {
     pub box_: ActorBox,
     /// From the rig's origin, the middle of the rear axle, forward to the box's centre, in metres.
     pub center_x_m: f64,
+}
+
+impl EgoState {
+    /// The state of an ego.
+    pub fn new(ego: &Ego) -> Self {
+        Self {
+            world_from_rig: ego.world_from_rig(),
+            velocity_mps: ego.velocity_m_s(),
+            yaw_rate_radps: ego.yaw_rate_rad_s(),
+        }
+    }
+}
+
+impl Default for EgoBox {
+    /// AlpaSim's vehicle.
+    fn default() -> Self {
+        let box_ = ActorBox { length_m: 5.393, width_m: 2.109, height_m: 1.503 };
+        Self { box_, center_x_m: 1.3 }
+    }
 }
 
 /// One sub-step: at most 10 ms of a step.

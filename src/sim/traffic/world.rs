@@ -19,6 +19,7 @@ use super::script::{Action, After, Condition, Near, Trigger};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 use super::track::Track;
 use crate::limits;
+use crate::{Ego, EgoModel};
 
 /// The actors of an episode before it begins.
 #[derive(Clone, Debug, PartialEq)]
@@ -161,14 +162,10 @@ impl World {
     pub fn step(&mut self, dt_us: i64, ego: &EgoMotion, each: &mut dyn FnMut(&SubStep<'_>)) {
         let traffic = self.traffic.clone();
         let begin_us = self.time_us;
-        let count = dt_us.max(1).unsigned_abs().div_ceil(limits::SUB_STEP_US.unsigned_abs()) as i64;
         let mut ego_now = ego.from;
-        for sub_step in 1..=count {
+        for (since_us, ego_next) in ego.sub_steps(dt_us) {
             let sub_begin_us = self.time_us;
-            // i128, since the product may overflow i64.
-            let since_us = (i128::from(dt_us) * i128::from(sub_step) / i128::from(count)) as i64;
             let sub_end_us = begin_us.saturating_add(since_us);
-            let ego_next = ego.at(since_us, dt_us);
             let bodies = self.bodies(&ego_now);
             self.fire(&traffic, &ego_now, &bodies);
             let before = std::mem::take(&mut self.states);
@@ -301,9 +298,32 @@ impl World {
 }
 
 impl EgoMotion {
+    /// The motion of an ego from a state to its present one.
+    pub fn new(from: EgoState, to: &Ego) -> Self {
+        let smooth = to.dynamics().model != EgoModel::Teleport;
+        Self { from, to: EgoState::new(to), smooth }
+    }
+
     /// An ego that stands.
     pub fn standing(state: EgoState) -> Self {
         Self { from: state, to: state, smooth: false }
+    }
+
+    /// Length of the straight line between its ends over the time of a step of `dt_us`, in m/s.
+    pub fn mean_speed_mps(&self, dt_us: i64) -> f64 {
+        let way_m = self.from.world_from_rig.position_m.distance(self.to.world_from_rig.position_m);
+        way_m / (dt_us as f64 * 1e-6)
+    }
+
+    /// The ends of the sub-steps of a step of `dt_us`, above 0: the time since the start of the step, in microseconds,
+    /// and the ego then.
+    pub fn sub_steps(&self, dt_us: i64) -> impl Iterator<Item = (i64, EgoState)> {
+        let count = dt_us.max(1).unsigned_abs().div_ceil(limits::SUB_STEP_US.unsigned_abs()) as i64;
+        (1..=count).map(move |sub_step| {
+            // i128, since the product may overflow i64.
+            let since_us = (i128::from(dt_us) * i128::from(sub_step) / i128::from(count)) as i64;
+            (since_us, self.at(since_us, dt_us))
+        })
     }
 
     /// The ego at a time of a step of `dt_us`.

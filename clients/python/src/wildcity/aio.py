@@ -26,6 +26,7 @@ from .observation import Observation
 from .protocol import (
     PROTOCOL,
     Action,
+    ContactMode,
     DriveSection,
     Dynamics,
     Model,
@@ -114,6 +115,7 @@ class Client:
         scenario: str | Mapping[str, Any] | None = None,
         repair: str | Repair | None = None,
         sensors: Sensors | None = None,
+        contact: ContactMode | None = None,
         trajectory: DriveSection | None = None,
     ) -> Session:
         """Opens a session on a twin. Arguments that are None have the default of the server or of the twin.
@@ -122,7 +124,8 @@ class Client:
 
         `scenario` is the name of one of the server's, `{"name": .., "values": {..}}`, or the scenario itself.
         `repair` is the name of a model of the server's that repairs images, or a `Repair`. `sensors` has effects of
-        cameras and other sensors: lost frames, noise and the like.
+        cameras and other sensors: lost frames, noise and the like. `contact` says what contact with the twin does:
+        "end" the episode, "report" it, or "off"; by default the scenario or the dynamics decide.
 
         Raises `Refused` if the server refuses.
         """
@@ -144,6 +147,7 @@ class Client:
                 scenario=scenario,
                 repair=repair,
                 sensors=sensors,
+                contact=contact,
                 trajectory=trajectory,
             )
         )

@@ -83,6 +83,7 @@ class Step:
 
 
 Model = Literal["teleport", "kinematic", "dynamic"]
+ContactMode = Literal["end", "report", "off"]
 
 
 @dataclass(frozen=True)
@@ -723,10 +724,10 @@ class Residency:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in a scenario since the previous observation."""
+    """Something that happened since the previous observation. A contact without an actor is one with the twin."""
 
     time_us: int
-    kind: Literal["contact", "trigger", "appeared", "left", "end"]
+    kind: Literal["contact", "trigger", "appeared", "left", "off_model", "end"]
     actor: str | None = None
     name: str | None = None
     at_fault: bool | None = None

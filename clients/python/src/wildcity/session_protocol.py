@@ -24,6 +24,7 @@ from .protocol import (
     PROTOCOL,
     Action,
     Closed,
+    ContactMode,
     DriveSection,
     Dynamics,
     InMemory,
@@ -113,6 +114,7 @@ class SessionProtocol:
         scenario: str | Mapping[str, Any] | None = None,
         repair: str | Repair | None = None,
         sensors: Sensors | None = None,
+        contact: ContactMode | None = None,
         trajectory: DriveSection | None = None,
     ) -> Exchange[Opened]:
         """Opens a session."""
@@ -130,6 +132,7 @@ class SessionProtocol:
             "scenario": scenario if scenario is None or isinstance(scenario, str) else dict(scenario),
             "repair": encode(Repair(repair) if isinstance(repair, str) else repair),
             "sensors": encode(sensors),
+            "contact": contact,
             "trajectory": encode(trajectory),
         }
         fields = {name: value for name, value in optional.items() if value is not None}

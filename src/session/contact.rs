@@ -1,0 +1,232 @@
+//! Contact of the ego with the twin (`wildcity.static@1`), which every session looks for unless it is switched off.
+//!
+//! The ego touches the twin where the solid Gaussians in its box have more area than on the recorded drives near by:
+//! the recorded car drove there, so what its box overlapped is no obstacle. The drives within the same block of 16 m, or a
+//! few metres beside it, decide. The largest area on all drives of a city would hide a parked car where the road is
+//! clear, because of one bush that hangs over the road elsewhere.
+//!
+//! Solid Gaussians are read block by block around the ego, at full detail: what is drawn, and from where, does not
+//! matter. A contact is a function of the version, of the ego's box and of its motion in the step.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3};
+use parking_lot::Mutex;
+use serde::{Deserialize, Serialize};
+
+use wildcity_scene::Gaussians;
+use wildcity_scene::chunk::BLOCK_M;
+use wildcity_scene::geometry::Pose;
+use wildcity_sim::contact::{MAX_SWEPT_SPEED_MPS, SolidPoint, Solids, StaticLimit, TestedBox};
+use wildcity_sim::traffic::{EgoBox, EgoMotion, EgoState};
+use wildcity_sim::{Ego, EgoModel};
+use wildcity_twin::store::{Catalog, StoreError};
+
+use crate::engine::solid_blocks::SolidBlocks;
+use crate::scenario::{Event, EventKind};
+use crate::spatial_index::{Block, SpatialIndex, block_at, blocks_between};
+
+/// Recorded drives up to this far outside of a block decide what is a contact in it, in metres.
+const BESIDE_M: f64 = 4.0;
+/// Largest distance between two places at which the area is measured along a recorded drive, in metres.
+const MEASURED_M: f64 = 0.5;
+
+/// Whether a session looks for contact with the twin, and what it does at a contact. With a scenario, `Off` switches it
+/// off, and the scenario says what a contact does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ContactMode {
+    /// A contact is an event, and ends the episode as a driving failure.
+    End,
+    /// A contact is an event, and the episode goes on.
+    Report,
+    /// Contact with the twin is not looked for.
+    Off,
+}
+
+impl ContactMode {
+    /// The mode of an episode unless the session names one. A teleported ego is not stopped by what it meets: it is
+    /// often put into places where no car drives.
+    pub(crate) fn default_for(model: EgoModel) -> Self {
+        if model == EgoModel::Teleport { Self::Report } else { Self::End }
+    }
+}
+
+/// The solid Gaussians of a version, for an ego of one size. Copies share what they have read.
+#[derive(Clone, Debug)]
+pub(crate) struct TwinSolids {
+    catalog: Catalog,
+    index: Arc<SpatialIndex>,
+    blocks: Arc<SolidBlocks>,
+    ego_box: EgoBox,
+    limits: Arc<Mutex<HashMap<Block, StaticLimit>>>,
+}
+
+/// Blocks that a computation has looked up, so that it does not look them up for each pose.
+#[derive(Default)]
+struct Near(HashMap<Block, Vec<Arc<Solids>>>);
+
+impl TwinSolids {
+    pub(crate) fn new(
+        catalog: Catalog,
+        index: Arc<SpatialIndex>,
+        blocks: Arc<SolidBlocks>,
+        ego_box: EgoBox,
+    ) -> Self {
+        Self { catalog, index, blocks, ego_box, limits: Arc::default() }
+    }
+
+    /// The contacts that begin while the ego goes from one state through others, step by step. Each step takes `dt_us`, and
+    /// the first begins at `begin_us`. Blocks while it reads what is near.
+    ///
+    /// What the ego overlaps already at the beginning is not a new contact.
+    ///
+    /// # Errors
+    /// The twin cannot be read.
+    pub(crate) fn contacts(
+        &self,
+        from: &Ego,
+        egos: &[Ego],
+        begin_us: i64,
+        dt_us: i64,
+    ) -> Result<Vec<Vec<Event>>, StoreError> {
+        let mut near = Near::default();
+        let mut from = EgoState::new(from);
+        let mut touches: Option<bool> = None;
+        let mut steps = Vec::with_capacity(egos.len());
+        for (ego, step) in egos.iter().zip(0..) {
+            let motion = EgoMotion::new(from, ego);
+            let mut events = Vec::new();
+            // An ego that stands does not begin to touch anything.
+            if motion.from != motion.to {
+                let is_jump = motion.mean_speed_mps(dt_us) > MAX_SWEPT_SPEED_MPS;
+                let mut touched = match touches {
+                    _ if is_jump => false,
+                    Some(touches) => touches,
+                    None => self.contact_m2(&mut near, &motion.from.world_from_rig)?.is_some(),
+                };
+                for (since_us, state) in motion.sub_steps(dt_us) {
+                    // Of a jump only the end is tested.
+                    if is_jump && since_us < dt_us {
+                        continue;
+                    }
+                    let area_m2 = self.contact_m2(&mut near, &state.world_from_rig)?;
+                    if let (Some(area_m2), false) = (area_m2, touched) {
+                        let impact_mps = state.velocity_mps.length();
+                        events.push(Event {
+                            time_us: begin_us + step * dt_us + since_us,
+                            kind: EventKind::StaticContact { area_m2, impact_mps },
+                        });
+                    }
+                    touched = area_m2.is_some();
+                }
+                touches = Some(touched);
+            }
+            steps.push(events);
+            from = motion.to;
+        }
+        Ok(steps)
+    }
+
+    /// Reads what an ego at a pose needs. Blocks.
+    ///
+    /// # Errors
+    /// The twin cannot be read.
+    pub(crate) fn read_around(&self, world_from_rig: &Pose) -> Result<(), StoreError> {
+        self.contact_m2(&mut Near::default(), world_from_rig).map(|_| ())
+    }
+
+    /// The area that the ego meets at a pose, in m²; `None` if it is free.
+    fn contact_m2(
+        &self,
+        near: &mut Near,
+        world_from_rig: &Pose,
+    ) -> Result<Option<f64>, StoreError> {
+        let area_m2 = self.area_m2(near, world_from_rig)?;
+        // Most places are free whatever the limit is.
+        if !StaticLimit::default().is_exceeded_by(area_m2) {
+            return Ok(None);
+        }
+        let limit = self.limit(near, block_at(world_from_rig.position_m.truncate()))?;
+        Ok(limit.is_exceeded_by(area_m2).then_some(area_m2))
+    }
+
+    /// The area that the ego overlaps at a pose, in m².
+    fn area_m2(&self, near: &mut Near, world_from_rig: &Pose) -> Result<f64, StoreError> {
+        let tested = TestedBox::new(world_from_rig, &self.ego_box);
+        let [low_m, high_m] = tested.extent_m();
+        let mut area_m2 = 0.0;
+        for block in blocks_between(low_m, high_m) {
+            for solids in self.block(near, block)? {
+                area_m2 += solids.area_m2(&tested);
+            }
+        }
+        Ok(area_m2)
+    }
+
+    /// The area above which there is a contact in a block.
+    fn limit(&self, near: &mut Near, block: Block) -> Result<StaticLimit, StoreError> {
+        if let Some(limit) = self.limits.lock().get(&block) {
+            return Ok(*limit);
+        }
+        let south_west_m = corner_m(block) - BESIDE_M;
+        let north_east_m = corner_m(block) + BLOCK_M + BESIDE_M;
+        let mut most_on_drive_m2: f64 = 0.0;
+        let [x, y] = block;
+        for beside in (x - 1..=x + 1).flat_map(|x| (y - 1..=y + 1).map(move |y| [x, y])) {
+            for [from, to] in self.index.drives(beside) {
+                let way_m = from.position_m.distance(to.position_m);
+                let parts = (way_m / MEASURED_M).ceil().max(1.0);
+                for part in 0..=parts as u32 {
+                    let pose = from.interpolate(&to, f64::from(part) / parts);
+                    let place_m = pose.position_m.truncate();
+                    if place_m.cmpge(south_west_m).all() && place_m.cmple(north_east_m).all() {
+                        most_on_drive_m2 = most_on_drive_m2.max(self.area_m2(near, &pose)?);
+                    }
+                }
+            }
+        }
+        let limit = StaticLimit { most_on_drive_m2 };
+        self.limits.lock().insert(block, limit);
+        Ok(limit)
+    }
+
+    fn block<'a>(&self, near: &'a mut Near, block: Block) -> Result<&'a [Arc<Solids>], StoreError> {
+        if !near.0.contains_key(&block) {
+            let mut all = Vec::new();
+            for (chunk, section) in self.index.sections(block) {
+                let solids = match self.blocks.get(&section.hash) {
+                    Some(solids) => solids,
+                    None => {
+                        let version = self.index.version();
+                        let gaussians =
+                            self.catalog.section(version, chunk, section)?.to_gaussians();
+                        let points = (0..gaussians.len()).map(|index| point(&gaussians, index));
+                        let solids = Arc::new(Solids::new(points));
+                        self.blocks.insert(section.hash, solids.clone());
+                        solids
+                    }
+                };
+                all.push(solids);
+            }
+            near.0.insert(block, all);
+        }
+        Ok(near.0.get(&block).map_or(&[], Vec::as_slice))
+    }
+}
+
+/// The south-west corner of a block.
+fn corner_m([x, y]: Block) -> DVec2 {
+    BLOCK_M * DVec2::new(x as f64, y as f64) - 0.5 * wildcity_scene::chunk::CELL_M
+}
+
+/// A Gaussian of the twin, activated.
+fn point(gaussians: &Gaussians, index: usize) -> SolidPoint {
+    let logit = f64::from(gaussians.logit_opacities[index]);
+    SolidPoint {
+        mean_m: DVec3::from_array(gaussians.means_m[index]),
+        sigma_m: DVec3::from_array(gaussians.ln_scales[index].map(|ln| f64::from(ln).exp())),
+        opacity: 1.0 / (1.0 + (-logit).exp()),
+    }
+}

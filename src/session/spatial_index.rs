@@ -1,0 +1,106 @@
+//! What of a version of a twin is near a place: its sections at full detail, and its recorded drives.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use glam::DVec2;
+
+use wildcity_scene::chunk::{BLOCK_M, CELL_M};
+use wildcity_scene::geometry::Pose;
+use wildcity_scene::manifest::{ChunkEntry, Section};
+use wildcity_twin::store::Version;
+
+use crate::observe::trust::RecordedPoses;
+
+/// A block of 16 m by its place in the world, in x and in y.
+pub(crate) type Block = [i64; 2];
+
+/// Between two keyframes that are farther apart than this, in metres, nothing was recorded: the drive has a gap.
+const GAP_M: f64 = 64.0;
+
+/// A version of a twin by place.
+#[derive(Debug)]
+pub(crate) struct SpatialIndex {
+    version: Arc<Version>,
+    /// Index of the chunk, and of the section within it.
+    sections: HashMap<Block, Vec<[usize; 2]>>,
+    /// Index of the drive, and of the keyframe with which a part of the drive begins that touches the block.
+    drives: HashMap<Block, Vec<[usize; 2]>>,
+    /// `None` without a recorded drive.
+    recorded: Option<Arc<RecordedPoses>>,
+}
+
+impl SpatialIndex {
+    pub(crate) fn new(version: Arc<Version>) -> Self {
+        let manifest = &version.manifest;
+        let mut sections: HashMap<Block, Vec<[usize; 2]>> = HashMap::new();
+        for (chunk_index, chunk) in manifest.chunks.iter().enumerate() {
+            for (section_index, section) in chunk.sections.iter().enumerate() {
+                if section.is_full_detail() {
+                    let block = block_of_section(chunk, section);
+                    sections.entry(block).or_default().push([chunk_index, section_index]);
+                }
+            }
+        }
+        let mut drives: HashMap<Block, Vec<[usize; 2]>> = HashMap::new();
+        for (drive_index, drive) in manifest.trajectories.iter().enumerate() {
+            for (key_index, pair) in drive.keyframes.windows(2).enumerate() {
+                let [a_m, b_m] =
+                    [&pair[0], &pair[1]].map(|key| key.world_from_rig.position_m.truncate());
+                if a_m.distance(b_m) > GAP_M {
+                    continue;
+                }
+                for block in blocks_between(a_m.min(b_m), a_m.max(b_m)) {
+                    drives.entry(block).or_default().push([drive_index, key_index]);
+                }
+            }
+        }
+        let recorded = RecordedPoses::new(manifest).map(Arc::new);
+        Self { version, sections, drives, recorded }
+    }
+
+    pub(crate) fn version(&self) -> &Arc<Version> {
+        &self.version
+    }
+
+    /// The sections at full detail of a block, with their chunks.
+    pub(crate) fn sections(&self, block: Block) -> impl Iterator<Item = (&ChunkEntry, &Section)> {
+        let chunks = &self.version.manifest.chunks;
+        self.sections.get(&block).into_iter().flatten().map(|[chunk, section]| {
+            let chunk = &chunks[*chunk];
+            (chunk, &chunk.sections[*section])
+        })
+    }
+
+    /// The parts of the recorded drives, each between two keyframes, that may pass through a block.
+    pub(crate) fn drives(&self, block: Block) -> impl Iterator<Item = [Pose; 2]> {
+        let drives = &self.version.manifest.trajectories;
+        self.drives.get(&block).into_iter().flatten().map(|[drive, key]| {
+            let keyframes = &drives[*drive].keyframes;
+            [keyframes[*key].world_from_rig, keyframes[*key + 1].world_from_rig]
+        })
+    }
+
+    /// The recorded poses; `None` without a recorded drive.
+    pub(crate) fn recorded(&self) -> Option<&Arc<RecordedPoses>> {
+        self.recorded.as_ref()
+    }
+}
+
+/// The block of a point.
+pub(crate) fn block_at(point_m: DVec2) -> Block {
+    // Cells, and so blocks, are offset by half a cell from the origin.
+    ((point_m + 0.5 * CELL_M) / BLOCK_M).floor().as_i64vec2().to_array()
+}
+
+/// The blocks that a rectangle touches, from west to east and from south to north.
+pub(crate) fn blocks_between(low_m: DVec2, high_m: DVec2) -> impl Iterator<Item = Block> {
+    let [[west, south], [east, north]] = [low_m, high_m].map(block_at);
+    (west..=east).flat_map(move |x| (south..=north).map(move |y| [x, y]))
+}
+
+fn block_of_section(chunk: &ChunkEntry, section: &Section) -> Block {
+    // A cell of 64 m has 4 x 4 blocks.
+    let in_cell = [section.block % 4, section.block / 4].map(i64::from);
+    [0, 1].map(|axis| 4 * i64::from(chunk.cell[axis]) + in_cell[axis])
+}
