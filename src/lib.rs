@@ -19,7 +19,7 @@
 //! | [`wildcity_eval`] | rendered images against held-out real ones: scores and their page | render, scene |
 //! | [`wildcity_stress`] | extreme scenes, each with its bound, for every backend | generate, render, scene |
 //! | [`wildcity_twin`] | twins on disk and in memory: import, versioned store, streaming | scene |
-//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, render, repair, scene, sim, twin |
+//! | [`wildcity_session`] | episodes: reset, step, observe, record, replay | episode, generate, render, repair, scene, sim, twin |
 //! | [`wildcity_push`] | new versions from uploaded files: read, check, report, preview, publish | render, scene, session, twin |
 //! | [`wildcity_repair`] | repair of images by an ONNX model: manifest, tiles, checks, hashes | scene |
 //! | [`wildcity_report`] | error against run time of every setting of a twin | generate, render, repair, scene, session, stress, twin |

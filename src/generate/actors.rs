@@ -1,4 +1,5 @@
-//! Vehicles and a pedestrian as assets of actors: the street's parked cars in more detail, and a person.
+//! Assets of actors: the street's parked cars in more detail, a truck, a bus, a pedestrian, a cyclist and a crate. Actors
+//! without an asset of their own are drawn as one of them.
 //!
 //! They are lit from above ([`Light::overhead`]), since an actor turns and its light does not. Pictures were used to
 //! check that they look right next to the parked cars.
@@ -7,8 +8,9 @@ use glam::DVec3;
 
 use wildcity_scene::{ActorBox, ActorClass, Gaussians};
 
-use super::car_kinds::{HATCHBACK, MOVING_VAN, SEDAN};
+use super::car_kinds::{BUS, HATCHBACK, MOVING_VAN, SEDAN, TRUCK};
 use super::cars::Car;
+use super::cyclist;
 use super::light::Light;
 use super::pedestrian;
 use super::surface::{Paint, Painter};
@@ -31,24 +33,31 @@ pub struct ActorModel {
 
 impl ActorModel {
     /// The names of all models.
-    pub const NAMES: [&'static str; 4] = ["hatchback", "sedan", "van", "pedestrian"];
+    pub const NAMES: [&'static str; 8] =
+        ["hatchback", "sedan", "van", "truck", "bus", "pedestrian", "bicycle", "crate"];
 }
 
 /// Counts changes of the models: assets of another revision are made again.
 pub const ACTOR_REVISION: u32 = 3;
 
-/// All models: a red hatchback, a silver sedan, a white van, and a pedestrian in mid-stride.
+/// Cells along an edge of a truck and a bus: they have four times the surface of a car.
+const LARGE_DETAIL: usize = 2;
+
+/// All models: a red hatchback, a silver sedan, a white van, a truck, a bus, a pedestrian in mid-stride, a cyclist, and a
+/// wooden crate of 1 m.
 pub fn actor_models() -> Vec<ActorModel> {
     let cars = [
-        ("hatchback", &HATCHBACK, Paint::matt(0.62, 0.12, 0.11)),
-        ("sedan", &SEDAN, Paint::matt(0.60, 0.62, 0.65)),
-        ("van", &MOVING_VAN, Paint::matt(0.86, 0.87, 0.88)),
+        ("hatchback", &HATCHBACK, Paint::matt(0.62, 0.12, 0.11), DETAIL),
+        ("sedan", &SEDAN, Paint::matt(0.60, 0.62, 0.65), DETAIL),
+        ("van", &MOVING_VAN, Paint::matt(0.86, 0.87, 0.88), DETAIL),
+        ("truck", &TRUCK, Paint::matt(0.80, 0.79, 0.74), LARGE_DETAIL),
+        ("bus", &BUS, Paint::matt(0.72, 0.60, 0.16), LARGE_DETAIL),
     ];
     let light = Light::overhead();
     let mut models: Vec<ActorModel> = Vec::new();
-    for (name, kind, paint) in cars {
+    for (name, kind, paint, detail) in cars {
         let car = Car::model(kind, paint);
-        let mut painter = Painter::detailed(&light, DETAIL);
+        let mut painter = Painter::detailed(&light, detail);
         car.paint_model(&mut painter);
         let DVec3 { x: length_m, y: width_m, z: height_m } = car.size_m();
         models.push(ActorModel {
@@ -66,7 +75,49 @@ pub fn actor_models() -> Vec<ActorModel> {
         box_: ActorBox::PEDESTRIAN,
         gaussians: painter.gaussians,
     });
+    let mut painter = Painter::detailed(&light, 1);
+    cyclist::paint(&mut painter);
+    models.push(ActorModel {
+        name: "bicycle",
+        class: ActorClass::Bicycle,
+        box_: ActorBox { length_m: 1.8, width_m: 0.6, height_m: 1.75 },
+        gaussians: painter.gaussians,
+    });
+    let mut painter = Painter::detailed(&light, 1);
+    paint_crate(&mut painter);
+    models.push(ActorModel {
+        name: "crate",
+        class: ActorClass::Object,
+        box_: ActorBox { length_m: 1.0, width_m: 1.0, height_m: 1.0 },
+        gaussians: painter.gaussians,
+    });
     models
+}
+
+/// A crate of boards.
+fn paint_crate(painter: &mut Painter) {
+    let ends_m: Vec<f64> = (0..=50).map(|k| -0.5 + 0.02 * f64::from(k)).collect();
+    let wood = Paint::matt(0.62, 0.47, 0.30);
+    // Outward normal and the two directions of each face, u x v.
+    let faces = [
+        (DVec3::X, DVec3::Y, DVec3::Z),
+        (DVec3::NEG_X, DVec3::NEG_Y, DVec3::Z),
+        (DVec3::Y, DVec3::NEG_X, DVec3::Z),
+        (DVec3::NEG_Y, DVec3::X, DVec3::Z),
+        (DVec3::Z, DVec3::X, DVec3::Y),
+    ];
+    for (normal, u, v) in faces {
+        let place = |a_m: f64, b_m: f64| 0.5 * DVec3::Z + 0.5 * normal + a_m * u + b_m * v;
+        painter.sheet(&ends_m, &ends_m, place, |a_m, b_m| {
+            let is_edge = a_m.abs().max(b_m.abs()) > 0.42;
+            let is_gap = ((b_m + 0.5) * 6.0).fract() < 0.1;
+            Some(match (is_edge, is_gap) {
+                (true, _) => wood.times(0.8),
+                (false, true) => wood.times(0.35),
+                (false, false) => wood,
+            })
+        });
+    }
 }
 
 /// The Gaussians with centres above the ground. A wheel arch is a whole disc, and a road need not hide its lower part.

@@ -1,6 +1,6 @@
 //! Outlines of cars, as tables.
 
-/// Length and width of a kind, and its outline from the tail (x = 0) to the nose (x = 1).
+/// Sizes of a kind in metres, and its outline from the tail (x = 0) to the nose (x = 1).
 ///
 /// Every knot is (x, belt, top): the position along the car as a fraction of its length, the height of the
 /// body's side, and the height of the middle line, both in metres. Heights are interpolated linearly.
@@ -8,6 +8,8 @@
 pub(super) struct Kind {
     pub(super) length_m: f64,
     pub(super) width_m: f64,
+    /// Radius of a tyre.
+    pub(super) tyre_m: f64,
     knots: &'static [(f64, f64, f64)],
     /// Side windows from tail to nose, as fractions of the length; pillars are between them.
     pub(super) side_glass: &'static [[f64; 2]],
@@ -51,6 +53,7 @@ impl Kind {
 pub(super) const HATCHBACK: Kind = Kind {
     length_m: 4.1,
     width_m: 1.76,
+    tyre_m: 0.325,
     knots: &[
         (0.00, 0.72, 0.74),
         (0.03, 0.94, 0.98),
@@ -69,6 +72,7 @@ pub(super) const HATCHBACK: Kind = Kind {
 pub(super) const SEDAN: Kind = Kind {
     length_m: 4.7,
     width_m: 1.82,
+    tyre_m: 0.325,
     knots: &[
         (0.00, 0.70, 0.72),
         (0.02, 0.90, 0.98),
@@ -88,6 +92,7 @@ pub(super) const SEDAN: Kind = Kind {
 pub(super) const WAGON: Kind = Kind {
     length_m: 4.5,
     width_m: 1.86,
+    tyre_m: 0.325,
     knots: &[
         (0.00, 0.80, 0.82),
         (0.02, 1.04, 1.10),
@@ -106,6 +111,7 @@ pub(super) const WAGON: Kind = Kind {
 pub(super) const VAN: Kind = Kind {
     length_m: 5.1,
     width_m: 1.94,
+    tyre_m: 0.325,
     knots: &[
         (0.00, 1.02, 1.04),
         (0.01, 1.18, 1.80),
@@ -136,4 +142,51 @@ pub(super) const MOVING_VAN: Kind = Kind {
     ],
     rear_glass: [0.004, 0.0125],
     ..VAN
+};
+
+/// A delivery truck with a box body.
+pub(super) const TRUCK: Kind = Kind {
+    length_m: 8.4,
+    width_m: 2.5,
+    tyre_m: 0.48,
+    knots: &[
+        (0.000, 1.10, 1.12),
+        (0.003, 1.20, 3.40),
+        (0.006, 1.22, 3.50),
+        (0.715, 1.22, 3.50),
+        (0.730, 1.22, 2.80),
+        (0.740, 1.22, 2.72),
+        (0.940, 1.22, 2.66),
+        (0.985, 1.20, 1.34),
+        (1.000, 1.00, 1.04),
+    ],
+    side_glass: &[[0.79, 0.92]],
+    rear_glass: [0.0, 0.0],
+    windscreen: [0.942, 0.984],
+};
+
+/// A city bus.
+pub(super) const BUS: Kind = Kind {
+    length_m: 12.0,
+    width_m: 2.55,
+    tyre_m: 0.48,
+    knots: &[
+        (0.000, 1.10, 1.14),
+        (0.003, 1.14, 2.90),
+        (0.010, 1.15, 3.05),
+        (0.960, 1.15, 3.05),
+        (0.985, 1.14, 2.90),
+        (0.998, 1.10, 1.24),
+        (1.000, 1.00, 1.04),
+    ],
+    side_glass: &[
+        [0.03, 0.17],
+        [0.18, 0.33],
+        [0.34, 0.49],
+        [0.50, 0.65],
+        [0.66, 0.81],
+        [0.82, 0.95],
+    ],
+    rear_glass: [0.004, 0.009],
+    windscreen: [0.972, 0.997],
 };

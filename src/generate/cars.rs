@@ -9,8 +9,6 @@ use super::surface::{Paint, Painter};
 
 /// Height of the sills, in metres.
 const SILL_M: f64 = 0.24;
-/// Radius of a tyre, in metres.
-const TYRE_M: f64 = 0.325;
 /// Middle of the wheels along the car, as parts of its length.
 const WHEELS: [f64; 2] = [0.19, 0.80];
 
@@ -170,7 +168,7 @@ impl Car {
 
     /// The side from sill to shoulder, slightly bellied, with the wheel arches cut out.
     fn flank(&self, painter: &mut Painter, xs: &[f64], side: f64) {
-        let length_m = self.kind.length_m;
+        let Kind { length_m, tyre_m, .. } = *self.kind;
         let vs = painter.even(0.0, 1.0, 0.16);
         let place = |x_m: f64, v: f64| {
             let x = x_m / length_m;
@@ -190,7 +188,7 @@ impl Car {
                 let z_m = SILL_M + v * (self.kind.belt_m(x_m / length_m) - SILL_M);
                 let arch = WHEELS.iter().any(|wheel| {
                     let dx_m = x_m - wheel * length_m;
-                    dx_m * dx_m + (z_m - TYRE_M).powi(2) < (TYRE_M + 0.07).powi(2)
+                    dx_m * dx_m + (z_m - tyre_m).powi(2) < (tyre_m + 0.07).powi(2)
                 });
                 if arch {
                     return None;
@@ -290,12 +288,13 @@ impl Car {
 
     /// Tyre, rim, and the dark wheel arch behind them.
     fn wheel(&self, painter: &mut Painter, wheel: f64, side: f64) {
+        let tyre_m = self.kind.tyre_m;
         let x_m = wheel * self.kind.length_m;
         let half_m = self.half_width_m(wheel);
         let disc = |radius_m: f64, y_m: f64| {
             move |angle_rad: f64, r: f64| {
                 let (sin, cos) = angle_rad.sin_cos();
-                self.place(x_m + radius_m * r * cos, side * y_m, TYRE_M + radius_m * r * sin)
+                self.place(x_m + radius_m * r * cos, side * y_m, tyre_m + radius_m * r * sin)
             }
         };
         let detail = painter.refined(&[0.0, 1.0]).len() - 1;
@@ -305,13 +304,13 @@ impl Car {
             // Outwards for either side: with r as v, u × v points to -left when u turns left.
             (0..=count).map(|i| side * i as f64 * step_rad).collect()
         };
-        let arch = disc(TYRE_M + 0.09, half_m - 0.16);
+        let arch = disc(tyre_m + 0.09, half_m - 0.16);
         let radii = painter.refined(&[0.1, 0.55, 1.0]);
         painter
             .sheet(&around(10), &radii, arch, |_, _| Some(Paint::matt(0.07, 0.07, 0.08).open(0.5)));
         let rings = painter.refined(&[0.0, 0.22, 0.48, 0.68, 0.82, 1.0]);
         let rim = Paint::matt(0.66, 0.67, 0.70).gloss(0.1);
-        painter.sheet(&around(15), &rings, disc(TYRE_M, half_m - 0.035), |angle_rad, r| {
+        painter.sheet(&around(15), &rings, disc(tyre_m, half_m - 0.035), |angle_rad, r| {
             let spoke = (angle_rad.abs() * 5.0 / std::f64::consts::TAU).fract() < 0.55;
             Some(if r > 0.68 {
                 Paint::matt(0.14, 0.14, 0.15)
@@ -325,7 +324,7 @@ impl Car {
         let tread = move |angle_rad: f64, t: f64| {
             let (sin, cos) = angle_rad.sin_cos();
             let y_m = side * (half_m - 0.035 - 0.20 * t);
-            self.place(x_m + TYRE_M * cos, y_m, TYRE_M + TYRE_M * sin)
+            self.place(x_m + tyre_m * cos, y_m, tyre_m + tyre_m * sin)
         };
         let across = painter.refined(&[0.0, 0.5, 1.0]);
         painter.sheet(&around(14), &across, tread, |_, _| Some(Paint::matt(0.12, 0.12, 0.13)));

@@ -26,6 +26,7 @@ mod canyon;
 mod car_kinds;
 mod cars;
 mod city;
+mod cyclist;
 mod facade;
 mod furniture;
 mod ground_floor;

@@ -9,22 +9,22 @@ const CELL_M: f64 = 0.016;
 
 /// A ring of a tube: where its middle is, and its half width (along y) and half depth (along x), in metres.
 #[derive(Clone, Copy, Debug)]
-struct Ring {
+pub(super) struct Ring {
     center_m: DVec3,
     half_width_m: f64,
     half_depth_m: f64,
 }
 
-const fn ring(x: f64, y: f64, z: f64, half_width_m: f64, half_depth_m: f64) -> Ring {
+pub(super) const fn ring(x: f64, y: f64, z: f64, half_width_m: f64, half_depth_m: f64) -> Ring {
     Ring { center_m: DVec3::new(x, y, z), half_width_m, half_depth_m }
 }
 
-const TROUSERS: Paint = Paint::matt(0.20, 0.24, 0.36);
-const COAT: Paint = Paint::matt(0.52, 0.20, 0.16);
+pub(super) const TROUSERS: Paint = Paint::matt(0.20, 0.24, 0.36);
+pub(super) const COAT: Paint = Paint::matt(0.52, 0.20, 0.16);
 const SHIRT: Paint = Paint::matt(0.86, 0.85, 0.82);
-const SKIN: Paint = Paint::matt(0.80, 0.62, 0.52);
+pub(super) const SKIN: Paint = Paint::matt(0.80, 0.62, 0.52);
 const HAIR: Paint = Paint::matt(0.20, 0.15, 0.12);
-const SHOES: Paint = Paint::matt(0.15, 0.14, 0.14);
+pub(super) const SHOES: Paint = Paint::matt(0.15, 0.14, 0.14);
 
 /// Paints a person of 1.75 m in mid-stride along x: the left foot and the right arm are in front.
 pub(super) fn paint(painter: &mut Painter) {
@@ -166,7 +166,7 @@ fn head(painter: &mut Painter) {
 /// Covers a tube through rings, from one end to the other.
 ///
 /// Rings lie in planes of constant arc length: across the tube's own direction in the plane of x and z, and along y.
-fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) -> Paint) {
+pub(super) fn tube(painter: &mut Painter, rings: &[Ring], paint: impl Fn(DVec3) -> Paint) {
     // Break points along the tube, by index of the ring.
     let mut along = vec![0.0];
     for (index, pair) in rings.windows(2).enumerate() {

@@ -86,7 +86,7 @@ pub use repair::session_repair::SessionRepair;
 pub use repair::status::{ImageRepair, RepairFailure, RepairStatus};
 pub use scenario::{
     EpisodeTraffic, Event, EventKind, LoadedScenario, ScenarioError, ScenarioSource, Scenarios,
-    asset_info,
+    StoredAssets, generated_actors,
 };
 pub use sensors::settings::{
     AxisNoise, CameraSensor, ExposureDrift, FrozenFrames, ImageNoise, Imu, LateFrames, LensDirt,

@@ -10,7 +10,7 @@ use wildcity_episode::{DriveStart, ScenarioLine, scenario_line};
 use wildcity_scene::Trajectory;
 use wildcity_session::{
     Encoding, ImagePart, LoadedScenario, Outputs, ScenarioOptions, ScenarioSource, Scenarios,
-    SessionOptions, asset_info, limits as session,
+    SessionOptions, StoredAssets, limits as session,
 };
 use wildcity_sim::scenario::{Case as Seeded, Scenario, ScenarioFile};
 use wildcity_twin::store::{Catalog, Version};
@@ -66,7 +66,7 @@ pub fn cases(
     catalog: &Catalog,
     options: CaseOptions,
 ) -> Result<Vec<Case>, SuiteError> {
-    let asset = |name: &str| asset_info(catalog, name);
+    let assets = StoredAssets::new(catalog);
     let mut versions = Versions { catalog, latest: options.latest, opened: BTreeMap::new() };
     let mut cases = Vec::new();
     for scenario in scenarios {
@@ -84,7 +84,7 @@ pub fn cases(
             let pinned = (&version.manifest, version.hash.as_str());
             let dir = scenario.path.parent().unwrap_or(Path::new(""));
             let loaded = Scenarios::in_dir(dir)
-                .resolve(file, case.seed, pinned, options.latest, &asset)
+                .resolve(file, case.seed, pinned, options.latest, &assets)
                 .map_err(|cause| SuiteError::Scenario { path: scenario.path.clone(), cause })?;
             cases.push(Case::new(suite, name, case, loaded, &version));
             if cases.len() > limits::EPISODES {

@@ -8,7 +8,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_sim::map::{Map, MapFile};
-use wildcity_sim::scenario::{Document, Scenario, Surroundings, TracksFile};
+use wildcity_sim::scenario::{Document, NoAssets, Scenario, Surroundings, TracksFile};
 use wildcity_sim::traffic::{EgoMotion, EgoState, World};
 
 /// Files of each kind are damaged so often.
@@ -127,9 +127,8 @@ fn run(text: &[u8]) -> Result<usize, String> {
     let drives = [drive()];
     let tracks = TracksFile::parse(tracks().to_string().as_bytes()).unwrap();
     let map = Map::new(map()).unwrap();
-    let nothing = |_: &str| Err("there is none".to_owned());
     let around =
-        Surroundings { drives: &drives, tracks: Some(&tracks), map: Some(&map), asset: &nothing };
+        Surroundings { drives: &drives, tracks: Some(&tracks), map: Some(&map), assets: &NoAssets };
     let scenario = Scenario::resolve(file, 3, &around).map_err(refused)?;
     // What was resolved resolves again to the same.
     let again = Scenario::resolve(scenario.file.clone(), 99, &around).map_err(refused)?;

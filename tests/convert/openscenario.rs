@@ -2,7 +2,7 @@
 
 use wildcity_convert::openscenario::{Settings, read};
 use wildcity_sim::scenario::{
-    ActionSection, Document, EgoStart, Scenario, ScenarioFile, Surroundings,
+    ActionSection, Document, EgoStart, NoAssets, Scenario, ScenarioFile, Surroundings,
 };
 
 /// An ego, a car that cuts in, and a pedestrian that crosses: every element that is read.
@@ -125,8 +125,7 @@ pub(crate) fn settings() -> Settings {
 }
 
 fn resolved(file: ScenarioFile) -> Scenario {
-    let nothing = |_: &str| Err("there is none".to_owned());
-    let around = Surroundings { drives: &[], tracks: None, map: None, asset: &nothing };
+    let around = Surroundings { drives: &[], tracks: None, map: None, assets: &NoAssets };
     Scenario::resolve(file, 1, &around).unwrap()
 }
 

@@ -6,7 +6,7 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::contact::{Contact, Detector};
 use wildcity_sim::map::Map;
-use wildcity_sim::scenario::{AssetInfo, Document, EgoStart, Scenario, Surroundings};
+use wildcity_sim::scenario::{AssetInfo, Assets, Document, EgoStart, Scenario, Surroundings};
 use wildcity_sim::traffic::{
     ActorState, Course, CourseFootPoint, EgoMotion, EgoState, Idm, World, rolled,
 };
@@ -19,6 +19,24 @@ struct Driven {
     names: Vec<String>,
 }
 
+/// The generated models by their names, as if each were a small car.
+struct Models;
+
+impl Assets for Models {
+    fn find(&self, name: &str) -> Result<AssetInfo, String> {
+        let info = AssetInfo {
+            hash: "0".repeat(64),
+            class: ActorClass::Vehicle,
+            box_: ActorBox::PEDESTRIAN,
+        };
+        ActorModel::NAMES.contains(&name).then_some(info).ok_or_else(|| name.to_owned())
+    }
+
+    fn default_for(&self, _: ActorClass, _: &ActorBox) -> Result<Option<AssetInfo>, String> {
+        Ok(None)
+    }
+}
+
 fn drive(file: &str, seed: u64, seconds: u32) -> Driven {
     let settings = StreetSettings::default();
     let drives = [crate::DEMO.trajectory.clone()];
@@ -26,15 +44,7 @@ fn drive(file: &str, seed: u64, seconds: u32) -> Driven {
     let text = std::fs::read(crate::root::root().join("scenes").join(file)).unwrap();
     let document = Document::parse(&text).unwrap();
     assert!(document.cases().len() >= 5);
-    let asset = |name: &str| {
-        let info = AssetInfo {
-            hash: "0".repeat(64),
-            class: ActorClass::Vehicle,
-            box_: ActorBox::PEDESTRIAN,
-        };
-        ActorModel::NAMES.contains(&name).then_some(info).ok_or_else(|| name.to_owned())
-    };
-    let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), asset: &asset };
+    let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), assets: &Models };
     let scenario =
         Scenario::resolve(document.with(&document.first_values()).unwrap(), seed, &around).unwrap();
     let Some(EgoStart::Station { station_m, .. }) = scenario.start else { panic!("a station") };

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use wildcity_scene::geometry::Pose;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_sim::map::{Map, MapFile};
-use wildcity_sim::scenario::{Document, Scenario, Surroundings};
+use wildcity_sim::scenario::{Document, NoAssets, Scenario, Surroundings};
 use wildcity_sim::traffic::{EgoMotion, EgoState, World};
 
 /// Uphill along x, 5 m above 0 at its start: a rise of 1 m in 10 m.
@@ -42,8 +42,7 @@ fn actors_follow_the_height_and_the_tilt_of_drives_and_lanes() {
     let document = Document::parse(scenario.to_string().as_bytes()).unwrap();
     let file = document.with(&document.first_values()).unwrap();
     let (drives, map) = ([drive()], map());
-    let nothing = |_: &str| Err("there is none".to_owned());
-    let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), asset: &nothing };
+    let around = Surroundings { drives: &drives, tracks: None, map: Some(&map), assets: &NoAssets };
     let scenario = Scenario::resolve(file, 0, &around).unwrap();
     let mut world = World::new(scenario.traffic.clone());
     let far = Pose { position_m: DVec3::new(0.0, 900.0, 0.0), ..Pose::IDENTITY };

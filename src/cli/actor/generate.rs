@@ -1,16 +1,14 @@
-//! `wildcity actor generate`, and the assets that the demo needs.
+//! `wildcity actor generate`.
 
 use std::io::{self, Write};
 
-use wildcity_generate::{ACTOR_REVISION, ActorModel, actor_models};
-use wildcity_scene::RecordFormat;
-use wildcity_scene::actor::{ActorAsset, AssetDescription};
-use wildcity_scene::manifest::Provenance;
-use wildcity_twin::store::{Catalog, StoredActor};
+use wildcity_session::generated_actors;
 
 use crate::cli::directories::Twins;
 
-/// Make the assets of the demo: a hatchback, a sedan, a van and a pedestrian.
+/// Make the assets of actors that name none: a hatchback, a sedan, a van, a truck, a bus, a pedestrian, a cyclist and a crate.
+///
+/// A scenario that needs one makes it, too.
 ///
 /// They are made by a program, like the demo street, and lit from above, so that they fit every heading. Those that
 /// exist already stay as they are.
@@ -27,7 +25,7 @@ pub(super) struct Generate {
 impl Generate {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let mut out = io::stdout().lock();
-        for actor in generated(&self.twins.catalog()?)? {
+        for actor in generated_actors(&self.twins.catalog()?).map_err(anyhow::Error::msg)? {
             writeln!(
                 out,
                 "actor {}: {}, {} Gaussians\nblake3 {}",
@@ -39,31 +37,4 @@ impl Generate {
         }
         Ok(())
     }
-}
-
-/// The assets of all generated models, made if need be.
-pub(in crate::cli) fn generated(catalog: &Catalog) -> anyhow::Result<Vec<StoredActor>> {
-    let source = |name: &str| format!("generated {name}, revision {ACTOR_REVISION}");
-    let stored = catalog.actors()?.actors;
-    let mut all = Vec::new();
-    let mut missing = Vec::new();
-    for name in ActorModel::NAMES {
-        match stored.iter().find(|actor| actor.description.provenance.source == source(name)) {
-            Some(actor) => all.push(actor.clone()),
-            None => missing.push(name),
-        }
-    }
-    if missing.is_empty() {
-        return Ok(all);
-    }
-    for ActorModel { name, class, box_, gaussians } in actor_models() {
-        if !missing.contains(&name) {
-            continue;
-        }
-        let provenance = Provenance::of(source(name));
-        let description = AssetDescription { name: name.to_owned(), class, box_, provenance };
-        let asset = ActorAsset::new(&gaussians, description)?;
-        all.push(catalog.put_actor(&asset, RecordFormat::default())?);
-    }
-    Ok(all)
 }

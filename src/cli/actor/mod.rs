@@ -11,8 +11,6 @@ mod remove;
 mod show;
 mod summary;
 
-pub(super) use generate::generated;
-
 /// Make, list, show and remove assets of actors, from which other vehicles and pedestrians are rendered.
 ///
 /// Assets are stored next to the twins, and all twins share them. An asset is identified by the BLAKE3 of its content.

@@ -23,6 +23,7 @@ use wildcity_repair::{LoadOptions, Models};
 use wildcity_scene::manifest::Provenance;
 use wildcity_scene::{RecordFormat, Rig};
 use wildcity_server::{Config, Directories};
+use wildcity_session::generated_actors;
 use wildcity_twin::ingest::sky;
 use wildcity_twin::store::{
     Catalog, NewSky, NewVersion, SkyBytes, StorageOptions, StoreError, StoredActor, Version,
@@ -31,7 +32,6 @@ use wildcity_twin::store::{
 use self::driver::CarefulDriver;
 use self::scenario::DemoScenario;
 
-use super::actor::generated;
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
 use super::repair_options::runtime_library;
@@ -126,7 +126,7 @@ impl Demo {
         };
         let version = demo_twin(&twins, TWIN, StorageOptions::default(), None)?;
         let assets = match self.scenario {
-            Some(_) => generated(&self.twins.catalog()?)?,
+            Some(_) => generated_actors(&self.twins.catalog()?).map_err(anyhow::Error::msg)?,
             None => Vec::new(),
         };
         if self.off_trajectory.is_some() {

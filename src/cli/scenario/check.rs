@@ -7,7 +7,7 @@ use anyhow::Context;
 
 use super::opened;
 use crate::cli::directories::Twins;
-use wildcity_session::asset_info;
+use wildcity_session::StoredAssets;
 
 /// Check scenarios against their twins, with every combination of their sweeps.
 ///
@@ -44,10 +44,10 @@ impl Check {
             for case in &cases {
                 let file = opened.document.with(&case.values).with_context(context)?;
                 let version = (&opened.version.manifest, opened.version.hash.as_str());
-                let asset = |name: &str| asset_info(&catalog, name);
+                let assets = StoredAssets::new(&catalog);
                 let loaded = opened
                     .scenarios
-                    .resolve(file, case.seed, version, self.latest, &asset)
+                    .resolve(file, case.seed, version, self.latest, &assets)
                     .with_context(|| format!("{}, seed {}", path.display(), case.seed))?;
                 actors = actors.max(loaded.scenario.traffic.actors.len());
                 unpinned = loaded.unpinned;

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use super::{opened, value, values_of};
 use crate::cli::directories::Twins;
-use wildcity_session::asset_info;
+use wildcity_session::StoredAssets;
 
 /// Show a scenario as an episode runs it: with a seed's jitter, the values of its sweep, and all hashes.
 ///
@@ -46,8 +46,8 @@ impl Show {
         values.extend(values_of(&self.values));
         let file = opened.document.with(&values)?;
         let version = (&opened.version.manifest, opened.version.hash.as_str());
-        let asset = |name: &str| asset_info(&catalog, name);
-        let loaded = opened.scenarios.resolve(file, self.seed, version, self.latest, &asset)?;
+        let assets = StoredAssets::new(&catalog);
+        let loaded = opened.scenarios.resolve(file, self.seed, version, self.latest, &assets)?;
         let shown = serde_json::json!({
             "hash": loaded.hash,
             "scenario": loaded.scenario.file,

@@ -1,13 +1,17 @@
 //! The assets of an episode's actors, and the parts of them that a frame draws.
 
+use std::cell::{OnceCell, RefCell};
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use wildcity_scene::RenderProfile;
 use wildcity_scene::actor::{ActorAsset, ActorViewpoint, ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Pose;
-use wildcity_sim::scenario::AssetInfo;
+use wildcity_scene::{ActorBox, ActorClass, RenderProfile};
+use wildcity_sim::scenario::{AssetInfo, Assets};
 use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
-use wildcity_twin::store::Catalog;
+use wildcity_twin::store::{Catalog, StoredActor};
+
+use super::default_assets::{generated_actors, nearest};
 
 /// The asset of each actor, by its index; `None` for an actor that is not drawn. Copies share the assets.
 #[derive(Clone, Debug, Default)]
@@ -20,14 +24,44 @@ pub(crate) struct FrameDetail<'a> {
     pub(crate) profile: &'a RenderProfile,
 }
 
-/// Data of an asset that a scenario needs, by its hash or its name.
-///
-/// # Errors
-/// There is no such asset, or more than one, or it is damaged.
-pub fn asset_info(catalog: &Catalog, name: &str) -> Result<AssetInfo, String> {
-    let actor = catalog.find_actor(name).map_err(|error| error.to_string())?;
-    let description = actor.description;
-    Ok(AssetInfo { hash: actor.hash, class: description.class, box_: description.box_ })
+/// The assets of a store, as scenarios look them up. Remembers what it found: many actors have the same asset.
+#[derive(Debug)]
+pub struct StoredAssets<'a> {
+    catalog: &'a Catalog,
+    found: RefCell<BTreeMap<String, Result<AssetInfo, String>>>,
+    generated: OnceCell<Result<Vec<StoredActor>, String>>,
+}
+
+impl<'a> StoredAssets<'a> {
+    /// The assets of a store. If an actor needs a generated one that is missing, it is made.
+    pub fn new(catalog: &'a Catalog) -> Self {
+        Self { catalog, found: RefCell::default(), generated: OnceCell::new() }
+    }
+}
+
+impl Assets for StoredAssets<'_> {
+    fn find(&self, name: &str) -> Result<AssetInfo, String> {
+        let mut found = self.found.borrow_mut();
+        let entry = found.entry(name.to_owned());
+        let find = || {
+            let actor = self.catalog.find_actor(name).map_err(|error| error.to_string())?;
+            Ok(info(&actor))
+        };
+        entry.or_insert_with(find).clone()
+    }
+
+    fn default_for(&self, class: ActorClass, box_: &ActorBox) -> Result<Option<AssetInfo>, String> {
+        let generated = self.generated.get_or_init(|| generated_actors(self.catalog));
+        let generated = generated.as_ref().map_err(|reason| {
+            format!("the generated one cannot be made: {reason}; write \"asset\": \"none\" for an invisible actor")
+        })?;
+        Ok(nearest(generated, class, box_).map(info))
+    }
+}
+
+fn info(actor: &StoredActor) -> AssetInfo {
+    let description = &actor.description;
+    AssetInfo { hash: actor.hash.clone(), class: description.class, box_: description.box_ }
 }
 
 impl ActorAssets {

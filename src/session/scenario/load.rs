@@ -12,7 +12,7 @@ use wildcity_scene::rig::is_name;
 use wildcity_sim::limits::{MAP_BYTES, SCENARIO_BYTES};
 use wildcity_sim::map::{LaneSurface, Map, MapFile};
 use wildcity_sim::scenario::{
-    AssetInfo, Document, FileError, Scenario, ScenarioFile, Surroundings, TracksFile,
+    Assets, Document, FileError, Scenario, ScenarioFile, Surroundings, TracksFile,
 };
 
 /// A directory of scenarios: `NAME.json`, and the tracks and maps that they name.
@@ -170,7 +170,7 @@ impl Scenarios {
         seed: u64,
         (manifest, version_hash): (&Manifest, &str),
         latest: bool,
-        asset: &dyn Fn(&str) -> Result<AssetInfo, String>,
+        assets: &dyn Assets,
     ) -> Result<LoadedScenario, ScenarioError> {
         if file.twin.name != manifest.twin {
             return Err(ScenarioError::Twin {
@@ -205,7 +205,7 @@ impl Scenarios {
             drives: &manifest.trajectories,
             tracks: tracks.as_ref(),
             map: map.as_ref(),
-            asset,
+            assets,
         };
         let scenario = Scenario::resolve(file, seed, &around).map_err(wrong("scenario"))?;
         // Serializing plain values into memory cannot fail. If it did, only the hash would differ.
@@ -223,7 +223,7 @@ impl Scenarios {
         values: &BTreeMap<String, Value>,
         seed: u64,
         version: (&Manifest, &str),
-        asset: &dyn Fn(&str) -> Result<AssetInfo, String>,
+        assets: &dyn Assets,
     ) -> Result<LoadedScenario, ScenarioError> {
         let document = self.document(source)?;
         let mut chosen = document.first_values();
@@ -231,7 +231,7 @@ impl Scenarios {
         let file = document.with(&chosen);
         let file =
             file.map_err(|cause| ScenarioError::File { file: "scenario".to_owned(), cause })?;
-        self.resolve(file, seed, version, false, asset)
+        self.resolve(file, seed, version, false, assets)
     }
 
     fn read(

@@ -1,21 +1,22 @@
 //! Scenarios: files by name with their tracks and maps, and the traffic of a session's episodes.
 
 pub(crate) mod assets;
+mod default_assets;
 pub(crate) mod load;
 pub(crate) mod past;
 mod traffic;
 
-use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use serde_json::Value;
 
-use wildcity_sim::scenario::{AssetInfo, EgoStart, ScenarioFile};
+use wildcity_sim::scenario::{EgoStart, ScenarioFile};
 use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Version;
 
-pub use assets::asset_info;
+pub use assets::StoredAssets;
+pub use default_assets::generated_actors;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
@@ -65,14 +66,8 @@ impl SessionScenario {
     ) -> Result<EpisodeScenario, SessionError> {
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
-        // Many actors have the same asset.
-        let known: RefCell<BTreeMap<String, Result<AssetInfo, String>>> = RefCell::default();
-        let asset = |name: &str| {
-            let mut known = known.borrow_mut();
-            let found = known.entry(name.to_owned());
-            found.or_insert_with(|| asset_info(cache.catalog(), name)).clone()
-        };
-        let loaded = self.scenarios.resolve(file, seed, pinned, false, &asset)?;
+        let assets = StoredAssets::new(cache.catalog());
+        let loaded = self.scenarios.resolve(file, seed, pinned, false, &assets)?;
         let actors = loaded.scenario.traffic.actors.iter();
         let assets = ActorAssets::load(cache, actors.map(|actor| actor.spec.asset.as_deref()))?;
         Ok(EpisodeScenario { loaded: Arc::new(loaded), assets })

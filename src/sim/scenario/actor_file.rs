@@ -6,6 +6,9 @@ use wildcity_scene::ActorClass;
 
 use super::pose::PoseSection;
 
+/// The name of the asset of an actor that is not drawn.
+pub const NOT_DRAWN: &str = "none";
+
 /// An actor, with exactly one of `log`, `path`, `idm`, `collide`, `attack` and `stand`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
@@ -17,7 +20,8 @@ pub struct ActorSection {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(with = "Option<ClassSchema>"))]
     pub class: Option<ActorClass>,
-    /// BLAKE3 of its asset, 64 lower-case hex digits, or the name of a built-in asset. Without one it is not drawn.
+    /// The name of its asset, or its BLAKE3, 64 lower-case hex digits; `none` if it is not drawn. If absent, the generated
+    /// asset of its class whose size is the nearest.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub asset: Option<String>,
     /// Length, width and height, in metres. If absent, those of its asset; without an asset, of its kind.

@@ -7,7 +7,7 @@ use wildcity_scene::route::Route;
 use wildcity_scene::{ActorBox, ActorClass};
 
 use super::actor_file::{
-    ActorSection, AttackSection, IdmModel, IdmSection, JitterDraw, PathSection,
+    ActorSection, AttackSection, IdmModel, IdmSection, JitterDraw, NOT_DRAWN, PathSection,
 };
 use super::around::{AssetInfo, EgoStart, Surroundings};
 use super::collide::collide_of;
@@ -43,13 +43,17 @@ pub(super) fn actors_of(
     }
     let mut actors: Vec<Actor> = Vec::with_capacity(count);
     for (section, track) in tracks {
-        let asset = section.asset.as_deref().map(|hash| asset_of("tracks", hash, around));
-        let asset = asset.transpose()?;
+        let box_ = box_of("tracks", section.size)?;
+        let asset = named_asset("tracks", section.asset.as_deref(), around)?;
+        let asset = match &section.asset {
+            Some(_) => asset,
+            None => default_asset("tracks", section.class, &box_, around)?,
+        };
         actors.push(Actor {
             spec: ActorSpec {
                 name: section.id.clone(),
                 class: section.class,
-                box_: box_of("tracks", section.size)?,
+                box_,
                 asset: asset.map(|asset| asset.hash),
             },
             behaviour: Behaviour::Track(track),
@@ -125,8 +129,26 @@ fn start_time_us(around: &Surroundings<'_>, start: Option<&EgoStart>) -> i64 {
     route.map_or(0, |route| route.at(*station_m).time_us)
 }
 
-fn asset_of(path: &str, name: &str, around: &Surroundings<'_>) -> Result<AssetInfo, FileError> {
-    (around.asset)(name).map_err(|reason| FileError::new(path, reason))
+/// The asset that an actor names; `None` if it names none, or [`NOT_DRAWN`].
+fn named_asset(
+    path: &str,
+    name: Option<&str>,
+    around: &Surroundings<'_>,
+) -> Result<Option<AssetInfo>, FileError> {
+    let drawn = name.filter(|name| *name != NOT_DRAWN);
+    let found = drawn.map(|name| around.assets.find(name)).transpose();
+    found.map_err(|reason| FileError::new(path, reason))
+}
+
+/// The asset of an actor that names none.
+fn default_asset(
+    path: &str,
+    class: ActorClass,
+    box_: &ActorBox,
+    around: &Surroundings<'_>,
+) -> Result<Option<AssetInfo>, FileError> {
+    let found = around.assets.default_for(class, box_);
+    found.map_err(|reason| FileError::new(path, format!("has no asset, and {reason}")))
 }
 
 fn actor_of(
@@ -138,8 +160,7 @@ fn actor_of(
     courses: &mut Courses<'_>,
     references: &References<'_>,
 ) -> Result<Actor, FileError> {
-    let asset = section.asset.as_deref().map(|name| asset_of("asset", name, around)).transpose()?;
-    section.asset = asset.as_ref().map(|asset| asset.hash.clone());
+    let asset = named_asset("asset", section.asset.as_deref(), around)?;
     let class = section.class.or(asset.as_ref().map(|asset| asset.class));
     let drawn = drawn(section.jitter.as_ref(), seed, &section.name)?;
     if let Some(jitter) = &mut section.jitter {
@@ -201,8 +222,17 @@ fn actor_of(
         (None, Some(asset)) => asset.box_,
         (None, None) => usual_box(class),
     };
+    let asset = match &section.asset {
+        Some(_) => asset,
+        None => default_asset("asset", class, &box_, around)?,
+    };
+    let asset = asset.map(|asset| asset.hash);
+    // An actor that is not drawn keeps the word for it, so that it is not drawn again either.
+    if asset.is_some() {
+        section.asset.clone_from(&asset);
+    }
     let mut actor = Actor {
-        spec: ActorSpec { name: section.name.clone(), class, box_, asset: section.asset.clone() },
+        spec: ActorSpec { name: section.name.clone(), class, box_, asset },
         behaviour,
         script: Vec::new(),
         present: section.present.unwrap_or(true),

@@ -19,8 +19,37 @@ pub struct Surroundings<'a> {
     pub tracks: Option<&'a TracksFile>,
     /// The map that the scenario names.
     pub map: Option<&'a Map>,
-    /// Looks up an asset by its hash or its name. The error is the reason if it cannot be used.
-    pub asset: &'a dyn Fn(&str) -> Result<AssetInfo, String>,
+    /// The assets of actors.
+    pub assets: &'a dyn Assets,
+}
+
+/// The assets that actors may have.
+pub trait Assets {
+    /// Looks up an asset by its hash or its name.
+    ///
+    /// # Errors
+    /// The reason if it cannot be used.
+    fn find(&self, name: &str) -> Result<AssetInfo, String>;
+
+    /// The asset of an actor that names none, by its class and its size; `None` if there is none of the class.
+    ///
+    /// # Errors
+    /// The reason if assets cannot be read.
+    fn default_for(&self, class: ActorClass, box_: &ActorBox) -> Result<Option<AssetInfo>, String>;
+}
+
+/// No asset at all: actors without one are not drawn, and others are refused.
+#[derive(Clone, Copy, Debug)]
+pub struct NoAssets;
+
+impl Assets for NoAssets {
+    fn find(&self, name: &str) -> Result<AssetInfo, String> {
+        Err(format!("there is no asset {name:?}"))
+    }
+
+    fn default_for(&self, _: ActorClass, _: &ActorBox) -> Result<Option<AssetInfo>, String> {
+        Ok(None)
+    }
 }
 
 /// The properties of an asset that a scenario needs.

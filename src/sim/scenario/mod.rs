@@ -25,7 +25,7 @@ mod script;
 mod tracks;
 
 pub use actor_file::*;
-pub use around::{AssetInfo, EgoStart, Surroundings};
+pub use around::{AssetInfo, Assets, EgoStart, NoAssets, Surroundings};
 pub use document::{Case, Document};
 pub use end::{EndInput, EndReason, EndRules, Stuck};
 pub use error::{FileError, check_format};
