@@ -10,6 +10,8 @@ pub(super) struct Kind {
     pub(super) width_m: f64,
     /// Radius of a tyre.
     pub(super) tyre_m: f64,
+    /// How far each side of the cabin leans in, as a share of its height above the belt.
+    pub(super) lean: f64,
     knots: &'static [(f64, f64, f64)],
     /// Side windows from tail to nose, as fractions of the length; pillars are between them.
     pub(super) side_glass: &'static [[f64; 2]],
@@ -54,6 +56,7 @@ pub(super) const HATCHBACK: Kind = Kind {
     length_m: 4.1,
     width_m: 1.76,
     tyre_m: 0.325,
+    lean: 0.38,
     knots: &[
         (0.00, 0.72, 0.74),
         (0.03, 0.94, 0.98),
@@ -73,6 +76,7 @@ pub(super) const SEDAN: Kind = Kind {
     length_m: 4.7,
     width_m: 1.82,
     tyre_m: 0.325,
+    lean: 0.38,
     knots: &[
         (0.00, 0.70, 0.72),
         (0.02, 0.90, 0.98),
@@ -93,6 +97,7 @@ pub(super) const WAGON: Kind = Kind {
     length_m: 4.5,
     width_m: 1.86,
     tyre_m: 0.325,
+    lean: 0.38,
     knots: &[
         (0.00, 0.80, 0.82),
         (0.02, 1.04, 1.10),
@@ -112,6 +117,7 @@ pub(super) const VAN: Kind = Kind {
     length_m: 5.1,
     width_m: 1.94,
     tyre_m: 0.325,
+    lean: 0.38,
     knots: &[
         (0.00, 1.02, 1.04),
         (0.01, 1.18, 1.80),
@@ -149,20 +155,21 @@ pub(super) const TRUCK: Kind = Kind {
     length_m: 8.4,
     width_m: 2.5,
     tyre_m: 0.48,
+    lean: 0.03,
     knots: &[
         (0.000, 1.10, 1.12),
-        (0.003, 1.20, 3.40),
-        (0.006, 1.22, 3.50),
-        (0.715, 1.22, 3.50),
-        (0.730, 1.22, 2.80),
-        (0.740, 1.22, 2.72),
-        (0.940, 1.22, 2.66),
-        (0.985, 1.20, 1.34),
+        (0.015, 1.20, 3.36),
+        (0.030, 1.22, 3.50),
+        (0.690, 1.22, 3.50),
+        (0.705, 1.22, 3.36),
+        (0.725, 1.22, 2.72),
+        (0.930, 1.22, 2.66),
+        (0.975, 1.20, 1.34),
         (1.000, 1.00, 1.04),
     ],
-    side_glass: &[[0.79, 0.92]],
+    side_glass: &[[0.77, 0.91]],
     rear_glass: [0.0, 0.0],
-    windscreen: [0.942, 0.984],
+    windscreen: [0.934, 0.972],
 };
 
 /// A city bus.
@@ -170,23 +177,24 @@ pub(super) const BUS: Kind = Kind {
     length_m: 12.0,
     width_m: 2.55,
     tyre_m: 0.48,
+    lean: 0.03,
     knots: &[
         (0.000, 1.10, 1.14),
-        (0.003, 1.14, 2.90),
-        (0.010, 1.15, 3.05),
-        (0.960, 1.15, 3.05),
-        (0.985, 1.14, 2.90),
-        (0.998, 1.10, 1.24),
+        (0.013, 1.14, 2.90),
+        (0.030, 1.15, 3.05),
+        (0.950, 1.15, 3.05),
+        (0.970, 1.14, 2.90),
+        (0.986, 1.10, 1.24),
         (1.000, 1.00, 1.04),
     ],
     side_glass: &[
-        [0.03, 0.17],
+        [0.04, 0.17],
         [0.18, 0.33],
         [0.34, 0.49],
         [0.50, 0.65],
         [0.66, 0.81],
-        [0.82, 0.95],
+        [0.82, 0.94],
     ],
-    rear_glass: [0.004, 0.009],
-    windscreen: [0.972, 0.997],
+    rear_glass: [0.006, 0.012],
+    windscreen: [0.971, 0.985],
 };

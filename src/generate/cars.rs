@@ -218,10 +218,9 @@ impl Car {
             let x = x_m / length_m;
             let (belt_m, top_m) = (self.kind.belt_m(x), self.kind.middle_line_m(x));
             let half_m = 0.97 * self.half_width_m(x);
-            // The cabin leans in by a quarter of its height above the shoulder; the roof's crown
-            // is 6 cm above its edge.
+            // The roof's crown is 12 % of the cabin's height above its edge.
             let cabin_m = (top_m - belt_m).max(0.0);
-            let edge_m = half_m - 0.10 - 0.38 * (cabin_m - 0.06).max(0.0);
+            let edge_m = half_m - 0.10 - self.kind.lean * (cabin_m - 0.06).max(0.0);
             let edge_z_m = belt_m + 0.88 * cabin_m;
             let (y_m, z_m) = if v < 1.0 {
                 (half_m + v * (edge_m - half_m), belt_m + v * (edge_z_m - belt_m))
