@@ -261,11 +261,38 @@ async fn without_actors_nothing_changes() {
     let wanted = standing(&mut open(&bench, "bare", bare).await, 2).await;
     let none = options(&json!([]), true);
     assert_eq!(standing(&mut open(&bench, "none", none).await, 2).await, wanted);
-    // Actors without an asset move and are reported, but are not drawn.
-    let boxes = options(&actors(&Value::Null), true);
+    // Actors without an image move and are reported, but are not drawn.
+    let boxes = options(&actors(&"none".into()), true);
     assert_eq!(standing(&mut open(&bench, "boxes", boxes).await, 2).await, wanted);
+    // An actor that names no asset gets the generated one of its class whose size is the nearest.
+    let unnamed = options(&actors(&Value::Null), true);
+    let mut unnamed = open(&bench, "unnamed", unnamed).await;
+    assert_ne!(standing(&mut unnamed, 2).await, wanted);
+    let named = |name: &str| demo().catalog().find_actor(name).unwrap().hash;
+    let specs = unnamed.traffic().unwrap().specs();
+    assert!(specs.iter().all(|actor| actor.asset == Some(named("sedan"))), "{specs:?}");
     let drawn = options(&actors(&Value::from(&*car().hash)), true);
     assert_ne!(standing(&mut open(&bench, "drawn", drawn).await, 2).await, wanted);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_default_asset_has_the_class_and_about_the_size_of_its_actor() {
+    let bench = bench(unlimited());
+    let actor = |name: &str, class: &str, size: [f64; 3], y_m: f64| json!({"name": name, "class": class, "size": size, "stand": {"xyz": [20, y_m, 0], "yaw_rad": 0}});
+    let all = json!([
+        actor("bus", "vehicle", [11.0, 2.5, 3.0], 10.0),
+        actor("truck", "vehicle", [8.0, 2.4, 3.3], 20.0),
+        actor("small", "vehicle", [3.9, 1.7, 1.5], 30.0),
+        actor("pedestrian", "pedestrian", [0.6, 0.6, 1.6], 40.0),
+        actor("bicycle", "bicycle", [1.7, 0.6, 1.7], 50.0),
+        actor("crate", "object", [0.5, 0.5, 0.8], 60.0),
+    ]);
+    let session = open(&bench, "all", options(&all, true)).await;
+    for actor in session.traffic().unwrap().specs() {
+        let asset = demo().catalog().find_actor(actor.asset.as_ref().unwrap()).unwrap();
+        let wanted = if actor.name == "small" { "hatchback" } else { &actor.name };
+        assert_eq!(asset.description.name, wanted);
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]
