@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use wildcity_episode::FaultLine;
 use wildcity_render::Backend;
 use wildcity_session::{FrameRequest, RecordedEpisode, ReplayUntil, jpeg, limits as session};
 use wildcity_twin::residency::Cache;
@@ -24,7 +25,7 @@ pub struct Picture {
     pub jpeg: Vec<u8>,
 }
 
-/// The pictures of the worst episodes of a run: of the step of their first fault, by their first camera. An episode
+/// The pictures of the worst episodes of a run: of the step of their worst fault, by their first camera. An episode
 /// that cannot be rendered again has no picture, which the report mentions.
 pub fn pictures(
     result: &SuiteResult,
@@ -47,19 +48,33 @@ pub fn pictures(
 }
 
 impl SuiteResult {
-    /// The failed episodes: those with a contact or off the road before those that only lack progress, and of these
-    /// those with the earliest fault first. Without duplicates, which would show the same pictures.
+    /// The failed episodes: those with a contact first, then those off the road, then those that only lack progress, and of
+    /// these those with the earliest fault first. Without duplicates, which would show the same pictures.
     pub(crate) fn worst(&self) -> Vec<&EpisodeEntry> {
         let distinct = self.episodes.iter().filter(|episode| episode.duplicate_of.is_none());
         let mut worst: Vec<&EpisodeEntry> =
             distinct.filter(|episode| episode.status == Status::Failed).collect();
         worst.sort_by_key(|episode| {
-            let lacks_progress_alone = episode.faults.iter().all(|fault| fault.fault == "progress");
-            let first_us = episode.faults.first().map_or(i64::MAX, |fault| fault.time_us);
-            (lacks_progress_alone, first_us, &episode.name)
+            let worst = worst_fault(episode);
+            (worst.map(severity), worst.map_or(i64::MAX, |fault| fault.time_us), &episode.name)
         });
         worst.truncate(limits::WORST);
         worst
+    }
+}
+
+/// The fault that an episode is shown by: a contact that follows a step off the road says more than that step.
+fn worst_fault(episode: &EpisodeEntry) -> Option<&FaultLine> {
+    // The first of equally severe ones, since faults are in order of their times.
+    episode.faults.iter().min_by_key(|fault| severity(fault))
+}
+
+/// Smaller is worse.
+fn severity(fault: &FaultLine) -> u8 {
+    match fault.fault.as_str() {
+        "progress" => 2,
+        "off_road" => 1,
+        _ => 0,
     }
 }
 
@@ -71,7 +86,7 @@ fn picture(
 ) -> Result<Option<Picture>, String> {
     let path = episodes.join(&episode.record);
     let mut recording = RecordedEpisode::read(&path).map_err(|error| error.to_string())?;
-    let fault_us = episode.faults.first().map_or(i64::MAX, |fault| fault.time_us);
+    let fault_us = worst_fault(episode).map_or(i64::MAX, |fault| fault.time_us);
     let shown = |frame: &wildcity_session::FrameRecord| {
         frame.request != FrameRequest::Observe && !frame.images.is_empty()
     };

@@ -200,8 +200,8 @@ async fn a_run_without_a_verdict_has_no_rate() {
 async fn seeds_with_jitter_are_no_duplicates_even_out_of_sight() {
     let bench = Bench::new();
     let mut value = scenario("behind", &json!({ "model": "kinematic", "speed": 10.0 }));
-    // No asset: no image shows it.
-    value["actors"] = json!([{ "name": "car", "path": { "along": "log", "station_m": 5.0, "speed": 5.0 },
+    // No image shows it.
+    value["actors"] = json!([{ "name": "car", "asset": "none", "path": { "along": "log", "station_m": 5.0, "speed": 5.0 },
         "jitter": { "longitudinal_m": 1.0, "lateral_m": 0.0, "yaw_rad": 0.0 } }]);
     bench.write("behind.json", &value);
     let suite = json!({ "format": "wildcity.suite/1", "name": "jitter", "scenarios": ["behind.json"],
@@ -213,6 +213,44 @@ async fn seeds_with_jitter_are_no_duplicates_even_out_of_sight() {
         run.episodes.iter().map(|episode| &*episode.frames_hash).collect();
     assert_eq!((images.len(), run.counts.duplicates), (1, 0), "{}", run.to_json());
     assert_eq!(run.pass_rate.runs, 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_not_looked_for_is_no_pass() {
+    let bench = Bench::new();
+    // Without a map, without contact with the twin, and both.
+    let twin_contact = |looks: bool| json!({ "progress": 0.5, "twin_contact": looks });
+    for (name, looks) in [("seen", true), ("unseen", false)] {
+        let mut value = scenario(name, &json!({ "model": "kinematic", "speed": 10.0 }));
+        value["verdict"] = twin_contact(looks);
+        bench.write(&format!("{name}.json"), &value);
+    }
+    let suite = json!({ "format": "wildcity.suite/1", "name": "both", "scenarios": ["seen.json", "unseen.json"],
+        "cameras": ["front"] });
+    let path = bench.write("both.json", &suite);
+    let wanted = [
+        (vec![], [Status::NotJudged, Status::NotJudged], ExitCode::NotJudged),
+        (vec!["off_road"], [Status::Passed, Status::NotJudged], ExitCode::NotJudged),
+        (vec!["off_road", "contact.static"], [Status::Passed, Status::Passed], ExitCode::Passed),
+    ];
+    for (index, (accepted, statuses, exit)) in wanted.into_iter().enumerate() {
+        let out = format!("out{index}");
+        let mut settings = bench.settings(AgentChoice::BuiltIn(BuiltIn::Log), 1, &out);
+        settings.accept_unjudged = accepted.into_iter().map(str::to_owned).collect();
+        let run = wildcity_suite::run(settings, bench.cases(&path).unwrap()).await.unwrap();
+        let found = [0, 1].map(|index| run.episodes[index].status);
+        assert_eq!((found, code(&run)), (statuses, exit), "{}", run.to_json());
+        let unseen = "contact.static: contact with the twin was not looked for";
+        assert!(run.episodes[1].not_judged.iter().any(|text| text == unseen));
+        let html = page(&run, &Ending::of(&run, None), &[], &bench.path(&out));
+        let first = html.find("Without a verdict");
+        assert_eq!(first.is_some(), exit == ExitCode::NotJudged);
+        assert!(first.is_none_or(|at| at < html.find("Scenarios").unwrap()), "it comes first");
+    }
+    let unknown = json!({ "format": "wildcity.suite/1", "name": "both", "scenarios": ["seen.json"],
+        "accept_unjudged": ["offroad"] });
+    let error = bench.cases(&bench.write("unknown.json", &unknown)).unwrap_err().to_string();
+    assert!(error.contains("accept_unjudged") && error.contains("off_road"), "{error}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -238,9 +276,16 @@ fn exit_codes_are_technical_before_driving() {
     assert_eq!(code(&changed), ExitCode::Technical);
     let mut off = passed.clone();
     off.counts.off_model = 1;
-    assert_eq!(code(&off), ExitCode::Technical, "a quarter of them are off the model");
-    off.counts.episodes = 10;
+    assert_eq!(code(&off), ExitCode::NotJudged);
+    off.at_least = Some(0.3);
+    assert_eq!(code(&off), ExitCode::NotJudged, "a rate does not count what has no verdict");
+    off.accept_unjudged.push("off_model".to_owned());
     assert_eq!(code(&off), ExitCode::Passed);
+    off.counts.not_judged = 1;
+    assert_eq!(code(&off), ExitCode::NotJudged);
+    off.at_least = None;
+    off.counts.failed = 1;
+    assert_eq!(code(&off), ExitCode::Driving, "a failure says more");
     let mut rated = passed.clone();
     // 2 of 2 have a lower end of 0.342.
     rated.at_least = Some(0.3);
@@ -248,13 +293,17 @@ fn exit_codes_are_technical_before_driving() {
     rated.counts.passed = 3;
     let ending = Ending::of(&rated, None);
     assert_eq!(ending.code, ExitCode::Passed);
-    assert!(ending.why.contains("of 4 episodes 1 failed"), "{}", ending.why);
+    assert!(
+        ending.why.contains("of 4 episodes 0 were not judged, 0 left the trained area, 1 failed"),
+        "{}",
+        ending.why
+    );
     assert!(ending.why.ends_with("at least 0.342, as wanted (0.3)"), "{}", ending.why);
     // The failure is still reported, and the report says why the exit code is 0.
     let xml = junit(&rated, &ending);
     assert!(xml.contains("failures=\"1\"") && xml.contains("\"exit_code\" value=\"0\""), "{xml}");
     let html = page(&rated, &ending, &[], &bench.path("log"));
-    assert!(html.contains("Exit code 0: of 4 episodes 1 failed"), "{html}");
+    assert!(html.contains("Exit code 0: of 4 episodes 0 were not judged"), "{html}");
     rated.at_least = Some(0.9);
     assert_eq!(code(&rated), ExitCode::Driving);
 }
