@@ -25,7 +25,7 @@ use wildcity_twin::store::{Catalog, StoreError};
 
 use crate::engine::solid_blocks::SolidBlocks;
 use crate::scenario::{Event, EventKind};
-use crate::spatial_index::{Block, SpatialIndex, block_at, blocks_between};
+use crate::spatial_index::{Block, SectionId, SpatialIndex, block_at};
 
 /// Recorded drives up to this far outside of a block decide what is a contact in it, in metres.
 const BESIDE_M: f64 = 4.0;
@@ -63,9 +63,9 @@ pub(crate) struct TwinSolids {
     limits: Arc<Mutex<HashMap<Block, StaticLimit>>>,
 }
 
-/// Blocks that a computation has looked up, so that it does not look them up for each pose.
+/// Sections that a computation has looked up, so that it does not look them up for each pose.
 #[derive(Default)]
-struct Near(HashMap<Block, Vec<Arc<Solids>>>);
+struct Near(HashMap<SectionId, Arc<Solids>>);
 
 impl TwinSolids {
     pub(crate) fn new(
@@ -157,10 +157,8 @@ impl TwinSolids {
         let tested = TestedBox::new(world_from_rig, &self.ego_box);
         let [low_m, high_m] = tested.extent_m();
         let mut area_m2 = 0.0;
-        for block in blocks_between(low_m, high_m) {
-            for solids in self.block(near, block)? {
-                area_m2 += solids.area_m2(&tested);
-            }
+        for section in self.index.sections(low_m, high_m) {
+            area_m2 += self.section(near, section)?.area_m2(&tested);
         }
         Ok(area_m2)
     }
@@ -192,27 +190,25 @@ impl TwinSolids {
         Ok(limit)
     }
 
-    fn block<'a>(&self, near: &'a mut Near, block: Block) -> Result<&'a [Arc<Solids>], StoreError> {
-        if !near.0.contains_key(&block) {
-            let mut all = Vec::new();
-            for (chunk, section) in self.index.sections(block) {
-                let solids = match self.blocks.get(&section.hash) {
-                    Some(solids) => solids,
-                    None => {
-                        let version = self.index.version();
-                        let gaussians =
-                            self.catalog.section(version, chunk, section)?.to_gaussians();
-                        let points = (0..gaussians.len()).map(|index| point(&gaussians, index));
-                        let solids = Arc::new(Solids::new(points));
-                        self.blocks.insert(section.hash, solids.clone());
-                        solids
-                    }
-                };
-                all.push(solids);
-            }
-            near.0.insert(block, all);
+    /// The solid Gaussians of a section.
+    fn section(&self, near: &mut Near, id: SectionId) -> Result<Arc<Solids>, StoreError> {
+        if let Some(solids) = near.0.get(&id) {
+            return Ok(solids.clone());
         }
-        Ok(near.0.get(&block).map_or(&[], Vec::as_slice))
+        let (chunk, section) = self.index.section(id);
+        let solids = match self.blocks.get(&section.hash) {
+            Some(solids) => solids,
+            None => {
+                let version = self.index.version();
+                let gaussians = self.catalog.section(version, chunk, section)?.to_gaussians();
+                let points = (0..gaussians.len()).map(|index| point(&gaussians, index));
+                let solids = Arc::new(Solids::new(points));
+                self.blocks.insert(section.hash, solids.clone());
+                solids
+            }
+        };
+        near.0.insert(id, solids.clone());
+        Ok(solids)
     }
 }
 

@@ -1,6 +1,6 @@
 //! What of a version of a twin is near a place: its sections at full detail, and its recorded drives.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use glam::DVec2;
@@ -18,12 +18,15 @@ pub(crate) type Block = [i64; 2];
 /// Between two keyframes that are farther apart than this, in metres, nothing was recorded: the drive has a gap.
 const GAP_M: f64 = 64.0;
 
+/// A section at full detail: the index of its chunk, and its own within the chunk.
+pub(crate) type SectionId = [usize; 2];
+
 /// A version of a twin by place.
 #[derive(Debug)]
 pub(crate) struct SpatialIndex {
     version: Arc<Version>,
-    /// Index of the chunk, and of the section within it.
-    sections: HashMap<Block, Vec<[usize; 2]>>,
+    /// The sections that may have Gaussians in the block: blocks with few Gaussians share a section with others.
+    sections: HashMap<Block, Vec<SectionId>>,
     /// Index of the drive, and of the keyframe with which a part of the drive begins that touches the block.
     drives: HashMap<Block, Vec<[usize; 2]>>,
     /// `None` without a recorded drive.
@@ -33,12 +36,20 @@ pub(crate) struct SpatialIndex {
 impl SpatialIndex {
     pub(crate) fn new(version: Arc<Version>) -> Self {
         let manifest = &version.manifest;
-        let mut sections: HashMap<Block, Vec<[usize; 2]>> = HashMap::new();
+        let mut sections: HashMap<Block, Vec<SectionId>> = HashMap::new();
         for (chunk_index, chunk) in manifest.chunks.iter().enumerate() {
+            let center_m = CELL_M * DVec2::from_array(chunk.cell.map(f64::from));
+            // The bounds are those of whole Gaussians, and the centres are within the cell. The end of a cell is in the
+            // next one.
+            let cell_m = [-0.5, 0.5 - 1e-9].map(|edge| center_m + CELL_M * edge);
             for (section_index, section) in chunk.sections.iter().enumerate() {
                 if section.is_full_detail() {
-                    let block = block_of_section(chunk, section);
-                    sections.entry(block).or_default().push([chunk_index, section_index]);
+                    let bounds = chunk.section_bounds(section);
+                    let [low_m, high_m] = [bounds.min_m, bounds.max_m]
+                        .map(|corner_m| corner_m.truncate().clamp(cell_m[0], cell_m[1]));
+                    for block in blocks_between(low_m, high_m) {
+                        sections.entry(block).or_default().push([chunk_index, section_index]);
+                    }
                 }
             }
         }
@@ -63,13 +74,16 @@ impl SpatialIndex {
         &self.version
     }
 
-    /// The sections at full detail of a block, with their chunks.
-    pub(crate) fn sections(&self, block: Block) -> impl Iterator<Item = (&ChunkEntry, &Section)> {
-        let chunks = &self.version.manifest.chunks;
-        self.sections.get(&block).into_iter().flatten().map(|[chunk, section]| {
-            let chunk = &chunks[*chunk];
-            (chunk, &chunk.sections[*section])
-        })
+    /// The sections that may have Gaussians in a rectangle, in a fixed order.
+    pub(crate) fn sections(&self, low_m: DVec2, high_m: DVec2) -> BTreeSet<SectionId> {
+        let of_block = |block| self.sections.get(&block).into_iter().flatten().copied();
+        blocks_between(low_m, high_m).flat_map(of_block).collect()
+    }
+
+    /// A section with its chunk.
+    pub(crate) fn section(&self, [chunk, section]: SectionId) -> (&ChunkEntry, &Section) {
+        let chunk = &self.version.manifest.chunks[chunk];
+        (chunk, &chunk.sections[section])
     }
 
     /// The parts of the recorded drives, each between two keyframes, that may pass through a block.
@@ -97,10 +111,4 @@ pub(crate) fn block_at(point_m: DVec2) -> Block {
 pub(crate) fn blocks_between(low_m: DVec2, high_m: DVec2) -> impl Iterator<Item = Block> {
     let [[west, south], [east, north]] = [low_m, high_m].map(block_at);
     (west..=east).flat_map(move |x| (south..=north).map(move |y| [x, y]))
-}
-
-fn block_of_section(chunk: &ChunkEntry, section: &Section) -> Block {
-    // A cell of 64 m has 4 x 4 blocks.
-    let in_cell = [section.block % 4, section.block / 4].map(i64::from);
-    [0, 1].map(|axis| 4 * i64::from(chunk.cell[axis]) + in_cell[axis])
 }

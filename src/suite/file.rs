@@ -96,10 +96,14 @@ impl SuiteFile {
         suite.check().map_err(wrong)?;
         let dir = path.parent().unwrap_or(Path::new("."));
         let mut scenarios = Vec::new();
-        for file in &suite.scenarios {
+        for (index, file) in suite.scenarios.iter().enumerate() {
             let path = dir.join(file);
             let wrong = |cause| SuiteError::File { path: path.clone(), cause };
-            let document = Document::parse(&read(&path, limits::FILE_BYTES)?).map_err(wrong)?;
+            let bytes = read(&path, limits::FILE_BYTES).map_err(|error| {
+                let cause = FileError::new(format!("scenarios[{index}]"), error.to_string());
+                SuiteError::File { path: suite.path.clone(), cause }
+            })?;
+            let document = Document::parse(&bytes).map_err(wrong)?;
             if path.parent() != Some(dir) {
                 check_alone(&document).map_err(wrong)?;
             }

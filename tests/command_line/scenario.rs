@@ -20,7 +20,9 @@ fn done(arguments: &[&str], dir: &Path) -> String {
 
 fn refused(arguments: &[&str], dir: &Path) -> String {
     let output = run(arguments, dir);
-    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {output:?}");
+    // A mistake in a scenario has the code that it has in `episode run`.
+    let code = if arguments.starts_with(&["scenario", "check"]) { 2 } else { 1 };
+    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {output:?}");
     String::from_utf8(output.stderr).unwrap()
 }
 
@@ -90,6 +92,37 @@ fn mistakes_name_the_file_the_place_and_the_fix() {
     fs::write(at.join("two.json"), "{").unwrap();
     assert!(refused(&check, at).contains("two.json"));
     assert!(refused(&["scenario", "check", "none.json", "--twins", "."], at).contains("none"));
+}
+
+#[test]
+fn check_warns_of_what_images_do_not_show() {
+    let dir = support::twins();
+    let at = dir.path();
+    let stand = |y_m: f64| json!({"xyz": [5, y_m, 0], "yaw_rad": 0});
+    let file = json!({
+        "format": "wildcity.scenario/1", "name": "two", "twin": {"name": "test"},
+        "actors": [
+            {"name": "seen", "size": [4.6, 1.8, 1.5], "stand": stand(0.0)},
+            {"name": "hidden", "asset": "none", "stand": stand(5.0)},
+            {"name": "late", "present": false, "stand": stand(10.0)},
+            {"name": "tram", "size": [30, 2.6, 3.6], "stand": stand(15.0)},
+        ],
+    });
+    fs::write(at.join("two.json"), file.to_string()).unwrap();
+    let checked = done(&["scenario", "check", "two.json", "--twins", "."], at);
+    let warnings: Vec<&str> = checked.lines().filter(|line| line.contains("warning")).collect();
+    let wanted = ["hidden", "late", "tram"];
+    assert_eq!(warnings.len(), wanted.len(), "{checked}");
+    for (warning, name) in warnings.iter().zip(wanted) {
+        assert!(warning.contains(&format!("actor {name:?}")), "{warning}");
+    }
+    let suite =
+        json!({"format": "wildcity.suite/1", "name": "s", "scenarios": ["two.json", "three.json"]});
+    fs::write(at.join("suite.json"), suite.to_string()).unwrap();
+    let driven = run(&["episode", "run", "suite.json", "--twins", "."], at);
+    assert_eq!(driven.status.code(), Some(2));
+    let error = String::from_utf8(driven.stderr).unwrap();
+    assert!(error.contains("suite.json: scenarios[1]") && error.contains("three.json"), "{error}");
 }
 
 #[test]
