@@ -201,7 +201,9 @@ impl TwinSolids {
             None => {
                 let version = self.index.version();
                 let gaussians = self.catalog.section(version, chunk, section)?.to_gaussians();
-                let points = (0..gaussians.len()).map(|index| point(&gaussians, index));
+                // An opacity of one half has the logit 0. Most of the work is for Gaussians that are solid.
+                let solid = (0..gaussians.len()).filter(|i| gaussians.logit_opacities[*i] >= 0.0);
+                let points = solid.map(|index| point(&gaussians, index));
                 let solids = Arc::new(Solids::new(points));
                 self.blocks.insert(section.hash, solids.clone());
                 solids

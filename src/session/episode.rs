@@ -350,9 +350,8 @@ impl Episode {
             || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
         // A replay does not evaluate the rules of the scenario. It takes the outcome from the record.
         let failed = self.failed || outcome == Outcome::DrivingFailure;
-        let off_model = self.off_model
-            || outcome == Outcome::OffModel
-            || least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
+        let off_model =
+            self.off_model || least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
         let outcome = match (completed, off_model, failed) {
             (true, true, _) => Outcome::OffModel,
             (true, false, true) => Outcome::DrivingFailure,

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use wildcity_episode::{EpisodeFile, FaultLine, ScoreLine, mcap_of};
+use wildcity_score::own;
 use wildcity_session::Engine;
 
 use crate::case::Case;
@@ -134,6 +135,11 @@ impl EpisodeEntry {
             entry.faults = result.faults;
             entry.not_judged = result.not_judged;
             entry.scores = result.scores;
+            if let (Status::Passed, Some(score)) = (entry.status, entry.scores.get_mut(own::NAME)) {
+                // It has no value if a criterion was not judged.
+                score.value = Some(1.0);
+                score.reason = None;
+            }
             entry.steps = end.steps;
             entry.distance_m = end.distance_m;
             entry.frames_hash = frames_hash;

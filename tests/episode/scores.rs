@@ -1,14 +1,20 @@
 //! Scores from records alone.
 
 use glam::DVec2;
+use serde_json::json;
 use wildcity_episode::{EpisodeFile, result};
 use wildcity_sim::contact::{CollisionType, Contact};
 
 use crate::thread_time::thread_time;
 use crate::written::{self, Made};
 
+/// The verdict of a drive on a road, in which contact with the twin was looked for.
 fn verdict(made: &Made) -> String {
-    result(&made.read()).unwrap().verdict
+    let mut lines = made.lines();
+    lines[1]["lanes"] =
+        json!([{ "outline": [[-9, -4], [120, -4], [120, 4], [-9, 4]], "route": true }]);
+    lines[1]["checks_static"] = true.into();
+    result(&written::read(&lines)).unwrap().verdict
 }
 
 fn contact(ego_at_fault: bool) -> Contact {
@@ -28,6 +34,12 @@ fn contact(ego_at_fault: bool) -> Contact {
 #[test]
 fn a_drive_at_the_recorded_speed_passes_and_a_stand_fails_for_progress() {
     assert_eq!(verdict(&Made::default()), "passed");
+    // Without a map, and without a look at the twin, it is no pass.
+    let unseen = result(&Made::default().read()).unwrap();
+    assert_eq!(unseen.verdict, "not_judged");
+    let names: Vec<&str> =
+        unseen.not_judged.iter().filter_map(|text| Some(text.split_once(": ")?.0)).collect();
+    assert_eq!(names, ["contact.static", "off_road"]);
     let stand = result(&Made { speed_mps: 0.0, ..Made::default() }.read()).unwrap();
     assert_eq!(stand.verdict, "failed");
     assert_eq!(stand.faults[0].fault, "progress");

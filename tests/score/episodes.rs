@@ -3,7 +3,7 @@
 use glam::DVec2;
 
 use wildcity_scene::ActorClass;
-use wildcity_score::own::{Fault, Judgement, verdict};
+use wildcity_score::own::{Criterion, Fault, Judgement, verdict};
 use wildcity_score::{
     DriveRecord, EgoSample, EgoShape, Lane, LaneMap, Polyline, ReferenceDrive, StaticContact,
     Track, TrackSample, lower_is_better, range_of, score,
@@ -66,6 +66,11 @@ fn contact(time_us: i64, ego_mps: f64, ego_at_fault: bool) -> Contact {
     }
 }
 
+/// The same drive on a road.
+fn on_road(record: DriveRecord) -> DriveRecord {
+    DriveRecord { map: Some(map(vec![lane([-10.0, 200.0], [-5.0, 5.0], true)])), ..record }
+}
+
 /// A drive next to or behind another box.
 fn drive_with(speed_mps: f64, other: Footprint, other_mps: f64) -> DriveRecord {
     let mut record = drive(speed_mps);
@@ -108,7 +113,7 @@ fn value(record: &DriveRecord, name: &str) -> Option<f64> {
 
 #[test]
 fn a_drive_as_recorded_passes_and_standing_does_not() {
-    let log = drive(10.0);
+    let log = on_road(drive(10.0));
     let judged = verdict(&log);
     assert_eq!((judged.judgement, judged.progress), (Judgement::Passed, Some(1.0)));
     assert_eq!(value(&log, "alpasim.scene@3032e0c"), Some(1.0));
@@ -119,14 +124,36 @@ fn a_drive_as_recorded_passes_and_standing_does_not() {
     assert_eq!(stand.judgement, Judgement::Failed);
     assert_eq!(stand.faults[0].fault, Fault::Progress);
     // 7.9 m/s are 79 m of 100; 8 m/s are 80.
-    assert_eq!(verdict(&drive(7.9)).judgement, Judgement::Failed);
-    assert_eq!(verdict(&drive(8.0)).judgement, Judgement::Passed);
+    assert_eq!(verdict(&on_road(drive(7.9))).judgement, Judgement::Failed);
+    assert_eq!(verdict(&on_road(drive(8.0))).judgement, Judgement::Passed);
+}
+
+#[test]
+fn a_criterion_that_is_not_judged_is_no_pass_and_hides_no_fault() {
+    let whole = || on_road(drive(10.0));
+    let unseen: [(Criterion, DriveRecord); 4] = [
+        (Criterion::Contact, DriveRecord { tracks: None, ..whole() }),
+        (Criterion::Static, DriveRecord { static_contacts: None, ..whole() }),
+        (Criterion::OffRoad, DriveRecord { map: None, ..whole() }),
+        (Criterion::Progress, DriveRecord { reference: None, ..whole() }),
+    ];
+    for (criterion, mut record) in unseen {
+        let judged = verdict(&record);
+        let missing: Vec<Criterion> = judged.not_judged.iter().map(|one| one.criterion).collect();
+        assert_eq!((judged.judgement, missing), (Judgement::NotJudged, vec![criterion]));
+        let text = judged.not_judged[0].to_string();
+        assert!(text.starts_with(&format!("{}: ", criterion.name())), "{text}");
+        if criterion != Criterion::Contact {
+            record.contacts.push(contact(2_000_000, 10.0, true));
+            assert_eq!(verdict(&record).judgement, Judgement::Failed, "{criterion:?}");
+        }
+    }
 }
 
 #[test]
 fn contacts_fail_by_fault_and_pedestrians_always() {
     let with = |class: ActorClass, contact: Contact| {
-        let mut record = drive(10.0);
+        let mut record = on_road(drive(10.0));
         record.tracks.as_mut().unwrap()[0].class = class;
         record.contacts.push(contact);
         verdict(&record)

@@ -39,6 +39,7 @@ async fn open(agent: &mut Agent, name: &str, model: &str) {
         "outputs": { "encoding": "raw", "depth": true, "frames": 4, "trust": true,
                      "period_us": { "rear": 200_000 } },
         "dynamics": { "model": model, "speed": speed }, "decision_us": 300_000, "warm_up_us": 500_000,
+        "contact": "report",
     });
     agent.open(fields).await;
 }

@@ -11,7 +11,9 @@ async fn car(server: &TestServer, name: &str, model: &str) -> Agent {
     let mut agent = server.agent().await;
     let dynamics = json!({ "model": model, "speed": 5.0 });
     let opened = agent
-        .open(json!({ "session": name, "dynamics": dynamics, "outputs": { "encoding": "raw" } }))
+        .open(json!({
+            "session": name, "dynamics": dynamics, "outputs": { "encoding": "raw" }, "contact": "report",
+        }))
         .await;
     let resolved = json!({ "model": model, "speed": 5.0, "reverse": false });
     assert_eq!(opened["dynamics"], resolved);

@@ -79,7 +79,7 @@ async fn car(server: &TestServer, name: &str, model: &str) -> Agent {
     let fields = json!({
         "session": name, "rig": { "name": "one", "cameras": [camera("front")] },
         "outputs": { "encoding": "raw", "frames": 3 }, "warm_up_us": 300_000,
-        "dynamics": { "model": model, "speed": 8.0 },
+        "dynamics": { "model": model, "speed": 8.0 }, "contact": "off",
     });
     agent.open(fields).await;
     agent

@@ -59,7 +59,7 @@ async fn open(agent: &mut Agent, name: &str, model: &str, sensors: Value) {
     let speed = if model == "teleport" { 0.0 } else { 9.0 };
     let mut fields = json!({
         "session": name, "seed": 5, "outputs": outputs(), "warm_up_us": 500_000,
-        "dynamics": { "model": model, "speed": speed },
+        "dynamics": { "model": model, "speed": speed }, "contact": "report",
     });
     if !sensors.is_null() {
         fields["sensors"] = sensors;

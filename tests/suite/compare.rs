@@ -316,7 +316,7 @@ fn scores_of_two_versions_are_not_compared() {
     let wanted = [format!("{DRIVING} before alone"), "bench2drive.new@1 now alone".to_owned()];
     assert_eq!(gone.scores_not_compared, wanted);
     // A changed verdict could be caused by its rules.
-    let later = renamed(VERDICT, "wildcity.verdict@2");
+    let later = renamed(VERDICT, "wildcity.verdict@3");
     let error = Comparison::new(&before.result(), &later, &Rule::default()).unwrap_err();
     assert!(matches!(error, CompareError::VerdictVersion { .. }), "{error}");
 }

@@ -58,7 +58,7 @@ async fn a_run_takes_less_than_five_percent_more_than_its_rendering() {
         "format": "wildcity.scenario/1", "name": "demo", "twin": { "name": "demo" },
         "ego": { "start": { "trajectory": "log", "station_m": 10.0 },
                  "dynamics": { "model": "dynamic", "speed": 10.0 } },
-        "actors": [{ "name": "ahead", "idm": { "along": "log", "station_m": 40.0, "speed": 9.0 } }],
+        "actors": [{ "name": "ahead", "asset": "none", "idm": { "along": "log", "station_m": 40.0, "speed": 9.0 } }],
         "end": { "time_s": 3.0, "contact": "any" },
     });
     bench.write("demo.json", &scenario);

@@ -81,7 +81,11 @@ impl RecordedEpisode {
             }
         }
         if let Some(end) = &self.end {
-            let wrong = values::wrong_in_end(end, replay.ego.episode(), self.end_line);
+            let mut episode = replay.ego.episode().clone();
+            if self.off_model_step.is_some() {
+                episode.leave_model();
+            }
+            let wrong = values::wrong_in_end(end, &episode, self.end_line);
             replay.report.wrong_value = replay.report.wrong_value.or(wrong);
         }
         Ok(replay.report)

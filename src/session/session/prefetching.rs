@@ -60,19 +60,20 @@ impl Session {
         let solids = self.version.solids.clone();
         let here_m = self.state.episode.world_from_rig().position_m;
         self.prefetch_task.submit(move || {
-            if let Some(solids) = solids {
-                let is_near =
-                    |pose: &&Pose| pose.position_m.distance(here_m) < limits::SOLIDS_AHEAD_M;
-                for pose in places.iter().map(|(_, pose)| pose).filter(is_near) {
-                    // A fault of the store is an error of the step that needs it.
-                    let _unread = solids.read_around(pose);
-                }
-            }
+            let is_near = |pose: &&Pose| pose.position_m.distance(here_m) < limits::SOLIDS_AHEAD_M;
+            let near: Vec<Pose> =
+                places.iter().map(|(_, pose)| pose).filter(is_near).copied().collect();
             let places: Vec<_> = places
                 .into_iter()
                 .map(|(urgency, pose)| (urgency, viewpoints(&View::of_rig(layout.cameras(), pose))))
                 .collect();
             prefetcher.prefetch(&places, &profile);
+            if let Some(solids) = solids {
+                for pose in near {
+                    // A fault of the store is an error of the step that needs it.
+                    let _unread = solids.read_around(&pose);
+                }
+            }
         });
     }
 }

@@ -35,6 +35,23 @@ struct Solid {
     area_m2: f32,
 }
 
+/// A Gaussian with its cell, and its cube within the cell.
+struct CubePoint {
+    cell: [i32; 2],
+    cube: [i32; 3],
+    from_corner_m: DVec3,
+    area_m2: f64,
+}
+
+impl CubePoint {
+    fn new(point: SolidPoint) -> Self {
+        let cell = cell_at(point.mean_m.truncate());
+        let from_corner_m = point.mean_m - corner_m(cell).extend(0.0);
+        let cube = (from_corner_m / MERGED_M).floor().as_ivec3().to_array();
+        Self { cell, cube, from_corner_m, area_m2: point.area_m2() }
+    }
+}
+
 /// The part of the ego's box in which Gaussians are a contact, at a pose.
 ///
 /// It is tilted as the pose is: on a slope of 15 % the road is 0.36 m higher below the front of an upright car than below
@@ -89,24 +106,19 @@ impl TestedBox {
 impl Solids {
     /// The Gaussians among `points` that are solid, each in world axes.
     pub fn new(points: impl IntoIterator<Item = SolidPoint>) -> Self {
-        let mut cubes: BTreeMap<([i32; 2], [i32; 3]), [f64; 4]> = BTreeMap::new();
-        for point in points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY) {
-            let cell = cell_at(point.mean_m.truncate());
-            let from_corner_m = point.mean_m - corner_m(cell).extend(0.0);
-            let cube = (from_corner_m / MERGED_M).floor().as_ivec3().to_array();
-            let area_m2 = point.area_m2();
-            let sums = cubes.entry((cell, cube)).or_default();
-            let [x, y, z] = (area_m2 * from_corner_m).to_array();
-            for (sum, value) in sums.iter_mut().zip([x, y, z, area_m2]) {
-                *sum += value;
-            }
-        }
+        let solid = points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY);
+        let mut points: Vec<CubePoint> = solid.map(CubePoint::new).collect();
+        // Stable: a sum of areas depends on its order in the last digits.
+        points.sort_by_key(|point| (point.cell, point.cube));
         let mut cells: BTreeMap<[i32; 2], Vec<Solid>> = BTreeMap::new();
-        for ((cell, _), [x, y, z, area_m2]) in cubes {
+        for cube in points.chunk_by(|a, b| (a.cell, a.cube) == (b.cell, b.cube)) {
+            let area_m2: f64 = cube.iter().map(|point| point.area_m2).sum();
+            let moment: DVec3 = cube.iter().map(|point| point.area_m2 * point.from_corner_m).sum();
             // A Gaussian without extent has no area, and no contact.
             if area_m2 > 0.0 {
-                let mean_m = (DVec3::new(x, y, z) / area_m2).as_vec3().to_array();
-                cells.entry(cell).or_default().push(Solid { mean_m, area_m2: area_m2 as f32 });
+                let mean_m = (moment / area_m2).as_vec3().to_array();
+                let solid = Solid { mean_m, area_m2: area_m2 as f32 };
+                cells.entry(cube[0].cell).or_default().push(solid);
             }
         }
         for solids in cells.values_mut() {
