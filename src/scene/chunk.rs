@@ -19,6 +19,7 @@ use rayon::prelude::*;
 
 use super::actor::PlacedChunk;
 use super::pages::{LanePages, Page};
+use super::validate::LN_SCALE;
 use super::{Gaussians, Sky, sh};
 
 pub use super::pages::{CLUSTER, LANES, Lanes};
@@ -309,7 +310,8 @@ impl Chunk {
             let quat = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
             let is_empty = quat == [0.0; 4];
             gaussians.quats_wxyz.push(if is_empty { [1.0, 0.0, 0.0, 0.0] } else { quat });
-            let ln = |scale_m: f32| f64::from(scale_m).max(1e-30).ln() as f32;
+            // A file may have scales of 0, and records round small ones to 0: they are the smallest that is allowed.
+            let ln = |scale_m: f32| (f64::from(scale_m).ln() as f32).max(LN_SCALE[0]);
             gaussians.ln_scales.push(three(column::SCALE).map(ln));
             gaussians.logit_opacities.push(logit_from_log2(value(column::LOG2_OPACITY)));
             let count = columns(self.sh_degree) - column::SH;

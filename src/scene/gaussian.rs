@@ -6,6 +6,7 @@ use glam::{DQuat, DVec3};
 
 use super::geometry::Pose;
 use super::sh;
+use super::validate::{FULL_LOGIT, LN_SCALE};
 
 /// Raw Gaussians, as columns of equal length `n`.
 ///
@@ -127,7 +128,17 @@ impl Gaussians {
         }
     }
 
-    /// Scales all Gaussians about the origin. A factor of 1 changes no bit.
+    /// Replaces values that no file needs to avoid and that have a nearest one within the bounds of
+    /// [`validate`](super::validate): opacities of 0 and 1, whose logit is infinite, and scales below the smallest one.
+    pub fn clamp_activations(&mut self) {
+        for logit in self.logit_opacities.iter_mut().filter(|logit| logit.is_infinite()) {
+            *logit = FULL_LOGIT.copysign(*logit);
+        }
+        self.ln_scales.as_flattened_mut().iter_mut().for_each(raise_to_smallest);
+    }
+
+    /// Scales all Gaussians about the origin. A factor of 1 changes no bit. Scales that would become smaller than the
+    /// smallest one become that one.
     pub fn scale(&mut self, factor: f64) {
         if factor == 1.0 {
             return;
@@ -138,6 +149,7 @@ impl Gaussians {
         }
         for scale in &mut self.ln_scales {
             *scale = scale.map(|s| (f64::from(s) + ln) as f32);
+            scale.iter_mut().for_each(raise_to_smallest);
         }
     }
 
@@ -170,6 +182,13 @@ impl Gaussians {
     pub fn sh_of(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);
         &self.sh[index * stride..(index + 1) * stride]
+    }
+}
+
+/// NaN stays NaN, which validation refuses.
+fn raise_to_smallest(ln_scale: &mut f32) {
+    if *ln_scale < LN_SCALE[0] {
+        *ln_scale = LN_SCALE[0];
     }
 }
 
