@@ -26,6 +26,7 @@ mod drive;
 mod episode;
 mod eval;
 mod exit;
+mod file_notes;
 mod import;
 mod input_files;
 mod inspect;
