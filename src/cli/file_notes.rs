@@ -5,6 +5,8 @@ use std::path::Path;
 
 use wildcity_twin::ingest::{Antialiasing, FileNotes, IngestError};
 
+use super::output::counted;
+
 /// `--drop-bad`, for every command that reads scene files.
 #[derive(Clone, Copy, Debug, clap::Args)]
 pub(super) struct DropBad {
@@ -22,8 +24,12 @@ pub(super) fn print(file: &Path, notes: &FileNotes) -> io::Result<()> {
         writeln!(out, "warning: {file}: {warning}")?;
     }
     if notes.dropped > 0 {
-        let count = notes.dropped;
-        writeln!(out, "warning: {file}: {count} Gaussians that cannot be drawn were left out")?;
+        let count = notes.dropped as usize;
+        writeln!(
+            out,
+            "warning: {file}: {} left out, which cannot be drawn",
+            counted(count, "Gaussian")
+        )?;
     }
     if let Some(Antialiasing { blur_px2, said_by }) = &notes.antialiasing {
         writeln!(

@@ -104,18 +104,22 @@ pub(super) struct Import {
 
 const EXAMPLES: &str = "\
 Formats, and their usual axes. Files of one format differ, so render the twin to check its axes:
-  PLY                 INRIA's columns in any order, SH degree 0 to 3        y-down-z-forward
+  PLY                 INRIA's columns in any order, SH degree 0 to 3; also  y-down-z-forward
+                      text, big-endian, and the columns of 2DGS,
+                      mip-splatting, nerfstudio and street_gaussians
   compressed PLY      PlayCanvas, SuperSplat                                y-down-z-forward
   safetensors         gsplat's names: means, quats, scales, opacities, ..   y-down-z-forward
   checkpoint (.pt)    python -m wildcity.convert CKPT.pt OUT.safetensors    y-down-z-forward
   .splat              antimatter15                                          y-down-z-forward
   .ksplat             mkkellogg, levels 0 to 2                              y-down-z-forward
   SPZ 2, 3, 4         Niantic; by its specification right, up, back, but    y-up-z-back
-                      some tools keep the axes of the PLY
+                      some tools keep the axes of the PLY; those that an
+                      extension records are the default
   SOG 1 and 2         PlayCanvas; a folder, or one .sog or .zip             y-down-z-forward
   streamed SOG        a folder, or one .zip; the finest level is read       y-down-z-forward
   glTF, GLB           KHR_gaussian_splatting, with the transforms of its    '-1 0 0 0 0 1 0 1 0'
-                      nodes; the standard has x left, y up, z to the front
+                      nodes; the standard has x left, y up, z to the front.
+                      Also compressed as SPZ
   glTF, GLB of        triangles are covered with 200,000 flat Gaussians     the same
   ordinary meshes     in their base colour
   NuRec (.usdz)       NVIDIA; static content only. Axes are the payload's,  y-down-z-forward

@@ -15,9 +15,9 @@ use std::sync::Arc;
 
 use tokio::time::{Instant, timeout, timeout_at};
 
-use wildcity_scene::{Gaussians, RenderProfile};
 use wildcity_scene::align::Alignment;
 use wildcity_scene::chunk::cell_at;
+use wildcity_scene::{Gaussians, RenderProfile};
 use wildcity_session::{Engine, LatestPin};
 use wildcity_twin::residency::Viewpoint;
 use wildcity_twin::store::{StoreError, Version, check_density};

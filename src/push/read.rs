@@ -206,7 +206,9 @@ impl<'a> Reader<'a> {
                 });
                 self.push.set_report(report.clone());
                 return Err(PushError::Content {
-                    reason: format!("{name}: {bad}; drop_bad (--drop-bad) leaves such Gaussians out"),
+                    reason: format!(
+                        "{name}: {bad}; drop_bad (--drop-bad) leaves such Gaussians out"
+                    ),
                     cells: Vec::new(),
                 });
             }

@@ -95,7 +95,9 @@ impl SourceAxes {
             }
             (None, None, Some((axes, text))) => {
                 if !axes.has_rotation_of(&Axes::IDENTITY) {
-                    notes.warnings.push(format!("no axes are given: those of the twin, {text}, are used"));
+                    notes
+                        .warnings
+                        .push(format!("no axes are given: those of the twin, {text}, are used"));
                 }
                 (*axes, text.clone())
             }
@@ -105,7 +107,9 @@ impl SourceAxes {
             (Some(scale), _) => scale,
             (None, Some(scale)) => {
                 if scale != 1.0 {
-                    notes.warnings.push(format!("no scale is given: that of the twin, {scale}, is used"));
+                    notes
+                        .warnings
+                        .push(format!("no scale is given: that of the twin, {scale}, is used"));
                 }
                 scale
             }

@@ -6,7 +6,7 @@ use glam::{DQuat, DVec3};
 
 use super::geometry::Pose;
 use super::sh;
-use super::validate::{FULL_LOGIT, LN_SCALE};
+use super::validate::{FULL_LOGIT, LN_SCALE, MAX_SH};
 
 /// Raw Gaussians, as columns of equal length `n`.
 ///
@@ -125,6 +125,15 @@ impl Gaussians {
         let colors = sh::ShRotation::new(a_from_b.rotation_matrix(), self.sh_degree);
         for color in self.sh.chunks_exact_mut(3 * sh::coefficients(self.sh_degree)) {
             colors.apply(color);
+        }
+        self.clamp_coefficients();
+    }
+
+    /// Replaces coefficients beyond the bound by the nearest within it: a rotation may turn several at the bound into
+    /// one beyond.
+    pub fn clamp_coefficients(&mut self) {
+        for coefficient in &mut self.sh {
+            *coefficient = coefficient.clamp(-MAX_SH, MAX_SH);
         }
     }
 

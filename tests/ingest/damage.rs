@@ -117,6 +117,11 @@ fn camera_lists_say_what_is_wrong() {
         assert!(of_rigs.starts_with("camera \"a\": a camera in a list has no "), "{of_rigs}");
         assert!(of_rigs.contains(&format!("leave {field} out")), "{of_rigs}");
     }
+    for field in ["k1", "camera_model", "is_fisheye"] {
+        let other = refusal(good.replacen('{', &format!("{{\"{field}\": 1, "), 1));
+        let wanted = format!("camera \"a\": {field} is not a field of a camera list");
+        assert!(other.starts_with(&wanted), "{other}");
+    }
     assert_eq!(refusal("[]".into()), "the camera list is empty");
 }
 

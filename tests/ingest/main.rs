@@ -13,6 +13,7 @@ mod root;
 mod scene_files;
 
 mod axes;
+mod captures;
 mod cases;
 mod conformance;
 mod corpus;

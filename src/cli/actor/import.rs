@@ -71,7 +71,9 @@ impl Import {
         let SourceScene { gaussians, hash, options, mut notes, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
         if let Some(Antialiasing { said_by, .. }) = notes.antialiasing.take() {
-            notes.warnings.push(format!("{said_by}: an actor is rendered with the profile of its twin"));
+            notes
+                .warnings
+                .push(format!("{said_by}: an actor is rendered with the profile of its twin"));
         }
         file_notes::print(&self.source, &notes)?;
         let source = AssetSource { gaussians, hashes: vec![hash], options: options.to_vec() };

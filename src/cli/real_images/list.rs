@@ -103,8 +103,7 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             CaptureError::NoModel { .. } => anyhow!("{error}; there is no transforms.json either"),
             error => error.into(),
         })?;
-        let listed =
-            |posed| ListedImage { posed, mask: None, near: None, exposure_stops: None };
+        let listed = |posed| ListedImage { posed, mask: None, near: None, exposure_stops: None };
         let images = images.into_iter().map(listed).collect();
         return Ok(Listed { images, folder: colmap_images(source), is_in_scene_axes: false });
     }

@@ -76,7 +76,9 @@ pub enum CapturedDriveError {
     )]
     FpsAndTimes(f64),
     /// Some images of the reference camera have a time and some have none.
-    #[error("{name:?} has no time_us, and other images have one: give it to all of {folder:?}, or to none")]
+    #[error(
+        "{name:?} has no time_us, and other images have one: give it to all of {folder:?}, or to none"
+    )]
     NoTime {
         /// The image.
         name: String,
@@ -84,7 +86,9 @@ pub enum CapturedDriveError {
         folder: String,
     },
     /// Two images of the reference camera have one time.
-    #[error("{name:?} has the same time_us as the image before it, {time_us}: a camera takes one image at a time")]
+    #[error(
+        "{name:?} has the same time_us as the image before it, {time_us}: a camera takes one image at a time"
+    )]
     SameTime {
         /// The image.
         name: String,
@@ -502,7 +506,9 @@ mod tests {
         };
         let rear = CaptureOptions { reference: Some("rear".into()), ..options() };
         assert!(refused(rear).contains("\"Left Side\", \"front\""));
-        assert!(refused(CaptureOptions { fps: Some(0.0), ..options() }).contains("images a second"));
+        assert!(
+            refused(CaptureOptions { fps: Some(0.0), ..options() }).contains("images a second")
+        );
         assert!(refused(CaptureOptions { name: "A".into(), ..options() }).contains("not a name"));
         let mut other = images.clone();
         other.iter_mut().filter(|i| i.name.starts_with("Left")).for_each(|i| i.name += "x.png");

@@ -147,6 +147,7 @@ impl Axes {
         for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
             turn.apply(colour);
         }
+        gaussians.clamp_coefficients();
     }
 }
 

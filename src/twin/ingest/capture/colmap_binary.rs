@@ -100,9 +100,7 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
                 "camera {id}: model {number} is not one of COLMAP's up to version 4: is it a cameras.bin of COLMAP?"
             )));
         };
-        model
-            .check_supported()
-            .map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
+        model.check_supported().map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
         let parameters: Result<Vec<f64>, _> = (0..model.parameters).map(|_| bytes.f64()).collect();
         let camera = model.camera(size, &parameters?);
         let camera = camera.map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;

@@ -100,7 +100,12 @@ fn read_images(
             )));
         };
         let world_from_camera = pose([qw, qx, qy, qz], [tx, ty, tz]).map_err(wrong)?;
-        images.push(PosedImage { name: name.to_owned(), camera: *camera, world_from_camera, time_us: None });
+        images.push(PosedImage {
+            name: name.to_owned(),
+            camera: *camera,
+            world_from_camera,
+            time_us: None,
+        });
         lines.next();
     }
     if images.is_empty() {

@@ -11,6 +11,9 @@ use super::EXTENSION;
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Document {
+    /// Extensions without which the document is another scene.
+    #[serde(default)]
+    pub(super) extensions_required: Vec<String>,
     pub(super) scene: Option<usize>,
     #[serde(default)]
     pub(super) scenes: Vec<Scene>,

@@ -36,6 +36,17 @@ const FORMAT: &str = "glTF";
 const EXTENSION: &str = "KHR_gaussian_splatting";
 /// The extension whose buffer view is an SPZ of version 2.
 const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
+/// Extensions that a document may require. Compressed buffer views are refused by their own names.
+const READ_EXTENSIONS: [&str; 8] = [
+    EXTENSION,
+    SPZ,
+    "EXT_meshopt_compression",
+    "KHR_draco_mesh_compression",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+];
 
 /// Whether JSON is glTF, in which an asset is required.
 pub(super) fn is_likely(json: &[u8]) -> bool {
@@ -115,6 +126,11 @@ pub(super) fn read(
 ) -> Result<Gaussians, IngestError> {
     let document: Document =
         serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
+    let required = document.extensions_required.iter().map(String::as_str);
+    let skipped: Vec<&str> = required.filter(|name| !READ_EXTENSIONS.contains(name)).collect();
+    if !skipped.is_empty() {
+        reading.warn_skipped("required extensions", &skipped);
+    }
     // Buffers: from URIs, or within the GLB file.
     let mut uris = Uris::new(parts);
     let mut fetched = Vec::new();

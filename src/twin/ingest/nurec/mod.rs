@@ -31,6 +31,20 @@ use msgpack::Value;
 const FORMAT: &str = "NuRec";
 const LAYERS: &str = ".gaussians_nodes.";
 
+/// Fields of a layer that are read, or that hold nothing for the picture.
+const READ_FIELDS: [&str; 10] = [
+    "positions",
+    "rotations",
+    "scales",
+    "densities",
+    "features_albedo",
+    "features_specular",
+    "n_active_features",
+    "gaussian_cuboid_ids",
+    "extra_signal",
+    "shape",
+];
+
 /// Reads the static Gaussians of a payload.
 pub(super) fn read(
     payload: &[u8],
@@ -49,6 +63,7 @@ pub(super) fn read(
     if layers.is_empty() {
         return Err(bad("a layer of static Gaussians", "is missing".into()));
     }
+    payload.warn_skipped(reading);
     let mut all = Gaussians::default();
     for name in layers {
         budget.check_stop()?;
@@ -139,6 +154,18 @@ impl<'a> Payload<'a> {
             tracks: tracks.map(Value::index).unwrap_or_default(),
             settings: settings.map(Value::index).unwrap_or_default(),
         })
+    }
+
+    /// Warns of what the model has besides the layers of Gaussians.
+    fn warn_skipped(&self, reading: &mut Reading) {
+        let is_read = |key: &&str| {
+            let field = key.strip_prefix(LAYERS).and_then(|rest| rest.rsplit('.').next());
+            field.is_some_and(|field| READ_FIELDS.contains(&field)) || *key == "._extra_state"
+        };
+        let skipped: Vec<&str> = self.fields.keys().copied().filter(|key| !is_read(key)).collect();
+        if !skipped.is_empty() {
+            reading.warn_skipped("entries of nre_data.state_dict", &skipped);
+        }
     }
 
     /// The tracks of a layer; none for a static one.

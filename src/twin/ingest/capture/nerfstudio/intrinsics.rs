@@ -88,7 +88,9 @@ impl Intrinsics {
             };
             match (given, of_fov) {
                 (Some(given), Some(of_fov)) if (given / of_fov - 1.0).abs() > 1e-3 => {
-                    let reason = format!("says a focal length of {of_fov:.2}, and {fl} or {angle} {given:.2}");
+                    let reason = format!(
+                        "says a focal length of {of_fov:.2}, and {fl} or {angle} {given:.2}"
+                    );
                     Err(Wrong { field: fov, reason })
                 }
                 (given, of_fov) => Ok(given.or(of_fov)),
@@ -100,8 +102,7 @@ impl Intrinsics {
             (Some(x), y) => Ok([x, y.unwrap_or(x)]),
             (None, Some(y)) => Ok([y, y]),
             (None, None) => {
-                let reason =
-                    "is missing, and camera_angle_x too: add it to the frame or to the file, in pixels";
+                let reason = "is missing, and camera_angle_x too: add it to the frame or to the file, in pixels";
                 Err(Wrong { field: "fl_x", reason: reason.to_owned() })
             }
         }
@@ -127,7 +128,8 @@ impl Intrinsics {
         let Distortion { k, p } = self.distortion()?;
         match model {
             Some(model) if is_ngp_fisheye && !FISHEYE.contains(&model) => {
-                let reason = format!("is true, and camera_model is {model:?}: remove one of the two");
+                let reason =
+                    format!("is true, and camera_model is {model:?}: remove one of the two");
                 Err(Wrong { field: "is_fisheye", reason })
             }
             Some(model) if FISHEYE.contains(&model) => fisheye(k, p),
@@ -155,7 +157,8 @@ impl Intrinsics {
             Some(list) => match <[f64; 6]>::deserialize(list) {
                 Ok([k1, k2, k3, k4, p1, p2]) => Ok(Distortion { k: [k1, k2, k3, k4], p: [p1, p2] }),
                 Err(_) => {
-                    let reason = format!("is {list}; six numbers can be read: k1, k2, k3, k4, p1, p2");
+                    let reason =
+                        format!("is {list}; six numbers can be read: k1, k2, k3, k4, p1, p2");
                     Err(Wrong { field, reason })
                 }
             },
