@@ -311,7 +311,7 @@ fn times_of_frames_are_those_of_the_drive() {
     let Some(timed) = crate::data::real("cases/transforms_time_us/tj_time.json") else { return };
     let dir = tempfile::tempdir().unwrap();
     let run = |more: &[&str]| {
-        let mut command = wildcity();
+        let mut command = crate::wildcity();
         command.args(["route", "from-nerfstudio", timed.to_str().unwrap(), "--axes", "identity"]);
         command.args(["--out", "out"]).args(more).current_dir(dir.path()).output().unwrap()
     };

@@ -23,6 +23,7 @@ mod fuzz;
 mod hostile;
 mod materials;
 mod meshes;
+mod notes;
 mod real_scenes;
 mod round_trip;
 mod skies;
