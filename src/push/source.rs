@@ -8,7 +8,7 @@ use std::sync::Arc;
 use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
 use wildcity_twin::ingest::{
-    self, Axes, FileNotes, IngestError, Progress, ReadLimits, ReadScene, TrackedObject,
+    self, Axes, FileAxes, FileNotes, IngestError, Progress, ReadLimits, ReadScene, TrackedObject,
 };
 
 /// The axes and unit of a scene file, and how the user wrote them.
@@ -74,24 +74,31 @@ impl SourceAxes {
     /// Converts a scene that was read to the twin's axes. `default` has those of a file for which they are not given.
     fn apply(&self, read: ReadScene, default: &Self) -> Result<SourceScene, IngestError> {
         let ReadScene { mut gaussians, hash, parts, mut notes } = read;
-        let recorded = notes.axes.clone();
-        let (axes, text) = match (&self.axes, &recorded, &default.axes) {
-            (Some(given), Some(recorded), _) => {
-                if !given.0.has_rotation_of(&recorded.axes) {
+        let (axes, text) = self.used_axes(default, &mut notes);
+        let scale = self.used_scale(default, &mut notes);
+        axes.scaled(scale)?.apply(&mut gaussians);
+        let options = [format!("axes={text}"), format!("scale={scale}")];
+        Ok(SourceScene { gaussians, hash, parts, options, notes })
+    }
+
+    /// The given axes, or else those that the file records, or else the default; notes which ones if that may surprise.
+    fn used_axes(&self, default: &Self, notes: &mut FileNotes) -> (Axes, String) {
+        match (&self.axes, &notes.axes, &default.axes) {
+            (Some((axes, text)), recorded, _) => {
+                if let Some(FileAxes { axes: recorded, said_by }) =
+                    recorded.as_ref().filter(|recorded| !axes.has_rotation_of(&recorded.axes))
+                {
+                    let recorded = recorded.option_text();
                     notes.warnings.push(format!(
-                        "{} says axes {}; the given ones, {}, are used",
-                        recorded.said_by,
-                        recorded.axes.option_text(),
-                        given.1
+                        "{said_by} says axes {recorded}; the given ones, {text}, are used"
                     ));
                 }
-                given.clone()
+                (*axes, text.clone())
             }
-            (Some(given), None, _) => given.clone(),
-            (None, Some(recorded), _) => {
-                let text = recorded.axes.option_text();
-                notes.warnings.push(format!("{}: axes {text} are used", recorded.said_by));
-                (recorded.axes, text)
+            (None, Some(FileAxes { axes, said_by }), _) => {
+                let (axes, text) = (*axes, axes.option_text());
+                notes.warnings.push(format!("{said_by}: axes {text} are used"));
+                (axes, text)
             }
             (None, None, Some((axes, text))) => {
                 if !axes.has_rotation_of(&Axes::IDENTITY) {
@@ -102,22 +109,16 @@ impl SourceAxes {
                 (*axes, text.clone())
             }
             (None, None, None) => (Axes::IDENTITY, "identity".to_owned()),
-        };
-        let scale = match (self.metres_per_unit, default.metres_per_unit) {
-            (Some(scale), _) => scale,
-            (None, Some(scale)) => {
-                if scale != 1.0 {
-                    notes
-                        .warnings
-                        .push(format!("no scale is given: that of the twin, {scale}, is used"));
-                }
-                scale
-            }
-            (None, None) => 1.0,
-        };
-        axes.scaled(scale)?.apply(&mut gaussians);
-        let options = [format!("axes={text}"), format!("scale={scale}")];
-        Ok(SourceScene { gaussians, hash, parts, options, notes })
+        }
+    }
+
+    /// The given metres per unit, or else the default; notes it if that may surprise.
+    fn used_scale(&self, default: &Self, notes: &mut FileNotes) -> f64 {
+        let inherited = default.metres_per_unit.filter(|_| self.metres_per_unit.is_none());
+        if let Some(scale) = inherited.filter(|scale| *scale != 1.0) {
+            notes.warnings.push(format!("no scale is given: that of the twin, {scale}, is used"));
+        }
+        self.metres_per_unit.or(inherited).unwrap_or(1.0)
     }
 
     /// The axes and the scale as options, for the provenance of a version; those that are not given are `identity`

@@ -250,9 +250,10 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
     assert!(told.contains("no COLMAP model") && told.contains("model_converter"), "{told}");
 
     let text = at.join("m");
-    let cases: [(&str, &str, &str, &str); 6] = [
+    let cases: [(&str, &str, &str, &str); 7] = [
         ("cameras.txt", "OPENCV", "OPENKV", "cameras.txt:2: \"OPENKV\" is not a camera model"),
-        ("cameras.txt", "OPENCV", "FOV", "cameras.txt:2: 8 parameters; FOV has 5"),
+        ("cameras.txt", "OPENCV", "PINHOLE", "cameras.txt:2: 8 parameters; PINHOLE has 4"),
+        ("cameras.txt", "OPENCV", "FOV", "cameras.txt:2: the camera model FOV is not supported"),
         ("cameras.txt", "1440", "wide", "cameras.txt:2: WIDTH is \"wide\", not a number"),
         (
             "images.txt",

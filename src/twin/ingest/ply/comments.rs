@@ -16,7 +16,13 @@ const WITHOUT_EFFECT: [&str; 10] = [
     "this file",
 ];
 
-/// Takes from a comment what it says, and warns of one that is not understood.
+/// Whether a comment gives a value, and is no prose.
+fn is_setting(comment: &str) -> bool {
+    let last = comment.split_ascii_whitespace().next_back().unwrap_or_default();
+    comment.contains([':', '=']) || last.parse::<f64>().is_ok() || last.parse::<bool>().is_ok()
+}
+
+/// Takes from a comment what it says, and warns of a setting that is not understood.
 pub(super) fn read(comment: &str, reading: &mut Reading) {
     let said_by = || format!("comment {comment:?}");
     let lower = comment.to_ascii_lowercase();
@@ -30,6 +36,7 @@ pub(super) fn read(comment: &str, reading: &mut Reading) {
         ["antialiased", "1"] => reading.set_antialiased(BLUR_PX2, said_by()),
         ["antialiased", "0"] => {}
         _ if WITHOUT_EFFECT.iter().any(|start| lower.starts_with(start)) => {}
-        _ => reading.warn(format!("{} has no effect", said_by())),
+        _ if is_setting(&lower) => reading.warn(format!("{} has no effect", said_by())),
+        _ => {}
     }
 }
