@@ -125,6 +125,13 @@ impl Reading {
         self.notes.axes = Some(FileAxes { axes, said_by });
     }
 
+    /// Takes back the axes, with a warning.
+    pub(super) fn ignore_axes(&mut self) {
+        if let Some(FileAxes { said_by, .. }) = self.notes.axes.take() {
+            self.warn(format!("{said_by} within the file has no effect"));
+        }
+    }
+
     /// Checks Gaussians; `name` gives the name of a field in the file. Infinite opacities and vanishing scales become the
     /// nearest values that can be stored.
     ///

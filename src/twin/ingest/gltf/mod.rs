@@ -195,7 +195,10 @@ fn read_primitive(
             let bytes = view.and_then(|view| document.view_bytes(buffers, view as usize));
             let bytes =
                 bytes.ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
-            return spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading);
+            let read = spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading);
+            // The axes are those of the glTF, whatever the SPZ within says.
+            reading.ignore_axes();
+            return read;
         }
         Some((extension, _)) => {
             return Err(bad(place, format!("is compressed by {extension}; export it without")));
