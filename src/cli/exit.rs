@@ -30,3 +30,29 @@ impl std::fmt::Display for Exit {
 }
 
 impl std::error::Error for Exit {}
+
+/// An error with its causes. A cause whose text the error before it already ends with is not said twice: the `Display`
+/// text of many errors includes that of their source.
+pub(super) fn chain(error: &anyhow::Error) -> String {
+    error.chain().map(ToString::to_string).fold(String::new(), |text, cause| {
+        match (text.is_empty(), text.ends_with(&cause)) {
+            (true, _) => cause,
+            (false, true) => text,
+            (false, false) => format!("{text}: {cause}"),
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_said_once() {
+        let cause = anyhow::anyhow!("Gaussian 0: x is NaN");
+        let once = cause.context("sky: Gaussian 0: x is NaN").context("cannot import a.ply");
+        assert_eq!(chain(&once), "cannot import a.ply: sky: Gaussian 0: x is NaN");
+        let plain = anyhow::anyhow!("no such file").context("cannot read b");
+        assert_eq!(chain(&plain), format!("{plain:#}"));
+    }
+}

@@ -14,6 +14,7 @@ use wildcity_scene::{RecordFormat, RenderProfile};
 use wildcity_twin::store::{NewSky, NewVersion, StorageOptions, StoreError};
 
 use super::directories::Twins;
+use super::file_notes::{self, DropBad};
 use super::input_files::read_trajectories;
 use super::output;
 use super::packed_folder::scene_file;
@@ -49,15 +50,17 @@ pub(super) struct Import {
     #[command(flatten)]
     twins: Twins,
 
-    /// Directions of the file's axes, which no format records: a preset, or the 9 numbers of
+    /// Directions of the file's axes, which hardly any file records: a preset, or the 9 numbers of
     /// the matrix from the file's axes to the twin's (x east, y north, z up), row by row.
     ///
     /// identity: z is up already.
     /// y-down-z-forward: OpenCV, COLMAP; most captures.
     /// y-up-z-back: OpenGL, SPZ.
     /// y-up-z-forward: Unity, left-handed.
-    #[arg(long, default_value = "identity", allow_hyphen_values = true, verbatim_doc_comment)]
-    axes: String,
+    ///
+    /// Default: the axes that the file records, as an SPZ may; else identity.
+    #[arg(long, value_name = "AXES", allow_hyphen_values = true, verbatim_doc_comment)]
+    axes: Option<String>,
 
     /// Metres per unit of the file, applied after --axes.
     #[arg(long, default_value_t = 1.0, allow_negative_numbers = true)]
@@ -86,6 +89,9 @@ pub(super) struct Import {
     #[command(flatten)]
     profile: ProfileOptions,
 
+    #[command(flatten)]
+    bad: DropBad,
+
     /// Record format in which Gaussians are stored: f32 (exact), h52, q32 or q24. For the last three the
     /// number is the bytes per Gaussian at SH degree 1, before compression.
     #[arg(long, value_name = "FORMAT", default_value_t)]
@@ -98,18 +104,22 @@ pub(super) struct Import {
 
 const EXAMPLES: &str = "\
 Formats, and their usual axes. Files of one format differ, so render the twin to check its axes:
-  PLY                 INRIA's columns in any order, SH degree 0 to 3        y-down-z-forward
+  PLY                 INRIA's columns in any order, SH degree 0 to 3; also  y-down-z-forward
+                      text, big-endian, and the columns of 2DGS,
+                      mip-splatting, nerfstudio and street_gaussians
   compressed PLY      PlayCanvas, SuperSplat                                y-down-z-forward
   safetensors         gsplat's names: means, quats, scales, opacities, ..   y-down-z-forward
   checkpoint (.pt)    python -m wildcity.convert CKPT.pt OUT.safetensors    y-down-z-forward
   .splat              antimatter15                                          y-down-z-forward
   .ksplat             mkkellogg, levels 0 to 2                              y-down-z-forward
   SPZ 2, 3, 4         Niantic; by its specification right, up, back, but    y-up-z-back
-                      some tools keep the axes of the PLY
+                      some tools keep the axes of the PLY; those that an
+                      extension records are the default
   SOG 1 and 2         PlayCanvas; a folder, or one .sog or .zip             y-down-z-forward
   streamed SOG        a folder, or one .zip; the finest level is read       y-down-z-forward
   glTF, GLB           KHR_gaussian_splatting, with the transforms of its    '-1 0 0 0 0 1 0 1 0'
-                      nodes; the standard has x left, y up, z to the front
+                      nodes; the standard has x left, y up, z to the front.
+                      Also compressed as SPZ
   glTF, GLB of        triangles are covered with 200,000 flat Gaussians     the same
   ordinary meshes     in their base colour
   NuRec (.usdz)       NVIDIA; static content only. Axes are the payload's,  y-down-z-forward
@@ -138,9 +148,11 @@ impl Import {
         if !is_name(&self.twin) {
             return Err(StoreError::Name { name: self.twin }.into());
         }
-        let axes = SourceAxes::parse(&self.axes, self.scale)?;
-        let profile = self.profile.load()?.apply(RenderProfile::default())?;
-        let sky = self.sky.read(&self.axes)?;
+        let axes = SourceAxes::given(self.axes.as_deref(), Some(self.scale))?;
+        let changes = self.profile.load()?;
+        changes.apply(RenderProfile::default())?;
+        let given_axes = self.axes.as_deref().unwrap_or("identity");
+        let sky = self.sky.read(given_axes)?;
         let rig = self.rig.as_deref().map(rig_of).transpose()?;
         let trajectories = read_trajectories(&self.trajectory)?;
         let catalog = self.twins.catalog()?;
@@ -150,10 +162,16 @@ impl Import {
         let cannot = || format!("cannot import {}", source.display());
         let mut phases = Phases::start();
         let bar = progress::bytes("reading");
-        let read = read_scene(&source, &axes, &mut progress::show(&bar));
-        let SourceScene { gaussians, hash, .. } = read.with_context(cannot)?;
+        let read = read_scene(&source, &axes, self.bad.drop_bad, &mut progress::show(&bar));
+        let read = file_notes::explained(read).with_context(cannot)?;
+        let SourceScene { gaussians, hash, options, notes, .. } = read;
         bar.finish_and_clear();
         phases.end("read");
+        file_notes::print(&source, &notes)?;
+        let profile = notes.profile().apply(RenderProfile::default())?;
+        let profile = changes.apply(profile)?;
+        let used_axes = options[0].trim_start_matches("axes=").to_owned();
+        let sky = if used_axes == given_axes { sky } else { self.sky.read(&used_axes)? };
         if gaussians.is_empty() {
             let source = source.display();
             writeln!(
@@ -173,7 +191,7 @@ impl Import {
             trajectories,
             sky: sky.map(NewSky::Put),
             geo: self.geo.clone(),
-            provenance: provenance(&[hash], axes.options().to_vec(), levels),
+            provenance: provenance(&[hash], options.to_vec(), levels),
             storage: StorageOptions { record: self.record, levels },
         };
         let mut show = progress::show(&bar);
@@ -188,7 +206,7 @@ impl Import {
         // The file passed its checks, so a Gaussian that is refused now was changed by the options.
         let version = version.map_err(|error| match error {
             StoreError::Gaussians(error) => anyhow::Error::new(error)
-                .context(format!("after --axes {:?} --scale {}", self.axes, self.scale)),
+                .context(format!("after --axes {used_axes:?} --scale {}", self.scale)),
             error => error.into(),
         });
         let version = version.with_context(cannot)?;

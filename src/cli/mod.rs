@@ -6,7 +6,7 @@
 //! kind; `episode run` has more, which its help lists.
 //!
 //! Each package has an error enum. Its `Display` text says everything, down to the text of the operating
-//! system. So an error is printed once, with `{:#}`, and the commands add only the flag or the file that it
+//! system. So an error is printed once, with its causes, and the commands add only the flag or the file that it
 //! belongs to. Numbers from outside are printed with `{:?}`, which writes 1e300 as such and not as 301
 //! digits.
 
@@ -26,6 +26,7 @@ mod drive;
 mod episode;
 mod eval;
 mod exit;
+mod file_notes;
 mod import;
 mod input_files;
 mod inspect;
@@ -145,7 +146,7 @@ pub fn main() -> ExitCode {
             let exit = error.downcast_ref::<exit::Exit>();
             match exit.is_some_and(|exit| exit.is_finding) {
                 true => eprintln!("{error}"),
-                false => eprintln!("error: {error:#}"),
+                false => eprintln!("error: {}", exit::chain(&error)),
             }
             exit.map_or(ExitCode::FAILURE, |exit| exit.code.into())
         }

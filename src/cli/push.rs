@@ -12,6 +12,7 @@ use wildcity_client::{
 };
 use wildcity_twin::ingest;
 
+use super::file_notes::DropBad;
 use super::{packed_folder, progress};
 
 /// Push trained scenes to a server, as a new version of a twin.
@@ -34,13 +35,14 @@ pub(super) struct Push {
     #[command(flatten)]
     server: Server,
 
-    /// Directions of the files' axes, as in `wildcity import`.
-    #[arg(long, default_value = "identity", allow_hyphen_values = true)]
-    axes: String,
+    /// Directions of the files' axes, as in `wildcity import` [default: those that a file records, or those with which
+    /// the twin was imported; for a new twin identity]
+    #[arg(long, value_name = "AXES", allow_hyphen_values = true)]
+    axes: Option<String>,
 
-    /// Metres per unit of the files.
-    #[arg(long, default_value_t = 1.0)]
-    scale: f64,
+    /// Metres per unit of the files [default: that with which the twin was imported; for a new twin 1]
+    #[arg(long, value_name = "M")]
+    scale: Option<f64>,
 
     /// The frame of the files, after --axes and --scale: `twin`, or `capture` for the axes and the unit with which the
     /// capture was imported, before `wildcity twin align` [default: twin]
@@ -77,6 +79,9 @@ pub(super) struct Push {
     /// the push is lower than this, in dB; or if no Gaussian is visible from any of them.
     #[arg(long, value_name = "DB")]
     min_psnr_db: Option<f64>,
+
+    #[command(flatten)]
+    bad: DropBad,
 }
 
 /// A coordinate frame, by its name on the wire.
@@ -151,7 +156,7 @@ impl Push {
         client: &HttpClient,
         cells: Option<CellSelection>,
     ) -> anyhow::Result<Pushed> {
-        let files = upload_all(client, &self.files, &self.axes, self.scale).await?;
+        let files = upload_all(client, &self.files, self.axes.as_deref(), self.scale).await?;
         let asked = NewPush {
             // One id for this run: if an answer is lost, the client sends the same push again under this id.
             id: Some(uuid::Uuid::now_v7().as_simple().to_string()),
@@ -167,6 +172,7 @@ impl Push {
             profile: self.settings.clone(),
             note: self.note.clone(),
             preview: PreviewRequest { poses: None, min_psnr_db: self.min_psnr_db },
+            drop_bad: self.bad.drop_bad,
         };
         let begun = client.push(&self.twin, &asked).await?;
         let bar = progress::state();
@@ -186,8 +192,8 @@ impl Push {
 pub(super) async fn upload_all(
     client: &HttpClient,
     paths: &[PathBuf],
-    axes: &str,
-    scale: f64,
+    axes: Option<&str>,
+    scale: Option<f64>,
 ) -> anyhow::Result<Vec<PushFile>> {
     let mut files = Vec::with_capacity(paths.len());
     for path in paths {
@@ -199,7 +205,7 @@ pub(super) async fn upload_all(
                 (upload(client, path).await?, name)
             }
         };
-        files.push(PushFile { upload, axes: axes.to_owned(), scale, name });
+        files.push(PushFile { upload, axes: axes.map(str::to_owned), scale, name });
     }
     Ok(files)
 }
@@ -257,6 +263,12 @@ fn print_report(out: &mut impl Write, report: &PushReport) -> io::Result<()> {
         for bad in &file.first_bad {
             let wildcity_protocol::http::BadGaussian { index, field, value, must } = bad;
             writeln!(out, "bad         Gaussian {index}: {field} is {value}; {must}")?;
+        }
+        if file.dropped > 0 {
+            writeln!(out, "left out    {} Gaussians that cannot be drawn", file.dropped)?;
+        }
+        for warning in &file.warnings {
+            writeln!(io::stderr(), "warning: {}: {warning}", file.name)?;
         }
         let unnamed = file.bad - file.first_bad.len() as u64;
         if unnamed > 0 {

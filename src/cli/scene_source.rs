@@ -9,12 +9,13 @@ use anyhow::Context;
 
 use wildcity_render::View;
 use wildcity_scene::{RenderProfile, Scene};
-use wildcity_twin::ingest;
 use wildcity_twin::ingest::cameras::{self, ListedCamera};
+use wildcity_twin::ingest::{self, ReadLimits, ReadScene};
 use wildcity_twin::residency::{Cache, PinnedScene, Resident};
 use wildcity_twin::store::Version;
 
 use super::directories::{TwinVersion, Twins};
+use super::file_notes::{self, DropBad};
 use super::profile_options::{LoadedProfile, ProfileOptions};
 use super::progress;
 
@@ -37,6 +38,9 @@ pub(super) struct SceneSource {
 
     #[command(flatten)]
     profile: ProfileOptions,
+
+    #[command(flatten)]
+    bad: DropBad,
 }
 
 /// A scene and the images of it that a rendering command makes.
@@ -80,18 +84,27 @@ impl Deref for FrameScene<'_> {
 }
 
 impl Source {
-    /// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file the default.
-    pub(super) fn open(scene: &str, twins: &Twins) -> anyhow::Result<(Self, RenderProfile)> {
+    /// Reads the scene of `SCENE`, with the profile that belongs to it: the twin's, or for a file the default with what
+    /// the file says.
+    pub(super) fn open(
+        scene: &str,
+        twins: &Twins,
+        DropBad { drop_bad }: DropBad,
+    ) -> anyhow::Result<(Self, RenderProfile)> {
         let path = Path::new(scene);
         // Pipes and devices count as files, so that the reader refuses them by name. A directory does
         // not: it may have the same name as a twin.
         if path.exists() && !path.is_dir() {
             let bar = progress::bytes("reading");
-            let gaussians = ingest::read(path, &mut progress::show(&bar))
-                .with_context(|| format!("{}", path.display()))?;
+            let limits = ReadLimits { drop_bad, ..ReadLimits::of_own_file() };
+            let read = ingest::read_limited(path, &limits, &mut progress::show(&bar));
+            let read = file_notes::explained(read);
+            let ReadScene { gaussians, notes, .. } =
+                read.with_context(|| format!("{}", path.display()))?;
             bar.finish_and_clear();
+            file_notes::print(path, &notes)?;
             let scene = Scene::from_gaussians(&gaussians);
-            return Ok((Self::File(scene), RenderProfile::default()));
+            return Ok((Self::File(scene), notes.profile().apply(RenderProfile::default())?));
         }
         let named: TwinVersion = scene.parse().map_err(anyhow::Error::msg)?;
         let cache = Cache::new(twins.catalog()?);
@@ -146,7 +159,7 @@ impl SceneSource {
         let listed =
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
         let changes = self.profile.load()?;
-        let (source, profile) = Source::open(&self.scene, &self.twins)?;
+        let (source, profile) = Source::open(&self.scene, &self.twins, self.bad)?;
         let shots = listed.into_iter().map(|camera| shot(camera, profile, &changes));
         let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
         Ok(LoadedScene { source, shots })

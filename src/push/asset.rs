@@ -18,7 +18,7 @@ use crate::limits;
 use crate::queue::PushQueue;
 use crate::read::{ReadBounds, read};
 use crate::request::{RequestedFile, check_files};
-use crate::source::{SourceFile, provenance};
+use crate::source::{SourceAxes, SourceFile, provenance};
 use crate::status::{Push, State};
 
 /// Request for a push of an asset.
@@ -144,6 +144,7 @@ pub async fn publish_asset(
         mesh_gaussians: request.settings.mesh_gaussians,
         most_gaussians: ActorAsset::MOST_GAUSSIANS as u64,
         too_many_fix: "an actor is one vehicle or person; reduce its Gaussians",
+        drop_bad: false,
     };
     // Blocking threads hold a clone of the permit, because they may outlive their push for a moment.
     let stopping = StopWhenDropped(push.stop_flag().clone());
@@ -152,7 +153,7 @@ pub async fn publish_asset(
         let push = push.clone();
         run_blocking(move || {
             let _permit = permit;
-            let scene = read(&push, &request.files, &files, bounds)?;
+            let scene = read(&push, &request.files, &files, &SourceAxes::default(), bounds)?;
             let (hashes, options) = (scene.hashes, scene.options);
             let source = AssetSource { gaussians: scene.gaussians, hashes, options };
             make_asset(source, &request.settings)

@@ -4,6 +4,7 @@ use wildcity_twin::store::{Catalog, StoreError, Version};
 
 use crate::error::PushError;
 use crate::request::{CellSelection, PushRequest};
+use crate::source::SourceAxes;
 
 /// The number of the twin's latest version, if the twin exists. Also refuses a push early if its
 /// cells changed since the base that it names.
@@ -44,6 +45,42 @@ pub fn default_id(request: &PushRequest, latest: Option<u64>) -> String {
     hasher.update(request.request_hash.as_bytes());
     hasher.update(&latest.unwrap_or(0).to_le_bytes());
     hasher.finalize().to_hex()[..32].to_owned()
+}
+
+/// The axes and the unit of files for which the request gives none: those with which the base was imported.
+///
+/// # Errors
+/// The base was made from files in different axes; or as [`find_base`].
+pub(crate) fn default_axes(
+    catalog: &Catalog,
+    request: &PushRequest,
+) -> Result<SourceAxes, PushError> {
+    let Some(index) = request.files.iter().position(|file| !file.axes.is_complete()) else {
+        return Ok(SourceAxes::default());
+    };
+    let Some(base) = find_base(catalog, request)? else { return Ok(SourceAxes::default()) };
+    let options = &base.manifest.provenance.options;
+    let found = |key: &str| {
+        let mut found: Vec<&str> =
+            options.iter().filter_map(|option| option.strip_prefix(key)).collect();
+        found.dedup();
+        found
+    };
+    let (axes, scales) = (found("axes="), found("scale="));
+    if axes.len() > 1 || scales.len() > 1 {
+        return Err(PushError::InvalidField {
+            field: format!("files[{index}].axes"),
+            reason: format!(
+                "give axes and scale: the twin was made from files of different ones ({})",
+                options.join(" ")
+            ),
+        });
+    }
+    let scale = scales.first().and_then(|scale| scale.parse().ok());
+    SourceAxes::given(axes.first().copied(), scale).map_err(|error| PushError::InvalidField {
+        field: format!("files[{index}].axes"),
+        reason: format!("give axes and scale: those of the twin cannot be read: {error}"),
+    })
 }
 
 /// The base version of a push; `None` if the push makes a new twin.

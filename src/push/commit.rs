@@ -1,6 +1,7 @@
 //! Writes the version of a push: all of its cells, or none.
 
-use wildcity_scene::{Gaussians, Manifest};
+use wildcity_scene::{Gaussians, Manifest, RenderProfile};
+use wildcity_twin::ingest::{Antialiasing, FileNotes};
 use wildcity_twin::store::{
     Catalog, CommitKind, NewSky, StorageOptions, StoreError, Version, VersionChange,
     VersionSettings,
@@ -18,6 +19,37 @@ pub(crate) struct NewContent<'a> {
     pub(crate) hashes: &'a [String],
     /// The axes and scale of each file.
     pub(crate) options: &'a [String],
+    /// The render profile of the version.
+    pub(crate) profile: RenderProfile,
+}
+
+/// The render profile of the version that a push makes: that of the base, or for a new twin the one that its files say,
+/// with the changes of the request. Also a warning if the files say another one.
+pub(crate) fn profile_of(
+    request: &PushRequest,
+    base: Option<&Version>,
+    antialiasing: Option<&Antialiasing>,
+) -> Result<(RenderProfile, Option<String>), PushError> {
+    let of_files = FileNotes { antialiasing: antialiasing.cloned(), ..FileNotes::default() };
+    let of_files = of_files.profile();
+    let own = match base {
+        Some(base) => base.manifest.profile,
+        None => of_files.apply(RenderProfile::DEFAULT).map_err(StoreError::from)?,
+    };
+    let profile = profile_with(own, &request.profile).map_err(StoreError::from)?;
+    let is_asked = |key: &str| request.profile.iter().any(|setting| setting.starts_with(key));
+    let is_right = of_files.apply(profile).map_err(StoreError::from)? == profile
+        || is_asked("antialiased=")
+        || is_asked("blur=");
+    let warning = antialiasing.filter(|_| !is_right).map(|Antialiasing { blur_px2, said_by }| {
+        format!(
+            "{said_by}: the scene was trained with antialiased=true and blur={blur_px2}, and the twin is rendered with \
+             antialiased={} and blur={}; if its other cells were trained so, too, push with --set antialiased=true --set \
+             blur={blur_px2}",
+            profile.antialiased, profile.blur
+        )
+    });
+    Ok((profile, warning))
 }
 
 /// Writes the version. A push of some cells changes those of the base and keeps the base's settings. A push of all
@@ -45,8 +77,7 @@ pub(crate) fn commit(
     if let Some(note) = &request.note {
         provenance.set_note(note);
     }
-    let old_profile = old.map(|old| old.profile).unwrap_or_default();
-    let profile = profile_with(old_profile, &request.profile).map_err(StoreError::from)?;
+    let profile = content.profile;
     let version = match base {
         Some(base) if request.cells != CellSelection::All => {
             let profile = (!request.profile.is_empty()).then_some(profile);

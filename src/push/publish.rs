@@ -15,16 +15,16 @@ use std::sync::Arc;
 
 use tokio::time::{Instant, timeout, timeout_at};
 
-use wildcity_scene::Gaussians;
 use wildcity_scene::align::Alignment;
 use wildcity_scene::chunk::cell_at;
+use wildcity_scene::{Gaussians, RenderProfile};
 use wildcity_session::{Engine, LatestPin};
 use wildcity_twin::residency::Viewpoint;
 use wildcity_twin::store::{StoreError, Version, check_density};
 
-use crate::base::find_base;
+use crate::base::{default_axes, find_base};
 use crate::blocking::run_blocking;
-use crate::commit::{NewContent, commit};
+use crate::commit::{NewContent, commit, profile_of};
 use crate::error::PushError;
 use crate::preview::psnr::preview_psnr;
 use crate::preview::{check_psnr, comparison};
@@ -43,6 +43,8 @@ struct CheckedScene {
     gaussians: Arc<Gaussians>,
     hashes: Vec<String>,
     options: Vec<String>,
+    /// The render profile of the version.
+    profile: RenderProfile,
     report: PushReport,
 }
 
@@ -113,12 +115,14 @@ async fn read_and_check(
     push.enter(State::Ingesting)?;
     let scene = {
         let push = push.clone();
+        let engine = engine.clone();
         let request = request.clone();
         let permit = permit.clone();
-        let bounds = ReadBounds::of_twin(permit.memory_bytes());
+        let bounds = ReadBounds::of_twin(permit.memory_bytes(), request.drop_bad);
         run_blocking(move || {
             let _permit = permit;
-            read(&push, &request.files, &files, bounds)
+            let default_axes = default_axes(engine.catalog(), &request)?;
+            read(&push, &request.files, &files, &default_axes, bounds)
         })
         .await?
     };
@@ -174,7 +178,11 @@ fn compare_cells(
 ) -> Result<CheckedScene, PushError> {
     let placed = scene.place_in_twin(request.frame, base);
     placed.inspect_err(|_| push.set_report(scene.report.clone()))?;
-    let PushedScene { mut gaussians, hashes, options, mut report } = scene;
+    let PushedScene { mut gaussians, hashes, options, antialiasing, mut report } = scene;
+    let (profile, warning) = profile_of(request, base, antialiasing.as_ref())?;
+    if let (Some(warning), Some(file)) = (warning, report.files.first_mut()) {
+        file.warnings.push(warning);
+    }
     // All cells of a twin have one SH degree. Coefficients of zero raise a lower one.
     if let Some(base) = base
         && request.cells != CellSelection::All
@@ -192,7 +200,7 @@ fn compare_cells(
     report.cells = changes.cells;
     report.left_out = changes.left_out;
     push.set_report(report.clone());
-    Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, report })
+    Ok(CheckedScene { gaussians: Arc::new(gaussians), hashes, options, profile, report })
 }
 
 /// A committed version that is not yet opened as the latest.
@@ -212,8 +220,12 @@ fn commit_held(
     // Until the new version is ready, sessions that open the latest version get the present latest version. It may be
     // later than the base, because another version may have been committed during the preview.
     let held = pin_latest(engine, &request.twin)?;
-    let content =
-        NewContent { gaussians: &scene.gaussians, hashes: &scene.hashes, options: &scene.options };
+    let content = NewContent {
+        gaussians: &scene.gaussians,
+        hashes: &scene.hashes,
+        options: &scene.options,
+        profile: scene.profile,
+    };
     let version = commit(engine.catalog(), push, request, content, base)?;
     Ok(Committed { version, held })
 }

@@ -249,6 +249,7 @@ mod tests {
             note: None,
             preview_poses: None,
             min_psnr_db: None,
+            drop_bad: false,
         }
     }
 

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use wildcity_scene::Gaussians;
 use wildcity_scene::validate::{self, Field};
-use wildcity_twin::ingest::{self, IngestError, ListedFiles, ReadLimits};
+use wildcity_twin::ingest::{self, Antialiasing, IngestError, ListedFiles, ReadLimits};
 use wildcity_twin::store::Version;
 
 use crate::error::PushError;
@@ -12,7 +12,7 @@ use crate::frame::{Frame, twin_from_capture};
 use crate::limits;
 use crate::report::{FileReport, PushReport, Ranges};
 use crate::request::RequestedFile;
-use crate::source::{SourceFile, SourceScene, read_limited};
+use crate::source::{SourceAxes, SourceFile, SourceScene, read_limited};
 use crate::status::Push;
 
 /// The joined files of a push.
@@ -22,6 +22,8 @@ pub(crate) struct PushedScene {
     pub(crate) hashes: Vec<String>,
     /// The axes and scale of each file.
     pub(crate) options: Vec<String>,
+    /// How the files say that they were trained.
+    pub(crate) antialiasing: Option<Antialiasing>,
     pub(crate) report: PushReport,
 }
 
@@ -60,30 +62,35 @@ pub(crate) struct ReadBounds {
     pub(crate) most_gaussians: u64,
     /// Remedy that the error gives if there are more.
     pub(crate) too_many_fix: &'static str,
+    /// Whether Gaussians outside their bounds are left out.
+    pub(crate) drop_bad: bool,
 }
 
 impl ReadBounds {
     /// The bounds of a push of a twin.
-    pub(crate) fn of_twin(memory_bytes: u64) -> Self {
+    pub(crate) fn of_twin(memory_bytes: u64, drop_bad: bool) -> Self {
         Self {
             memory_bytes,
             mesh_gaussians: ReadLimits::of_own_file().mesh_gaussians,
             most_gaussians: limits::PUSH_GAUSSIANS,
             too_many_fix: "push the scene in parts, some cells each",
+            drop_bad,
         }
     }
 }
 
 /// Reads the files, converts them to the twin's axes, and joins them in the order of the request. A file that another
-/// one names, such as a buffer of a glTF, is a part of that scene and not a separate scene. The report of the push is
+/// one names, such as a buffer of a glTF, is a part of that scene and not a separate scene. `default_axes` has the axes
+/// of files for which they are not given. The report of the push is
 /// set on success, and on failure if Gaussians are the reason.
 pub(crate) fn read(
     push: &Push,
     requested: &[RequestedFile],
     files: &[SourceFile],
+    default_axes: &SourceAxes,
     bounds: ReadBounds,
 ) -> Result<PushedScene, PushError> {
-    let mut reader = Reader::new(push, files, bounds);
+    let mut reader = Reader::new(push, files, default_axes, bounds);
     // Read scenes that may name other files first, so that the named files are not read as scenes.
     let names_others: Vec<bool> =
         files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
@@ -113,26 +120,26 @@ struct Reader<'a> {
     files: &'a [SourceFile],
     /// The files that a scene may name.
     listed: ListedFiles,
+    default_axes: &'a SourceAxes,
     bounds: ReadBounds,
     total_bytes: u64,
     read_bytes: u64,
     /// Names of the files that are parts of a scene.
     parts: BTreeSet<String>,
     /// Scenes that are not joined yet, by index of their file.
-    read: BTreeMap<usize, ReadFile>,
+    read: BTreeMap<usize, SourceScene>,
     /// Index of the next file to join.
     next: usize,
     scene: PushedScene,
 }
 
-/// A scene that is not joined yet.
-struct ReadFile {
-    scene: SourceScene,
-    options: [String; 2],
-}
-
 impl<'a> Reader<'a> {
-    fn new(push: &'a Push, files: &'a [SourceFile], bounds: ReadBounds) -> Self {
+    fn new(
+        push: &'a Push,
+        files: &'a [SourceFile],
+        default_axes: &'a SourceAxes,
+        bounds: ReadBounds,
+    ) -> Self {
         // A name of two different files stands for neither.
         let mut listed = ListedFiles::new();
         let mut ambiguous = BTreeSet::new();
@@ -147,6 +154,7 @@ impl<'a> Reader<'a> {
             push,
             files,
             listed,
+            default_axes,
             bounds,
             total_bytes: files.iter().map(|file| file.bytes).sum(),
             read_bytes: 0,
@@ -157,6 +165,7 @@ impl<'a> Reader<'a> {
                 gaussians: Gaussians::default(),
                 hashes: Vec::with_capacity(files.len()),
                 options: Vec::new(),
+                antialiasing: None,
                 report: PushReport::default(),
             },
         }
@@ -179,8 +188,10 @@ impl<'a> Reader<'a> {
             memory_bytes: self.bounds.memory_bytes,
             stop: push.stop_flag().clone(),
             mesh_gaussians: self.bounds.mesh_gaussians,
+            drop_bad: self.bounds.drop_bad,
         };
-        let read = match read_limited(&file.path, &requested.axes, &limits, progress) {
+        let default = self.default_axes;
+        let read = match read_limited(&file.path, &requested.axes, default, &limits, progress) {
             Ok(read) => read,
             Err(IngestError::Values(bad)) => {
                 let report = &mut self.scene.report;
@@ -190,9 +201,16 @@ impl<'a> Reader<'a> {
                     gaussians: bad.gaussians,
                     bad: bad.count,
                     first_bad: bad.first.clone(),
+                    dropped: 0,
+                    warnings: Vec::new(),
                 });
                 self.push.set_report(report.clone());
-                return Err(refused(IngestError::Values(bad)));
+                return Err(PushError::Content {
+                    reason: format!(
+                        "{name}: {bad}; drop_bad (--drop-bad) leaves such Gaussians out"
+                    ),
+                    cells: Vec::new(),
+                });
             }
             Err(IngestError::File(cause)) => {
                 return Err(PushError::Unreadable {
@@ -204,8 +222,7 @@ impl<'a> Reader<'a> {
         };
         self.read_bytes += file.bytes;
         self.parts.extend(read.parts.iter().cloned());
-        self.read
-            .insert(index, ReadFile { scene: read, options: requested.axes.options().clone() });
+        self.read.insert(index, read);
         if index == self.next {
             self.join_read(index + 1)?;
         }
@@ -216,9 +233,9 @@ impl<'a> Reader<'a> {
     fn join_read(&mut self, end: usize) -> Result<(), PushError> {
         while let Some(entry) = self.read.first_entry().filter(|entry| *entry.key() < end) {
             let name = &self.files[*entry.key()].name;
-            let ReadFile { scene: read, options } = entry.remove();
-            let SourceScene { gaussians, hash, .. } = read;
+            let SourceScene { gaussians, hash, options, notes, .. } = entry.remove();
             let scene = &mut self.scene;
+            scene.antialiasing = scene.antialiasing.take().or(notes.antialiasing);
             let count = gaussians.len() as u64;
             scene.report.gaussians += count;
             scene.report.files.push(FileReport {
@@ -226,6 +243,8 @@ impl<'a> Reader<'a> {
                 gaussians: count,
                 bad: 0,
                 first_bad: Vec::new(),
+                dropped: notes.dropped,
+                warnings: notes.warnings,
             });
             let total = scene.report.gaussians;
             check_count(name, total, &self.bounds)
@@ -262,7 +281,7 @@ mod tests {
 
     #[test]
     fn a_push_has_a_largest_size() {
-        let bounds = ReadBounds::of_twin(1 << 30);
+        let bounds = ReadBounds::of_twin(1 << 30, false);
         assert!(check_count("a.ply", limits::PUSH_GAUSSIANS, &bounds).is_ok());
         let error = check_count("b.ply", limits::PUSH_GAUSSIANS + 1, &bounds).unwrap_err();
         assert!(error.is_refusal());

@@ -56,6 +56,10 @@ pub struct FileReport {
     pub bad: u64,
     /// The first of these.
     pub first_bad: Vec<BadGaussian>,
+    /// Gaussians with a number outside its bounds that were left out.
+    pub dropped: u64,
+    /// What of the file was not read, or is drawn in another way than it says.
+    pub warnings: Vec<String>,
 }
 
 /// Smallest and largest values of the numbers of some Gaussians.

@@ -41,6 +41,8 @@ pub struct PushRequest {
     pub preview_poses: Option<Vec<Pose>>,
     /// The push is refused if the images of a pose differ by more than this PSNR, in dB.
     pub min_psnr_db: Option<f64>,
+    /// Whether Gaussians outside their bounds are left out; without it the push is refused.
+    pub drop_bad: bool,
 }
 
 /// One file of a push.

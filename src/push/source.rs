@@ -8,14 +8,14 @@ use std::sync::Arc;
 use wildcity_scene::Gaussians;
 use wildcity_scene::manifest::Provenance;
 use wildcity_twin::ingest::{
-    self, Axes, IngestError, Progress, ReadLimits, ReadScene, TrackedObject,
+    self, Axes, FileAxes, FileNotes, IngestError, Progress, ReadLimits, ReadScene, TrackedObject,
 };
 
 /// The axes and unit of a scene file, and how the user wrote them.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct SourceAxes {
-    axes: Axes,
-    options: [String; 2],
+    axes: Option<(Axes, String)>,
+    metres_per_unit: Option<f64>,
 }
 
 /// A scene file that waits to be read.
@@ -40,6 +40,10 @@ pub struct SourceScene {
     pub hash: String,
     /// The names of the files that the scene file names.
     pub parts: BTreeSet<String>,
+    /// The axes and the scale that were used, as options, for the provenance of a version.
+    pub options: [String; 2],
+    /// What the file says besides its Gaussians.
+    pub notes: FileNotes,
 }
 
 impl SourceAxes {
@@ -48,48 +52,110 @@ impl SourceAxes {
     /// # Errors
     /// The axes are not a rotation or reflection, or the scale is not a positive number.
     pub fn parse(axes: &str, scale: f64) -> Result<Self, IngestError> {
-        let options = [format!("axes={axes}"), format!("scale={scale}")];
-        Ok(Self { axes: axes.parse::<Axes>()?.scaled(scale)?, options })
+        Self::given(Some(axes), Some(scale))
     }
 
-    /// Converts a scene that was read to the twin's axes.
-    fn apply(&self, read: ReadScene) -> SourceScene {
-        let ReadScene { mut gaussians, hash, parts } = read;
-        self.axes.apply(&mut gaussians);
-        SourceScene { gaussians, hash, parts }
+    /// As [`Self::parse`]. Axes that are not given are those that the file records, or else the twin's; a scale that is
+    /// not given is 1.
+    ///
+    /// # Errors
+    /// As [`Self::parse`].
+    pub fn given(axes: Option<&str>, metres_per_unit: Option<f64>) -> Result<Self, IngestError> {
+        Axes::IDENTITY.scaled(metres_per_unit.unwrap_or(1.0))?;
+        let parsed = |text: &str| Ok::<_, IngestError>((text.parse::<Axes>()?, text.to_owned()));
+        Ok(Self { axes: axes.map(parsed).transpose()?, metres_per_unit })
     }
 
-    /// The axes and the scale as options, for the provenance of a version.
-    pub fn options(&self) -> &[String; 2] {
-        &self.options
+    /// Whether both are given.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.axes.is_some() && self.metres_per_unit.is_some()
+    }
+
+    /// Converts a scene that was read to the twin's axes. `default` has those of a file for which they are not given.
+    fn apply(&self, read: ReadScene, default: &Self) -> Result<SourceScene, IngestError> {
+        let ReadScene { mut gaussians, hash, parts, mut notes } = read;
+        let (axes, text) = self.used_axes(default, &mut notes);
+        let scale = self.used_scale(default, &mut notes);
+        axes.scaled(scale)?.apply(&mut gaussians);
+        let options = [format!("axes={text}"), format!("scale={scale}")];
+        Ok(SourceScene { gaussians, hash, parts, options, notes })
+    }
+
+    /// The given axes, or else those that the file records, or else the default; notes which ones if that may surprise.
+    fn used_axes(&self, default: &Self, notes: &mut FileNotes) -> (Axes, String) {
+        match (&self.axes, &notes.axes, &default.axes) {
+            (Some((axes, text)), recorded, _) => {
+                if let Some(FileAxes { axes: recorded, said_by }) =
+                    recorded.as_ref().filter(|recorded| !axes.has_rotation_of(&recorded.axes))
+                {
+                    let recorded = recorded.option_text();
+                    notes.warnings.push(format!(
+                        "{said_by} says axes {recorded}; the given ones, {text}, are used"
+                    ));
+                }
+                (*axes, text.clone())
+            }
+            (None, Some(FileAxes { axes, said_by }), _) => {
+                let (axes, text) = (*axes, axes.option_text());
+                notes.warnings.push(format!("{said_by}: axes {text} are used"));
+                (axes, text)
+            }
+            (None, None, Some((axes, text))) => {
+                if !axes.has_rotation_of(&Axes::IDENTITY) {
+                    notes
+                        .warnings
+                        .push(format!("no axes are given: those of the twin, {text}, are used"));
+                }
+                (*axes, text.clone())
+            }
+            (None, None, None) => (Axes::IDENTITY, "identity".to_owned()),
+        }
+    }
+
+    /// The given metres per unit, or else the default; notes it if that may surprise.
+    fn used_scale(&self, default: &Self, notes: &mut FileNotes) -> f64 {
+        let inherited = default.metres_per_unit.filter(|_| self.metres_per_unit.is_none());
+        if let Some(scale) = inherited.filter(|scale| *scale != 1.0) {
+            notes.warnings.push(format!("no scale is given: that of the twin, {scale}, is used"));
+        }
+        self.metres_per_unit.or(inherited).unwrap_or(1.0)
+    }
+
+    /// The axes and the scale as options, for the provenance of a version; those that are not given are `identity`
+    /// and 1.
+    pub fn options(&self) -> [String; 2] {
+        let axes = self.axes.as_ref().map_or("identity", |(_, text)| text);
+        [format!("axes={axes}"), format!("scale={}", self.metres_per_unit.unwrap_or(1.0))]
     }
 }
 
 /// Reads a scene file of any format, checks every Gaussian, and converts them to the twin's axes. The scene
-/// may name the files below its folder.
+/// may name the files below its folder. `drop_bad` leaves out Gaussians outside their bounds.
 ///
 /// # Errors
 /// As [`ingest::read`].
 pub fn read_scene(
     path: &Path,
     axes: &SourceAxes,
+    drop_bad: bool,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    let (gaussians, hash) = ingest::read_hashed(path, progress)?;
-    Ok(axes.apply(ReadScene { gaussians, hash, parts: BTreeSet::new() }))
+    let limits = ReadLimits { drop_bad, ..ReadLimits::of_own_file() };
+    read_limited(path, axes, &SourceAxes::default(), &limits, progress)
 }
 
-/// As [`read_scene`], within limits.
+/// As [`read_scene`], within limits. `default` has the axes of a file for which they are not given.
 ///
 /// # Errors
 /// As [`ingest::read_limited`].
 pub(crate) fn read_limited(
     path: &Path,
     axes: &SourceAxes,
+    default: &SourceAxes,
     limits: &ReadLimits<'_>,
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
-    ingest::read_limited(path, limits, progress).map(|read| axes.apply(read))
+    axes.apply(ingest::read_limited(path, limits, progress)?, default)
 }
 
 /// As [`read_scene`], with another number of Gaussians for the triangles of a mesh.
@@ -103,7 +169,7 @@ pub fn read_actor(
     progress: Progress<'_>,
 ) -> Result<SourceScene, IngestError> {
     let limits = ReadLimits { mesh_gaussians, ..ReadLimits::of_own_file() };
-    read_limited(path, axes, &limits, progress)
+    read_limited(path, axes, &SourceAxes::default(), &limits, progress)
 }
 
 /// The tracked objects of a recorded drive, each in its own axes, and the file's BLAKE3 in hex.
@@ -116,7 +182,9 @@ pub fn read_tracked(
     progress: Progress<'_>,
 ) -> Result<(Vec<TrackedObject>, String), IngestError> {
     let (mut objects, hash) = ingest::read_tracked(path, progress)?;
-    objects.iter_mut().for_each(|object| axes.axes.apply(&mut object.gaussians));
+    let (file_axes, _) = axes.axes.clone().unwrap_or((Axes::IDENTITY, String::new()));
+    let file_axes = file_axes.scaled(axes.metres_per_unit.unwrap_or(1.0))?;
+    objects.iter_mut().for_each(|object| file_axes.apply(&mut object.gaussians));
     Ok((objects, hash))
 }
 

@@ -18,7 +18,9 @@ use glam::{DMat3, DQuat, DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::actor::PlacedChunk;
+use super::geometry::Pose;
 use super::pages::{LanePages, Page};
+use super::validate::{LN_SCALE, MAX_SH};
 use super::{Gaussians, Sky, sh};
 
 pub use super::pages::{CLUSTER, LANES, Lanes};
@@ -298,22 +300,27 @@ impl Chunk {
     }
 
     /// The Gaussians before activation, in the order of the chunk and in its origin's axes. Opacities of 1, which no
-    /// logit has, become 1 - 1e-13; empty lanes become invisible Gaussians.
+    /// logit has, become 1 - 1e-13; empty lanes become invisible Gaussians. All are within the bounds of
+    /// [`validate`](super::validate), which rounding in a record could exceed.
     pub fn to_gaussians(&self) -> Gaussians {
         let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count);
         for index in 0..self.count {
             let value = |column| self.value(index, column);
             let three = |column| [0, 1, 2].map(|axis| value(column + axis));
             let mean_m = DVec3::from_array(three(column::MEAN).map(f64::from)) + self.origin_m;
-            gaussians.means_m.push(mean_m.to_array());
+            let most_m = Pose::MAX_COORDINATE_M;
+            gaussians.means_m.push(mean_m.to_array().map(|m| m.clamp(-most_m, most_m)));
             let quat = [0, 1, 2, 3].map(|k| value(column::QUAT + k));
             let is_empty = quat == [0.0; 4];
             gaussians.quats_wxyz.push(if is_empty { [1.0, 0.0, 0.0, 0.0] } else { quat });
-            let ln = |scale_m: f32| f64::from(scale_m).max(1e-30).ln() as f32;
+            // A file may have scales of 0, and records round small ones to 0: they are the smallest that is allowed.
+            let ln =
+                |scale_m: f32| (f64::from(scale_m).ln() as f32).clamp(LN_SCALE[0], LN_SCALE[1]);
             gaussians.ln_scales.push(three(column::SCALE).map(ln));
             gaussians.logit_opacities.push(logit_from_log2(value(column::LOG2_OPACITY)));
             let count = columns(self.sh_degree) - column::SH;
-            gaussians.sh.extend((0..count).map(|k| value(column::SH + k)));
+            let coefficients = (0..count).map(|k| value(column::SH + k));
+            gaussians.sh.extend(coefficients.map(|c| c.clamp(-MAX_SH, MAX_SH)));
         }
         gaussians
     }

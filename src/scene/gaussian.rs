@@ -6,6 +6,7 @@ use glam::{DQuat, DVec3};
 
 use super::geometry::Pose;
 use super::sh;
+use super::validate::{FULL_LOGIT, LN_SCALE, MAX_SH};
 
 /// Raw Gaussians, as columns of equal length `n`.
 ///
@@ -125,9 +126,28 @@ impl Gaussians {
         for color in self.sh.chunks_exact_mut(3 * sh::coefficients(self.sh_degree)) {
             colors.apply(color);
         }
+        self.clamp_coefficients();
     }
 
-    /// Scales all Gaussians about the origin. A factor of 1 changes no bit.
+    /// Replaces coefficients beyond the bound by the nearest within it: a rotation may turn several at the bound into
+    /// one beyond.
+    pub fn clamp_coefficients(&mut self) {
+        for coefficient in &mut self.sh {
+            *coefficient = coefficient.clamp(-MAX_SH, MAX_SH);
+        }
+    }
+
+    /// Replaces values that no file needs to avoid and that have a nearest one within the bounds of
+    /// [`validate`](super::validate): opacities of 0 and 1, whose logit is infinite, and scales below the smallest one.
+    pub fn clamp_activations(&mut self) {
+        for logit in self.logit_opacities.iter_mut().filter(|logit| logit.is_infinite()) {
+            *logit = FULL_LOGIT.copysign(*logit);
+        }
+        self.ln_scales.as_flattened_mut().iter_mut().for_each(raise_to_smallest);
+    }
+
+    /// Scales all Gaussians about the origin. A factor of 1 changes no bit. Scales that would become smaller than the
+    /// smallest one become that one.
     pub fn scale(&mut self, factor: f64) {
         if factor == 1.0 {
             return;
@@ -138,6 +158,7 @@ impl Gaussians {
         }
         for scale in &mut self.ln_scales {
             *scale = scale.map(|s| (f64::from(s) + ln) as f32);
+            scale.iter_mut().for_each(raise_to_smallest);
         }
     }
 
@@ -170,6 +191,13 @@ impl Gaussians {
     pub fn sh_of(&self, index: usize) -> &[f32] {
         let stride = 3 * sh::coefficients(self.sh_degree);
         &self.sh[index * stride..(index + 1) * stride]
+    }
+}
+
+/// NaN stays NaN, which validation refuses.
+fn raise_to_smallest(ln_scale: &mut f32) {
+    if *ln_scale < LN_SCALE[0] {
+        *ln_scale = LN_SCALE[0];
     }
 }
 

@@ -14,6 +14,8 @@ pub const QUAT_LENGTH: [f64; 2] = [1e-6, 1e6];
 pub const LN_SCALE: [f32; 2] = [-30.0, 10.0];
 /// Largest magnitude of an opacity before the sigmoid; in f32 the sigmoid is 1 from 17 on.
 pub const MAX_LOGIT: f32 = 1e4;
+/// Magnitude of the logit that stands for an opacity of 0 or 1, whose logit is infinite: the sigmoid of 20 is 1 in f32.
+pub const FULL_LOGIT: f32 = 20.0;
 /// Largest magnitude of a colour coefficient: colours are about 1.
 pub const MAX_SH: f32 = sh::MAX_COEFFICIENT;
 /// Number of invalid Gaussians of one file that are listed individually; further ones are only counted.
@@ -138,6 +140,11 @@ struct Violation {
     field: Field,
     value: String,
     must: &'static str,
+}
+
+/// Whether every number of a Gaussian is within its bounds.
+pub fn is_valid(gaussians: &Gaussians, index: usize) -> bool {
+    violation(gaussians, index).is_none()
 }
 
 /// The first number of a Gaussian that is outside its bounds. Every condition states what must hold, so

@@ -8,6 +8,9 @@ pub const IMAGE_BYTES: u64 = 9 << 30;
 /// Longest PLY header, in bytes. INRIA's with SH degree 3 has 1.5 kB.
 pub const PLY_HEADER_BYTES: usize = 64 << 10;
 
+/// Longest line of the body of a PLY file of text, in bytes. With SH degree 3 a line has about 700.
+pub const PLY_LINE_BYTES: u64 = 64 << 10;
+
 /// Longest safetensors header, in bytes. A gsplat checkpoint's has less than 1 kB.
 pub const SAFETENSORS_HEADER_BYTES: usize = 1 << 20;
 

@@ -250,9 +250,10 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
     assert!(told.contains("no COLMAP model") && told.contains("model_converter"), "{told}");
 
     let text = at.join("m");
-    let cases: [(&str, &str, &str, &str); 6] = [
+    let cases: [(&str, &str, &str, &str); 7] = [
         ("cameras.txt", "OPENCV", "OPENKV", "cameras.txt:2: \"OPENKV\" is not a camera model"),
-        ("cameras.txt", "OPENCV", "FOV", "cameras.txt:2: 8 parameters; FOV has 5"),
+        ("cameras.txt", "OPENCV", "PINHOLE", "cameras.txt:2: 8 parameters; PINHOLE has 4"),
+        ("cameras.txt", "OPENCV", "FOV", "cameras.txt:2: the camera model FOV is not supported"),
         ("cameras.txt", "1440", "wide", "cameras.txt:2: WIDTH is \"wide\", not a number"),
         (
             "images.txt",
@@ -304,4 +305,23 @@ fn damaged_captures_name_the_file_the_place_and_the_fix() {
     fs::write(at.join("t.json"), "{\n \"frames\": [\n}").unwrap();
     assert!(refused(at, &nerfstudio).contains("t.json:3: "));
     assert!(!at.join("out").exists(), "nothing is written");
+}
+
+#[test]
+fn times_of_frames_are_those_of_the_drive() {
+    let Some(timed) = crate::data::real("cases/transforms_time_us/tj_time.json") else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let run = |more: &[&str]| {
+        let mut command = crate::wildcity();
+        command.args(["route", "from-nerfstudio", timed.to_str().unwrap(), "--axes", "identity"]);
+        command.args(["--out", "out"]).args(more).current_dir(dir.path()).output().unwrap()
+    };
+    let output = run(&[]);
+    assert!(output.status.success(), "{output:?}");
+    let drive = std::fs::read(dir.path().join("out/capture.json")).unwrap();
+    let drive: serde_json::Value = serde_json::from_slice(&drive).unwrap();
+    let times_us = drive["keyframes"].as_array().unwrap().iter().map(|k| k["time_us"].as_i64());
+    assert!(times_us.eq((0..12).map(|i| Some(500_000 * i))), "{drive}");
+    let told = String::from_utf8(run(&["--fps", "10"]).stderr).unwrap();
+    assert!(told.contains("leave out --fps"), "{told}");
 }

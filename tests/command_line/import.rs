@@ -43,3 +43,55 @@ fn skull_and_biker_stand_upright_and_whole() {
         assert_eq!(verified.damaged.len(), 0);
     }
 }
+
+/// Runs a command on a file of a case; returns its standard error.
+fn run(arguments: &[&str], at: &Path, is_accepted: bool) -> String {
+    let output = wildcity().args(arguments).current_dir(at).output().unwrap();
+    assert_eq!(output.status.success(), is_accepted, "{arguments:?}: {output:?}");
+    String::from_utf8(output.stderr).unwrap()
+}
+
+#[test]
+fn what_a_file_says_goes_into_the_twin() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let Some(brush) = data::real("cases/antialiased_tag/brush_mip.ply") else { return };
+    let brush = brush.to_str().unwrap();
+    let profile_of = |name: &str| {
+        let version = Catalog::open(&at.join("twins")).unwrap().version(name, None).unwrap();
+        (version.manifest.profile.antialiased, version.manifest.profile.blur)
+    };
+    let told = run(&["import", brush, "--twin", "mip", "--twins", "twins"], at, true);
+    assert!(told.contains("SplatRenderMode: mip") && told.contains("antialiased=true"), "{told}");
+    assert_eq!(profile_of("mip"), (true, 0.1));
+    let own = ["--set", "antialiased=false", "--set", "blur=0.2"];
+    let import = ["import", brush, "--twin", "own", "--twins", "twins"];
+    run(&[&import[..], &own[..]].concat(), at, true);
+    assert_eq!(profile_of("own"), (false, 0.2));
+
+    let spz = data::real("cases/spz_coordinate_system/v4_rdf_ext.spz").unwrap();
+    let import = ["import", spz.to_str().unwrap(), "--twin", "spz", "--twins", "twins"];
+    let told = run(&import, at, true);
+    assert!(told.contains("6 (RDF): axes y-down-z-forward are used"), "{told}");
+    let version = Catalog::open(&at.join("twins")).unwrap().version("spz", None).unwrap();
+    assert_eq!(version.manifest.provenance.options[0], "axes=y-down-z-forward");
+    let told = run(&[&import[..], &["--axes", "identity"]].concat(), at, true);
+    assert!(
+        told.contains("says axes y-down-z-forward; the given ones, identity, are used"),
+        "{told}"
+    );
+}
+
+#[test]
+fn bad_rows_are_refused_once_and_left_out_on_request() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = dir.path();
+    let Some(nan) = data::real("cases/bad_rows/nan1.ply") else { return };
+    let import = ["import", nan.to_str().unwrap(), "--twin", "nan", "--twins", "twins"];
+    let told = run(&import, at, false);
+    assert!(told.contains("--drop-bad") && told.matches("Gaussian 3").count() == 1, "{told}");
+    let told = run(&[&import[..], &["--drop-bad"]].concat(), at, true);
+    assert!(told.contains("1 Gaussian left out"), "{told}");
+    let version = Catalog::open(&at.join("twins")).unwrap().version("nan", None).unwrap();
+    assert_eq!(version.manifest.gaussians(), 59);
+}

@@ -18,8 +18,8 @@ const SPOILS: [(Spoil, &str, &str); 12] = [
     (|g| g.quats_wxyz[17] = [0.0; 4], "length of rot is 0", "length of quats is 0"),
     (|g| g.quats_wxyz[17][0] = 1e9, "length of rot is 1000000000", "length of quats is 1000000000"),
     (|g| g.ln_scales[17][1] = 104.2, "scale_1 is 104.2", "scales[1] is 104.2"),
-    (|g| g.ln_scales[17][0] = f32::NEG_INFINITY, "scale_0 is -inf", "scales[0] is -inf"),
-    (|g| g.logit_opacities[17] = f32::INFINITY, "opacity is inf", "opacities is inf"),
+    (|g| g.ln_scales[17][0] = f32::NAN, "scale_0 is NaN", "scales[0] is NaN"),
+    (|g| g.logit_opacities[17] = 2e4, "opacity is 20000", "opacities is 20000"),
     (|g| g.sh[17 * 27 + 2] = 1e6, "f_dc_2 is 1000000", "sh0[0][2] is 1000000"),
     // Coefficient 3, green: the 8 of red come first in a PLY.
     (|g| g.sh[17 * 27 + 3 * 3 + 1] = f32::NAN, "f_rest_10 is NaN", "shN[2][1] is NaN"),
@@ -117,6 +117,11 @@ fn camera_lists_say_what_is_wrong() {
         assert!(of_rigs.starts_with("camera \"a\": a camera in a list has no "), "{of_rigs}");
         assert!(of_rigs.contains(&format!("leave {field} out")), "{of_rigs}");
     }
+    for field in ["k1", "camera_model", "is_fisheye"] {
+        let other = refusal(good.replacen('{', &format!("{{\"{field}\": 1, "), 1));
+        let wanted = format!("camera \"a\": {field} is not a field of a camera list");
+        assert!(other.starts_with(&wanted), "{other}");
+    }
     assert_eq!(refusal("[]".into()), "the camera list is empty");
 }
 
@@ -152,9 +157,17 @@ fn an_error_in_a_ply_header_names_the_line() {
     let good = ply_header(0, &inria_columns(1, false));
     let changed = |from: &str, to: &str| refusal(good.replacen(from, to, 1).as_bytes());
     let cases = [
-        (changed("binary_little", "binary_big"), "line 2: \"format binary_big_endian 1.0\" must"),
         (
-            changed("float y", "list uchar int y"),
+            changed("binary_little_endian", "binary_middle_endian"),
+            "line 2: \"format binary_middle_endian 1.0\" must",
+        ),
+        (changed("float y", "list uchar int y"), "there is no property y"),
+        (
+            refusal(
+                good.replace("vertex 0", "vertex 1")
+                    .replace("float y", "list uchar int y")
+                    .as_bytes(),
+            ),
             "line 6: \"property list uchar int y\": Gaussians",
         ),
         (changed("float y", "half y"), "line 6: \"half\" is not a type"),

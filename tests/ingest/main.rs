@@ -13,6 +13,8 @@ mod root;
 mod scene_files;
 
 mod axes;
+mod captures;
+mod cases;
 mod conformance;
 mod corpus;
 mod damage;
@@ -21,6 +23,7 @@ mod fuzz;
 mod hostile;
 mod materials;
 mod meshes;
+mod notes;
 mod real_scenes;
 mod round_trip;
 mod skies;

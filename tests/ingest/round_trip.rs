@@ -143,10 +143,11 @@ fn the_format_does_not_depend_on_the_name_of_a_file() {
         "{text}"
     );
     assert!(refusal(b"").contains("starts with \"\""));
-    let text = refusal(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n");
+    let text = refusal(b"ply\nformat binary 1.0\nelement vertex 0\nend_header\n");
     assert_eq!(
         text,
-        "PLY header, line 2: \"format ascii 1.0\" must be format binary_little_endian 1.0"
+        "PLY header, line 2: \"format binary 1.0\" must be format binary_little_endian 1.0, binary_big_endian 1.0 or \
+         ascii 1.0"
     );
     let column = Column { name: "x".into(), is_double: false };
     let text = refusal(&ply(&gaussians(1, 0, 1.0, 0), &[column]));

@@ -375,8 +375,8 @@ fn requests() -> Vec<(&'static str, Request)> {
 fn new_push() -> http::NewPush {
     let file = http::PushFile {
         upload: "blake3-0".into(),
-        axes: "y-down-z-forward".into(),
-        scale: 1.0,
+        axes: Some("y-down-z-forward".into()),
+        scale: Some(1.0),
         name: None,
     };
     http::NewPush {
@@ -390,6 +390,7 @@ fn new_push() -> http::NewPush {
         profile: Vec::new(),
         note: Some("epoch 30".into()),
         preview: http::PreviewRequest::default(),
+        drop_bad: false,
     }
 }
 

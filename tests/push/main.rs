@@ -16,6 +16,7 @@ mod support;
 
 mod actors;
 mod edits;
+mod files;
 mod frames;
 mod hostile;
 mod metrics;

@@ -72,8 +72,8 @@ async fn each_file_has_its_axes_and_its_scale() {
     let mut asked = push_of(&[&uploads[0], &uploads[1]]);
     asked.record = Some("f32".to_owned());
     // x right, y down, z forward, in half metres; and a quarter turn.
-    (asked.files[0].axes, asked.files[0].scale) = ("y-down-z-forward".to_owned(), 0.5);
-    asked.files[1].axes = "0 -1 0 1 0 0 0 0 1".to_owned();
+    (asked.files[0].axes, asked.files[0].scale) = (Some("y-down-z-forward".to_owned()), Some(0.5));
+    asked.files[1].axes = Some("0 -1 0 1 0 0 0 0 1".to_owned());
     let begun = client.push("turned", &asked).await.unwrap();
     let pushed = client.wait_for_push(begun, &mut |_| {}).await.unwrap();
     let ranges = pushed.report.unwrap().ranges.unwrap();

@@ -11,6 +11,7 @@ mod sky_network;
 #[path = "../support/versions.rs"]
 mod versions;
 
+mod accepted;
 mod actors;
 mod alignments;
 mod commits;

@@ -79,8 +79,8 @@ pub(crate) fn write(dir: &Path, name: &str, gaussians: &Gaussians) -> PathBuf {
 pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
     let file = |id: &&str| PushFile {
         upload: (*id).to_owned(),
-        axes: "identity".to_owned(),
-        scale: 1.0,
+        axes: Some("identity".to_owned()),
+        scale: Some(1.0),
         name: None,
     };
     NewPush {
@@ -94,6 +94,7 @@ pub(crate) fn push_of(uploads: &[&str]) -> NewPush {
         profile: Vec::new(),
         note: None,
         preview: PreviewRequest::default(),
+        drop_bad: false,
     }
 }
 

@@ -340,6 +340,53 @@ def test_files_that_torch_saved() -> None:
     assert np.isfinite(means).all()
 
 
+def test_checkpoints_of_street_gaussians_and_3dgrut(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    root = data()
+    if root is None:
+        return
+    folder = root / "cases/street_gaussians"
+    street = folder / "street_gaussians.pth"
+    with pytest.raises(CheckpointError, match="choose one of 'background', 'obj_001'"):
+        convert.splats(street)
+    background = convert.splats(street, "background")
+    assert background["means"].shape == (20, 3) and background["shN"].shape == (20, 3, 3)
+    np.testing.assert_array_equal(background["means"], convert.load(street)["background"]["xyz"])
+    assert convert.main([str(street), str(tmp_path / "out"), "--model", "background"]) == 0
+    assert capsys.readouterr().err == "warning: not converted: semantic\n"
+
+    grut = convert.splats(folder / "3dgrut.pt")
+    saved = convert.load(folder / "3dgrut.pt")
+    assert grut["shN"].shape == (20, 15, 3)
+    np.testing.assert_array_equal(grut["sh0"][:, 0], saved["features_albedo"])
+    np.testing.assert_array_equal(grut["shN"].reshape(20, 45), saved["features_specular"])
+    np.testing.assert_array_equal(grut["opacities"], saved["density"][:, 0])
+
+
+def test_3dgrut_says_its_degree_and_its_kernel(tmp_path: Path) -> None:
+    g = gaussians()
+    names = {"means": "positions", "quats": "rotation", "scales": "scale", "opacities": "density"}
+    names |= {"sh0": "features_albedo", "shN": "features_specular"}
+    saved: dict[str, Any] = {names[name]: Tensor(values) for name, values in g.items()}
+    saved["features_specular"] = Tensor(g["shN"].reshape(N, 45))
+    source = save(tmp_path / "ckpt_last.pt", saved | {"n_active_features": 1})
+    np.testing.assert_array_equal(convert.splats(source)["shN"], g["shN"][:, :3])
+    config = {"render": {"particle_kernel_degree": 4}}
+    source = save(tmp_path / "ckpt_4.pt", saved | {"config": config})
+    with pytest.raises(CheckpointError, match="particle_kernel_degree is 4"):
+        convert.splats(source)
+
+
+def test_what_cannot_be_converted_is_named(tmp_path: Path) -> None:
+    g = gaussians()
+    saved = {"background": tensors(g), "obj_001": tensors(g | {"sh0": np.zeros((N, 5, 3), "<f4")})}
+    source = save(tmp_path / "iteration_30000.pth", saved)
+    assert_same(convert.splats(source, "background"), g)
+    with pytest.raises(CheckpointError, match="fourier_dim"):
+        convert.splats(source, "obj_001")
+    with pytest.raises(CheckpointError, match="has no Gaussians of gsplat"):
+        convert.splats(save(tmp_path / "empty.pth", {"iter": 1}), "background")
+
+
 def test_converted_files_can_be_imported(tmp_path: Path) -> None:
     binary = os.environ.get("WILDCITY_BIN")
     assert binary, "set WILDCITY_BIN to the wildcity binary"

@@ -145,7 +145,14 @@ def test_a_push_in_the_frame_of_the_capture_is_the_golden_one(monkeypatch: pytes
     monkeypatch.setattr(HttpClient, "json_with_retries", answer)
     path = write_ply(tmp_path / "a.ply", 0.0, 1)
     pushed = wildcity.push(
-        path, twin="city", axes="y-down-z-forward", frame="capture", base=3, note="epoch 30", push_id="epoch-30"
+        path,
+        twin="city",
+        axes="y-down-z-forward",
+        scale=1.0,
+        frame="capture",
+        base=3,
+        note="epoch 30",
+        push_id="epoch-30",
     )
     golden = vector("http/new_push_capture.json")
     golden["files"][0]["name"] = "a.ply"

@@ -30,8 +30,8 @@ async fn main() -> anyhow::Result<()> {
         // The axes of COLMAP: y points down and z forward.
         files: vec![PushFile {
             upload: upload.id,
-            axes: "y-down-z-forward".into(),
-            scale: 1.0,
+            axes: Some("y-down-z-forward".into()),
+            scale: Some(1.0),
             name: None,
         }],
         frame: None,
@@ -42,6 +42,7 @@ async fn main() -> anyhow::Result<()> {
         profile: Vec::new(),
         note: Some("pushed by the example".into()),
         preview: PreviewRequest::default(),
+        drop_bad: false,
     };
     let push = client.push(twin, &request).await?;
     let mut on_state = |push: &Push| eprintln!("{:?}", push.state);

@@ -88,6 +88,9 @@ pub struct NewPush {
     /// Where to compare the images before and after the push.
     #[serde(default, rename = "golden")]
     pub preview: PreviewRequest,
+    /// Whether invalid Gaussians are left out. Otherwise the push is refused if there are any.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub drop_bad: bool,
 }
 
 /// The axes of a file: a preset, or nine numbers.
@@ -102,14 +105,15 @@ const AXES_PATTERN: &str = "^(identity|y-down-z-forward|y-up-z-back|y-up-z-forwa
 pub struct PushFile {
     /// Id of the upload.
     pub upload: String,
-    /// Axis convention of the file: a preset or nine numbers, as in `wildcity import --axes`.
-    #[serde(default = "identity")]
+    /// Axis convention of the file: a preset or nine numbers, as in `wildcity import --axes`. If absent, that which the
+    /// file records; else, in a push, that with which the twin was imported; else `identity`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(regex(pattern = AXES_PATTERN)))]
-    pub axes: String,
-    /// Metres per unit of the file.
-    #[serde(default = "one")]
+    pub axes: Option<String>,
+    /// Metres per unit of the file. If absent, in a push, that with which the twin was imported; else 1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "schema", schemars(extend("exclusiveMinimum" = 0)))]
-    pub scale: f64,
+    pub scale: Option<f64>,
     /// The name by which other files of the request name this one, such as `textures/paint.png`. If absent, that of
     /// the upload.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -282,6 +286,12 @@ pub struct FileReport {
     pub bad: u64,
     /// The first of the invalid Gaussians.
     pub first_bad: Vec<BadGaussian>,
+    /// Number of invalid Gaussians that were left out.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub dropped: u64,
+    /// What of the file was not read, or is drawn in another way than it says; for people.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
 }
 
 /// An invalid Gaussian.
@@ -524,12 +534,12 @@ fn five() -> f64 {
     5.0
 }
 
-fn one() -> f64 {
-    1.0
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
-fn identity() -> String {
-    "identity".to_owned()
+fn is_zero(value: &u64) -> bool {
+    *value == 0
 }
 
 /// `POST /v1/tickets`: stands for the request's token in the address of one WebSocket, as `?ticket=`.

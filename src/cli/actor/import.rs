@@ -13,12 +13,13 @@ use wildcity_push::{
 use wildcity_scene::ActorBox;
 use wildcity_scene::actor::{ActorAsset, AssetDescription};
 use wildcity_scene::geometry::{Bounds, Pose};
-use wildcity_twin::ingest::TrackedObject;
+use wildcity_twin::ingest::{Antialiasing, TrackedObject};
 use wildcity_twin::store::{Catalog, StoredActor};
 
 use super::asset_options::{AssetOptions, name_from};
 use super::summary::Summary;
 use crate::cli::directories::Twins;
+use crate::cli::file_notes;
 use crate::cli::packed_folder::scene_file;
 use crate::cli::progress;
 
@@ -67,10 +68,15 @@ impl Import {
         let bar = progress::bytes("reading");
         let show = &mut progress::show(&bar);
         let read = read_actor(&self.source, &axes, settings.mesh_gaussians, show);
-        let SourceScene { gaussians, hash, .. } = read.with_context(cannot)?;
+        let SourceScene { gaussians, hash, options, mut notes, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
-        let options = axes.options().to_vec();
-        let source = AssetSource { gaussians, hashes: vec![hash], options };
+        if let Some(Antialiasing { said_by, .. }) = notes.antialiasing.take() {
+            notes
+                .warnings
+                .push(format!("{said_by}: an actor is rendered with the profile of its twin"));
+        }
+        file_notes::print(&self.source, &notes)?;
+        let source = AssetSource { gaussians, hashes: vec![hash], options: options.to_vec() };
         let asset = make_asset(source, &settings).with_context(cannot)?;
         print(&catalog.put_actor(&asset, settings.record).with_context(cannot)?)?;
         Ok(())

@@ -59,7 +59,7 @@ impl Push {
         settings: AssetSettings,
     ) -> anyhow::Result<ActorAsset> {
         let AssetOptions { axes, scale, .. } = &self.options;
-        let files = upload_all(client, &self.files, axes, *scale).await?;
+        let files = upload_all(client, &self.files, Some(axes), Some(*scale)).await?;
         let AssetSettings { name, class, mesh_gaussians, record } = settings;
         let asked = NewActor {
             class: match class {

@@ -30,6 +30,7 @@ use self::repairer::{Repairer, RepairerOptions};
 use self::summary::{decibels, print_means, print_off_trajectory};
 use super::backend_options::BackendOptions;
 use super::directories::Twins;
+use super::file_notes::DropBad;
 use super::profile_options::ProfileOptions;
 use super::real_images::{ImageList, RealImage, camera_names};
 use super::scene_source::Source;
@@ -119,6 +120,9 @@ pub(super) struct Eval {
     profile: ProfileOptions,
 
     #[command(flatten)]
+    bad: DropBad,
+
+    #[command(flatten)]
     backend: BackendOptions,
 }
 
@@ -156,7 +160,7 @@ impl Eval {
         let images = list.every(1).into_iter().zip(&names).step_by(self.every as usize);
         let images: Vec<(&RealImage, &String)> = images.collect();
         let changes = self.profile.load()?;
-        let (source, own_profile) = Source::open(&self.scene, &self.twins)?;
+        let (source, own_profile) = Source::open(&self.scene, &self.twins, self.bad)?;
         let alignment = self.alignment(&source, &list)?;
         let held_out: Vec<Pose> =
             images.iter().map(|(image, _)| alignment.pose(&image.world_from_camera)).collect();

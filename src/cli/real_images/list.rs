@@ -40,7 +40,6 @@ struct ListedImage {
     posed: PosedImage,
     mask: Option<String>,
     near: Option<f64>,
-    time_us: Option<i64>,
     exposure_stops: Option<f64>,
 }
 
@@ -67,8 +66,8 @@ impl ImageList {
             read(source).with_context(|| format!("--images {}", source.display()))?;
         let folder = image_dir.unwrap_or(&folder);
         let mut found = Vec::with_capacity(images.len());
-        for ListedImage { posed, mask, near, time_us, exposure_stops } in images {
-            let PosedImage { name, camera, world_from_camera } = posed;
+        for ListedImage { posed, mask, near, exposure_stops } in images {
+            let PosedImage { name, camera, world_from_camera, time_us } = posed;
             let file = image_file(folder, &name)?;
             let mask = match (masks, mask) {
                 (Some(masks), _) => Some(mask_file(masks, &name)?),
@@ -104,21 +103,15 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             CaptureError::NoModel { .. } => anyhow!("{error}; there is no transforms.json either"),
             error => error.into(),
         })?;
-        let listed = |posed| ListedImage {
-            posed,
-            mask: None,
-            near: None,
-            time_us: None,
-            exposure_stops: None,
-        };
+        let listed = |posed| ListedImage { posed, mask: None, near: None, exposure_stops: None };
         let images = images.into_iter().map(listed).collect();
         return Ok(Listed { images, folder: colmap_images(source), is_in_scene_axes: false });
     }
     if is_dir || has_frames(source)? {
         let images = capture::read_nerfstudio_frames(source)?;
         let listed = |frame: capture::FrameImage| {
-            let capture::FrameImage { posed, mask, time_us, exposure_stops } = frame;
-            ListedImage { posed, mask, near: None, time_us, exposure_stops }
+            let capture::FrameImage { posed, mask, exposure_stops } = frame;
+            ListedImage { posed, mask, near: None, exposure_stops }
         };
         let images = images.into_iter().map(listed).collect();
         let folder = if is_dir { source.to_owned() } else { beside };
@@ -135,8 +128,8 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
             exposure_stops,
             ..
         } = listed;
-        let posed = PosedImage { name, camera, world_from_camera };
-        ListedImage { posed, mask, near, time_us, exposure_stops }
+        let posed = PosedImage { name, camera, world_from_camera, time_us };
+        ListedImage { posed, mask, near, exposure_stops }
     });
     Ok(Listed { images: listed.collect(), folder: beside, is_in_scene_axes: true })
 }

@@ -63,9 +63,10 @@ struct DriveOptions {
     #[arg(long, value_name = "NAME", default_value = "capture")]
     name: String,
 
-    /// Images per second of the capture; the files have no times.
-    #[arg(long, value_name = "N", default_value_t = 10.0)]
-    fps: f64,
+    /// Images per second of the capture, if its images have no times (time_us of each frame of a transforms.json)
+    /// [default: 10]
+    #[arg(long, value_name = "N")]
+    fps: Option<f64>,
 
     /// Height of the camera above the ground, in metres [default: the ground is at z = 0 of the twin]
     #[arg(long, value_name = "M")]

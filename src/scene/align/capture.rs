@@ -25,6 +25,8 @@ pub struct PosedImage {
     pub camera: Camera,
     /// Its pose; x right, y down, z forward.
     pub world_from_camera: Pose,
+    /// Time at which it was taken, in microseconds, if its file has it.
+    pub time_us: Option<i64>,
 }
 
 /// How a capture becomes a drive.
@@ -32,8 +34,8 @@ pub struct PosedImage {
 pub struct CaptureOptions {
     /// Name of the drive and of the rig.
     pub name: String,
-    /// Images a second.
-    pub fps: f64,
+    /// Images a second, if they have no times; `None` for [`DEFAULT_FPS`].
+    pub fps: Option<f64>,
     /// Height of the reference camera above the ground, in metres; `None` if the ground is at z = 0.
     pub camera_height_m: Option<f64>,
     /// Folder of the reference camera; `None` for the one with the most images.
@@ -41,6 +43,9 @@ pub struct CaptureOptions {
     /// Folders of the rig's cameras; empty for all.
     pub cameras: Vec<String>,
 }
+
+/// Images a second of a capture whose images have no times.
+pub const DEFAULT_FPS: f64 = 10.0;
 
 /// A drive and its rig.
 #[derive(Clone, Debug, PartialEq)]
@@ -65,6 +70,31 @@ pub enum CapturedDriveError {
     /// The frame rate is out of range.
     #[error("{0:?} images a second; from 0.001 to 10000 are accepted")]
     Fps(f64),
+    /// The images have times, and a frame rate is given, too.
+    #[error(
+        "the images have time_us, and {0:?} images a second are asked for: leave out --fps, or remove time_us"
+    )]
+    FpsAndTimes(f64),
+    /// Some images of the reference camera have a time and some have none.
+    #[error(
+        "{name:?} has no time_us, and other images have one: give it to all of {folder:?}, or to none"
+    )]
+    NoTime {
+        /// The image.
+        name: String,
+        /// The folder of the reference camera.
+        folder: String,
+    },
+    /// Two images of the reference camera have one time.
+    #[error(
+        "{name:?} has the same time_us as the image before it, {time_us}: a camera takes one image at a time"
+    )]
+    SameTime {
+        /// The image.
+        name: String,
+        /// The time.
+        time_us: i64,
+    },
     /// There is no such folder.
     #[error("there is no image in the folder {folder:?}; the folders are {}", known.join(", "))]
     Folder {
@@ -114,13 +144,13 @@ pub fn captured_drive(
     if !is_name(name) {
         return Err(CapturedDriveError::Name(name.clone()));
     }
-    if !(1e-3..=1e4).contains(fps) {
-        return Err(CapturedDriveError::Fps(*fps));
+    if let Some(fps) = fps.filter(|fps| !(1e-3..=1e4).contains(fps)) {
+        return Err(CapturedDriveError::Fps(fps));
     }
     let images: Vec<PosedImage> = images.iter().map(|image| aligned(image, alignment)).collect();
     let folders = folders(&images, options)?;
     let reference_name = reference(&folders, options)?;
-    let reference = &folders[&reference_name];
+    let (reference, times_us) = timed(folders[&reference_name].clone(), &reference_name, *fps)?;
 
     // 1. How the reference camera stands on the rig.
     let heights_m = reference.iter().map(|image| image.world_from_camera.position_m.z);
@@ -138,14 +168,14 @@ pub fn captured_drive(
     let rig_from_reference = Pose { position_m: camera_height_m * DVec3::Z, rotation };
 
     // 2. The poses of the rig.
-    let keyframe = |(index, image): (usize, &&PosedImage)| Keyframe {
-        time_us: (1e6 * index as f64 / fps).round() as i64,
+    let keyframe = |(image, time_us): (&&PosedImage, i64)| Keyframe {
+        time_us,
         world_from_rig: Pose {
             position_m: image.world_from_camera.position_m - camera_height_m * DVec3::Z,
             rotation: level(image),
         },
     };
-    let keyframes = reference.iter().enumerate().map(keyframe).collect();
+    let keyframes = reference.iter().zip(times_us).map(keyframe).collect();
     let most_tilt_rad =
         mounts.iter().map(|mount| mount.angle_between(rotation)).fold(0.0, f64::max);
 
@@ -159,7 +189,7 @@ pub fn captured_drive(
                 folder: folder.clone(),
                 reference: reference_name.clone(),
             };
-            rig_from_reference * relative(reference, of_camera).ok_or_else(no_pair)?
+            rig_from_reference * relative(&reference, of_camera).ok_or_else(no_pair)?
         };
         let camera_name = camera_name(folder, cameras.len());
         cameras.push(RigCamera::new(camera_name, usual_camera(of_camera), rig_from_camera));
@@ -168,6 +198,35 @@ pub fn captured_drive(
     rig.check()?;
     let trajectory = Trajectory { name: name.clone(), keyframes };
     Ok(CapturedDrive { trajectory, rig, camera_height_m, most_tilt_rad })
+}
+
+/// The images of the reference camera in the order in which they were taken, with their times from the first one on, in
+/// microseconds.
+fn timed<'a>(
+    mut images: Folder<'a>,
+    folder: &str,
+    fps: Option<f64>,
+) -> Result<(Folder<'a>, Vec<i64>), CapturedDriveError> {
+    if images.iter().all(|image| image.time_us.is_none()) {
+        let period_us = 1e6 / fps.unwrap_or(DEFAULT_FPS);
+        let times_us = (0..images.len()).map(|index| (period_us * index as f64).round() as i64);
+        return Ok((images, times_us.collect()));
+    }
+    if let Some(image) = images.iter().find(|image| image.time_us.is_none()) {
+        let (name, folder) = (image.name.clone(), folder.to_owned());
+        return Err(CapturedDriveError::NoTime { name, folder });
+    }
+    if let Some(fps) = fps {
+        return Err(CapturedDriveError::FpsAndTimes(fps));
+    }
+    images.sort_by_key(|image| image.time_us);
+    let all_us: Vec<i64> = images.iter().filter_map(|image| image.time_us).collect();
+    if let Some(at) = all_us.windows(2).position(|pair| pair[0] == pair[1]) {
+        let (name, time_us) = (images[at + 1].name.clone(), all_us[at]);
+        return Err(CapturedDriveError::SameTime { name, time_us });
+    }
+    let first_us = all_us.first().copied().unwrap_or(0);
+    Ok((images, all_us.into_iter().map(|time_us| time_us.saturating_sub(first_us)).collect()))
 }
 
 fn aligned(image: &PosedImage, alignment: &Alignment) -> PosedImage {
@@ -335,12 +394,14 @@ mod tests {
                 name: format!("front/{i}.png"),
                 camera: camera(500.0),
                 world_from_camera: world_from_front,
+                time_us: None,
             });
             let front_from_left = front.inverse() * left;
             images.push(PosedImage {
                 name: format!("Left Side/{i}.jpg"),
                 camera: camera(300.0),
                 world_from_camera: world_from_front * front_from_left,
+                time_us: None,
             });
         }
         (images, [front, left])
@@ -349,11 +410,37 @@ mod tests {
     fn options() -> CaptureOptions {
         CaptureOptions {
             name: "capture".into(),
-            fps: 10.0,
+            fps: None,
             camera_height_m: Some(1.5),
             reference: Some("front".into()),
             cameras: Vec::new(),
         }
+    }
+
+    #[test]
+    fn times_of_the_images_are_those_of_the_drive() {
+        let (mut images, _) = images();
+        for image in &mut images {
+            let number: i64 = parts(&image.name).1.parse().unwrap();
+            // Taken in the order of falling numbers.
+            image.time_us = Some(9_000_000 - 500_000 * number);
+        }
+        let made = captured_drive(&images, &Alignment::IDENTITY, &options()).unwrap();
+        let keyframes = &made.trajectory.keyframes;
+        let times_us: Vec<i64> = keyframes.iter().map(|keyframe| keyframe.time_us).collect();
+        assert_eq!(times_us, (0..12).map(|i| 500_000 * i).collect::<Vec<_>>());
+        assert!(keyframes[11].world_from_rig.position_m.length() < 1e-9);
+
+        let refused = |images: &[PosedImage], fps| {
+            let options = CaptureOptions { fps, ..options() };
+            captured_drive(images, &Alignment::IDENTITY, &options).unwrap_err().to_string()
+        };
+        assert!(refused(&images, Some(10.0)).contains("leave out --fps"));
+        let front = images.iter().position(|image| image.name == "front/3.png").unwrap();
+        images[front].time_us = Some(9_000_000);
+        assert!(refused(&images, None).contains("the same time_us"));
+        images[front].time_us = None;
+        assert!(refused(&images, None).starts_with("\"front/3.png\" has no time_us"));
     }
 
     #[test]
@@ -419,7 +506,9 @@ mod tests {
         };
         let rear = CaptureOptions { reference: Some("rear".into()), ..options() };
         assert!(refused(rear).contains("\"Left Side\", \"front\""));
-        assert!(refused(CaptureOptions { fps: 0.0, ..options() }).contains("images a second"));
+        assert!(
+            refused(CaptureOptions { fps: Some(0.0), ..options() }).contains("images a second")
+        );
         assert!(refused(CaptureOptions { name: "A".into(), ..options() }).contains("not a name"));
         let mut other = images.clone();
         other.iter_mut().filter(|i| i.name.starts_with("Left")).for_each(|i| i.name += "x.png");

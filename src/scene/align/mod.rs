@@ -13,7 +13,9 @@ use crate::geometry::{Pose, PoseError};
 use crate::trajectory::Keyframe;
 use crate::{Gaussians, Trajectory};
 
-pub use capture::{CaptureOptions, CapturedDrive, CapturedDriveError, PosedImage, captured_drive};
+pub use capture::{
+    CaptureOptions, CapturedDrive, CapturedDriveError, DEFAULT_FPS, PosedImage, captured_drive,
+};
 pub use ground::{GroundError, GroundPlane, GroundSearch, SceneExtent, find_ground, scene_extent};
 pub use path::{DEFAULT_SPEED_M_S, PathError, drive_through};
 

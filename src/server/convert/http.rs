@@ -66,8 +66,19 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         lone.name = None;
     }
     let request_hash = blake3::hash(json!([&twin, &content]).to_string().as_bytes());
-    let http::NewPush { id, files, frame, base, cells, record, levels, profile, note, preview } =
-        body;
+    let http::NewPush {
+        id,
+        files,
+        frame,
+        base,
+        cells,
+        record,
+        levels,
+        profile,
+        note,
+        preview,
+        drop_bad,
+    } = body;
     let preview_poses = preview
         .poses
         .map(|poses| poses_of("golden.poses", &poses, wildcity_push::limits::PREVIEW_MAX_POSES));
@@ -94,6 +105,7 @@ pub(crate) fn new_push(twin: String, body: &[u8]) -> Result<PushRequest, Fault> 
         note,
         preview_poses: preview_poses.transpose()?,
         min_psnr_db: preview.min_psnr_db,
+        drop_bad,
     };
     request.check()?;
     Ok(request)
@@ -106,7 +118,7 @@ pub(super) fn requested_files(files: Vec<http::PushFile>) -> Result<Vec<Requeste
 }
 
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
-    let axes = SourceAxes::parse(&file.axes, file.scale);
+    let axes = SourceAxes::given(file.axes.as_deref(), file.scale);
     let axes = axes.map_err(|error| {
         let part = match error {
             IngestError::InvalidAxes { option: "--scale", .. } => "scale",
@@ -206,6 +218,8 @@ fn file(file: &FileReport) -> http::FileReport {
         gaussians: file.gaussians,
         bad: file.bad,
         first_bad: file.first_bad.iter().map(bad).collect(),
+        dropped: file.dropped,
+        warnings: file.warnings.clone(),
     }
 }
 

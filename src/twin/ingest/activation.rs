@@ -2,15 +2,12 @@
 
 use wildcity_scene::sh;
 
-use super::validate::LN_SCALE;
-
-/// Largest absolute logit. An opacity of 255/255 is 1, which has an infinite logit; the sigmoid of
-/// 20 is 1 in f32.
-const MAX_LOGIT: f64 = 20.0;
+use super::validate::{FULL_LOGIT, LN_SCALE};
 
 /// The logit of an opacity from 0 to 1; NaN outside of that, which validation refuses.
 pub(super) fn logit(opacity: f64) -> f32 {
-    (opacity / (1.0 - opacity)).ln().clamp(-MAX_LOGIT, MAX_LOGIT) as f32
+    let most = f64::from(FULL_LOGIT);
+    (opacity / (1.0 - opacity)).ln().clamp(-most, most) as f32
 }
 
 /// The natural logarithm of a standard deviation. Zero, to which narrow types round small ones,

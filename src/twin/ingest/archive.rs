@@ -8,17 +8,22 @@ use zip::result::ZipError;
 use crate::limits;
 use wildcity_scene::Gaussians;
 
+use super::notes::Reading;
 use super::objects::TrackedObject;
 use super::scene_files::SceneFiles;
 use super::unpack_budget::UnpackBudget;
 use super::{IngestError, nurec, sog};
 
 /// Reads the scene of an archive within a budget of nothing read, found by the first file in it of a known name.
-pub(super) fn read(bytes: Vec<u8>, budget: UnpackBudget) -> Result<Gaussians, IngestError> {
+pub(super) fn read(
+    bytes: Vec<u8>,
+    budget: UnpackBudget,
+    reading: &mut Reading,
+) -> Result<Gaussians, IngestError> {
     let mut archive = Archive::open(bytes, budget)?;
     if let Some(name) = archive.find(|name| name.ends_with(".nurec")) {
         let payload = archive.read(&name, limits::SCENE_PART_BYTES)?;
-        return nurec::read(&payload, archive.budget());
+        return nurec::read(&payload, archive.budget(), reading);
     }
     let Some(name) = archive.find(|name| sog::DESCRIPTIONS.contains(&name)) else {
         let reason = match archive.find(|name| name == "data.pkl") {
@@ -32,7 +37,7 @@ pub(super) fn read(bytes: Vec<u8>, budget: UnpackBudget) -> Result<Gaussians, In
     };
     let folder = name.rfind('/').map_or("", |slash| &name[..=slash]).to_owned();
     let json = archive.read(&name, limits::SCENE_JSON_BYTES)?;
-    sog::read(&json, &folder, &mut archive)
+    sog::read(&json, &folder, &mut archive, reading)
 }
 
 /// Reads the tracked objects of a NuRec archive; none of any other archive.

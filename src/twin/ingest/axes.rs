@@ -1,7 +1,7 @@
 //! Converts from the axes and unit of a file to a twin's: metres, x east, y north, z up.
 //!
-//! No format defines the axes of its coordinates (two PLY files may differ), so an import has
-//! options for them.
+//! Hardly any file says what its axes are (two PLY files may differ), so an import has options for them. An SPZ file may
+//! say it in an extension.
 
 use std::str::FromStr;
 
@@ -100,6 +100,27 @@ impl Axes {
         (!is_mirrored).then_some(Alignment { new_from_old, metres_per_unit })
     }
 
+    /// The rotation as `--axes` takes it: the name of a preset, or nine numbers.
+    pub fn option_text(&self) -> String {
+        let rows = self.twin_from_file.transpose().to_cols_array_2d();
+        match PRESETS.iter().find(|(.., preset)| *preset == rows) {
+            Some((name, ..)) => (*name).to_owned(),
+            // Adding 0 makes a plain zero of a negative one.
+            None => rows
+                .as_flattened()
+                .iter()
+                .map(|n| (n + 0.0).to_string())
+                .collect::<Vec<_>>()
+                .join(" "),
+        }
+    }
+
+    /// Whether the rotation is that of other axes, whatever the unit.
+    pub fn has_rotation_of(&self, other: &Self) -> bool {
+        let off = self.twin_from_file - other.twin_from_file;
+        off.to_cols_array().iter().all(|e| e.abs() <= Self::MAX_ERROR)
+    }
+
     /// Rotates and then scales Gaussians in place. The identity changes no bit.
     ///
     /// A reflection `M` moves each ellipsoid as the rotation `-M` does, because an ellipsoid equals
@@ -126,6 +147,7 @@ impl Axes {
         for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
             turn.apply(colour);
         }
+        gaussians.clamp_coefficients();
     }
 }
 

@@ -1,6 +1,6 @@
 //! Camera lists: JSON files of views in the scene's own axes, and perhaps of their images.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use glam::{DMat3, DQuat};
@@ -113,6 +113,17 @@ pub enum CamerasError {
         /// `shutter`, `exposure` or `overlay`.
         field: &'static str,
     },
+    /// A field in which other programs describe a lens.
+    #[error(
+        "camera {name:?}: {field} is not a field of a camera list: give \"lens\", such as {{\"model\": \"opencv\", \"k\": \
+         [..]}}, or leave {field} out"
+    )]
+    OtherLens {
+        /// The camera's name.
+        name: String,
+        /// The field.
+        field: &'static str,
+    },
     /// The size or an intrinsic cannot be used.
     #[error("camera {name:?}: {cause}")]
     Camera {
@@ -125,7 +136,7 @@ pub enum CamerasError {
 
 const NAME_RULE: &str = "must be 1 to 64 of A-Z a-z 0-9 . _ -, not starting with .";
 
-/// One entry of the JSON. Fields that are not listed here are ignored.
+/// One entry of the JSON.
 #[derive(Deserialize)]
 struct Entry {
     name: String,
@@ -149,7 +160,23 @@ struct Entry {
     position_ply: Option<[f64; 3]>,
     #[serde(rename = "R_world_to_cam")]
     rotation: [[f64; 3]; 3],
+    #[serde(flatten)]
+    others: BTreeMap<String, IgnoredAny>,
 }
+
+/// Fields of other programs' cameras that change the picture. Others are ignored.
+const REFUSED_FIELDS: [&str; 10] = [
+    "camera_model",
+    "distortion",
+    "distortion_params",
+    "is_fisheye",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+];
 
 /// Reads a camera list: one object, one object a line (JSON Lines), or a list of objects.
 ///
@@ -199,6 +226,10 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     ];
     if let Some((field, _)) = of_rigs.into_iter().find(|(_, given)| *given) {
         return Err(CamerasError::RigCameraField { name, field });
+    }
+    if let Some(field) = REFUSED_FIELDS.into_iter().find(|field| entry.others.contains_key(*field))
+    {
+        return Err(CamerasError::OtherLens { name, field });
     }
     let position = match (entry.position, entry.position_ply) {
         (Some(position), None) | (None, Some(position)) => position,

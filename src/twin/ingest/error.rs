@@ -106,11 +106,11 @@ pub enum IngestError {
         count: u64,
     },
     /// Gaussians that no renderer can draw.
-    #[error("{0}")]
+    #[error(transparent)]
     Values(#[from] BadGaussians),
     /// A sky that cannot be drawn.
     #[error("sky: {0}")]
-    Sky(#[from] SkyError),
+    Sky(SkyError),
     /// `--axes` or `--scale` cannot be used.
     #[error("{option} {given:?}: {reason}")]
     InvalidAxes {
@@ -121,6 +121,13 @@ pub enum IngestError {
         /// The error, and the accepted values.
         reason: String,
     },
+}
+
+// Not `#[from]`, which would make it the source, too, and a message with its sources would say it twice.
+impl From<SkyError> for IngestError {
+    fn from(error: SkyError) -> Self {
+        Self::Sky(error)
+    }
 }
 
 impl From<io::Error> for IngestError {

@@ -13,7 +13,8 @@ use half::f16;
 
 use wildcity_scene::{Gaussians, sh};
 
-use super::validate::{self, Field};
+use super::notes::Reading;
+use super::validate::Field;
 use super::{IngestError, activation, check_count};
 
 const FORMAT: &str = ".ksplat";
@@ -27,7 +28,11 @@ const POSITION_RANGE: u32 = 32767;
 const SH_RANGE: f32 = 1.5;
 
 /// Reads a file of a known size.
-pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, IngestError> {
+pub(super) fn read(
+    mut input: impl Read,
+    file_bytes: u64,
+    reading: &mut Reading,
+) -> Result<Gaussians, IngestError> {
     let header = Header::read(&mut input)?;
     let headers_bytes =
         HEADER_BYTES as u128 + u128::from(header.sections) * SECTION_HEADER_BYTES as u128;
@@ -59,8 +64,7 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
         let part = section.decode(&mut input, &header)?;
         all.append(&part);
     }
-    validate::check(&all, &Field::plain_name)?;
-    Ok(all)
+    reading.accept(all, &Field::plain_name)
 }
 
 struct Header {

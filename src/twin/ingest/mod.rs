@@ -20,6 +20,7 @@ mod file;
 mod gltf;
 mod hash_reader;
 mod ksplat;
+mod notes;
 mod nurec;
 mod objects;
 mod ply;
@@ -45,6 +46,7 @@ use wildcity_scene::Gaussians;
 pub use axes::Axes;
 pub use error::IngestError;
 pub use file::{FileError, read_whole};
+pub use notes::{Antialiasing, FileAxes, FileNotes};
 pub use objects::TrackedObject;
 pub use progress::Progress;
 pub use read_limits::{ReadLimits, StopFlag};
@@ -55,6 +57,7 @@ pub use wildcity_scene::validate::{self, BadGaussian, BadGaussians};
 
 use error::check_count;
 use hash_reader::HashReader;
+use notes::Reading;
 use progress::ProgressReader;
 use scene_files::PartFiles;
 use unpack_budget::UnpackBudget;
@@ -95,6 +98,8 @@ pub struct ReadScene {
     pub hash: String,
     /// The names of the files that the given one names.
     pub parts: BTreeSet<String>,
+    /// What the files say besides the Gaussians.
+    pub notes: FileNotes,
 }
 
 /// As [`read_hashed`], within limits.
@@ -109,40 +114,44 @@ pub fn read_limited(
     let (file, file_bytes) = file::open(path)?;
     let mut input =
         BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
+    let mut reading = Reading::new(limits.drop_bad);
+    let reader = &mut reading;
     let gaussians = match Format::of(input.fill_buf()?)? {
         Format::Json => {
             let parts = PartFiles::new(path, limits, progress);
-            return read_parts(input, file_bytes, parts, MultiFileFormat::Json);
+            return read_parts(input, file_bytes, parts, reading, MultiFileFormat::Json);
         }
         Format::Glb => {
             let parts = PartFiles::new(path, limits, progress);
-            return read_parts(input, file_bytes, parts, MultiFileFormat::Glb);
+            return read_parts(input, file_bytes, parts, reading, MultiFileFormat::Glb);
         }
-        Format::Ply => ply::read(&mut input, file_bytes, progress)?,
-        Format::Safetensors => safetensors::read(&mut input, file_bytes, progress)?,
+        Format::Ply => ply::read(&mut input, file_bytes, reader, progress)?,
+        Format::Safetensors => safetensors::read(&mut input, file_bytes, reader, progress)?,
         Format::Spz => {
             let input = ProgressReader::new(&mut input, file_bytes, progress);
-            spz::read(input, file_bytes, UnpackBudget::new(limits))?
+            spz::read(input, file_bytes, UnpackBudget::new(limits), reader)?
         }
         Format::Gzip => {
             let input = ProgressReader::new(&mut input, file_bytes, progress);
-            spz::read_gzip(input, file_bytes, UnpackBudget::new(limits))?
+            spz::read_gzip(input, file_bytes, UnpackBudget::new(limits), reader)?
         }
         Format::Splat => {
-            splat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            splat::read(input, file_bytes, reader)?
         }
         Format::Ksplat => {
-            ksplat::read(ProgressReader::new(&mut input, file_bytes, progress), file_bytes)?
+            let input = ProgressReader::new(&mut input, file_bytes, progress);
+            ksplat::read(input, file_bytes, reader)?
         }
         Format::Zip => {
             let input = ProgressReader::new(&mut input, file_bytes, progress);
             let bytes = file::read_at_most(input, file_bytes, SCENE_PART_BYTES)?;
-            archive::read(bytes, UnpackBudget::new(limits))?
+            archive::read(bytes, UnpackBudget::new(limits), reader)?
         }
     };
     io::copy(&mut input, &mut io::sink())?;
     let hash = input.into_inner().finish();
-    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new() })
+    Ok(ReadScene { gaussians, hash, parts: BTreeSet::new(), notes: reading.into_notes() })
 }
 
 /// Whether a file is of a format in which it may name others.
@@ -166,6 +175,7 @@ fn read_parts(
     mut input: BufReader<HashReader<File>>,
     file_bytes: u64,
     mut parts: PartFiles<'_>,
+    mut reading: Reading,
     format: MultiFileFormat,
 ) -> Result<ReadScene, IngestError> {
     let limit_bytes = match format {
@@ -175,11 +185,14 @@ fn read_parts(
     let first = file::read_at_most(&mut input, file_bytes, limit_bytes)?;
     parts.add(first.len() as u64, input.into_inner().finish());
     let gaussians = match format {
-        MultiFileFormat::Glb => gltf::read_glb(&first, &mut parts)?,
-        MultiFileFormat::Json if gltf::is_likely(&first) => gltf::read(&first, None, &mut parts)?,
-        MultiFileFormat::Json => sog::read(&first, "", &mut parts)?,
+        MultiFileFormat::Glb => gltf::read_glb(&first, &mut parts, &mut reading)?,
+        MultiFileFormat::Json if gltf::is_likely(&first) => {
+            gltf::read(&first, None, &mut parts, &mut reading)?
+        }
+        MultiFileFormat::Json => sog::read(&first, "", &mut parts, &mut reading)?,
     };
-    Ok(ReadScene { gaussians, hash: parts.hash(), parts: parts.into_names() })
+    let notes = reading.into_notes();
+    Ok(ReadScene { gaussians, hash: parts.hash(), parts: parts.into_names(), notes })
 }
 
 /// The format of a file.

@@ -19,6 +19,8 @@ pub struct ReadLimits<'a> {
     /// About how many Gaussians the triangles of a mesh become; triangles smaller than one Gaussian's share add
     /// more. Scenes of Gaussians keep theirs.
     pub mesh_gaussians: u32,
+    /// Leaves out Gaussians outside their bounds; without it they are errors.
+    pub drop_bad: bool,
 }
 
 /// Tells readers of other threads to stop. Clones are one flag.
@@ -33,6 +35,7 @@ impl ReadLimits<'_> {
             memory_bytes: u64::MAX,
             stop: StopFlag::default(),
             mesh_gaussians: limits::MESH_GAUSSIANS,
+            drop_bad: false,
         }
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (ln), opacities [N] (logit), sh0 [N,1,3] and
 //! shN [N,K,3], or both in one as coeffs [N,1+K,3]. F32 throughout; means may be F64. Tensors of
-//! other names are skipped.
+//! other names are named in a warning, but for those of a sky and of tracked objects.
 
 use std::io::{self, Read};
 
@@ -12,6 +12,7 @@ use ::safetensors::tensor::{Metadata, TensorInfo};
 use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
+use super::notes::Reading;
 use super::validate::{self, Field};
 use super::{IngestError, Progress, check_count};
 
@@ -19,10 +20,28 @@ use super::{IngestError, Progress, check_count};
 pub(super) fn read(
     mut input: impl Read,
     file_bytes: u64,
+    reading: &mut Reading,
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
     let (metadata, body_start) = read_metadata(&mut input, file_bytes)?;
-    let mut plan = ReadPlan::of(&metadata)?;
+    let plan = ReadPlan::of(&metadata)?;
+    let skipped = plan.skipped(&metadata);
+    if !skipped.is_empty() {
+        reading.warn_skipped("tensors", &skipped.iter().map(String::as_str).collect::<Vec<_>>());
+    }
+    let one_tensor = plan.one_tensor;
+    let gaussians = read_tensors(input, body_start, file_bytes, plan, progress)?;
+    reading.accept(gaussians, &|field| file_name(field, one_tensor))
+}
+
+/// Reads the tensors of a plan, from front to back. The Gaussians are not checked.
+fn read_tensors(
+    input: impl Read,
+    body_start: u64,
+    file_bytes: u64,
+    mut plan: ReadPlan<'_>,
+    progress: Progress<'_>,
+) -> Result<Gaussians, IngestError> {
     let coefficients = sh::coefficients(plan.sh_degree);
     let mut gaussians = Gaussians::with_capacity(plan.sh_degree, plan.count);
     gaussians.sh.resize(3 * coefficients * plan.count, 0.0);
@@ -49,8 +68,6 @@ pub(super) fn read(
         }
     }
     (body.progress)(file_bytes, file_bytes);
-    let one_tensor = plan.one_tensor;
-    validate::check(&gaussians, &|field| file_name(field, one_tensor))?;
     Ok(gaussians)
 }
 
@@ -64,8 +81,13 @@ pub(super) fn read_tracked(
     // Tensors may be in any order, so the whole file is held, as that of a scene in parts.
     let mut bytes = Vec::new();
     input.take(limits::SCENE_PART_BYTES).read_to_end(&mut bytes)?;
-    let gaussians = read(&bytes[..], file_bytes, progress)?;
-    let (metadata, body_start) = read_metadata(&mut &bytes[..], file_bytes)?;
+    let mut file = &bytes[..];
+    let (metadata, body_start) = read_metadata(&mut file, file_bytes)?;
+    let plan = ReadPlan::of(&metadata)?;
+    let one_tensor = plan.one_tensor;
+    let mut gaussians = read_tensors(file, body_start, file_bytes, plan, progress)?;
+    gaussians.clamp_activations();
+    validate::check(&gaussians, &|field| file_name(field, one_tensor))?;
     let place = "tensor point_ids";
     let info = metadata.info("point_ids").ok_or_else(|| bad(place, "is missing".into()))?;
     let (start, end) = info.data_offsets;
@@ -116,6 +138,10 @@ struct ReadPlan<'a> {
     /// Whether all colours are in the tensor coeffs.
     one_tensor: bool,
 }
+
+/// Prefix of the tensors of a sky, which `--sky` reads, and names of those that only other readers need.
+const SKY_PREFIX: &str = "sky_head.";
+const OF_OTHER_READERS: [&str; 2] = ["appearance_embedding.weight", "point_ids"];
 
 /// The column of Gaussians that a tensor is read into.
 enum Column {
@@ -184,6 +210,20 @@ impl<'a> ReadPlan<'a> {
         let colours = colours.into_iter().enumerate();
         tensors.extend(colours.map(|(first, tensor)| (Column::Colours { first }, tensor)));
         Ok(Self { count: check_count(means.shape[0] as u64)?, sh_degree, tensors, one_tensor })
+    }
+
+    /// Names of the tensors that no reader of this program reads.
+    fn skipped(&self, metadata: &Metadata) -> Vec<String> {
+        let is_read = |name: &str| {
+            let info = metadata.info(name);
+            info.is_some_and(|info| self.tensors.iter().any(|(_, read)| std::ptr::eq(*read, info)))
+        };
+        let is_skipped = |name: &String| {
+            !is_read(name)
+                && !name.starts_with(SKY_PREFIX)
+                && !OF_OTHER_READERS.contains(&name.as_str())
+        };
+        metadata.offset_keys().into_iter().filter(is_skipped).collect()
     }
 }
 

@@ -7,7 +7,8 @@ use std::io::Read;
 
 use wildcity_scene::Gaussians;
 
-use super::validate::{self, Field};
+use super::notes::Reading;
+use super::validate::Field;
 use super::{IngestError, activation, check_count};
 
 /// Bytes of a Gaussian.
@@ -28,7 +29,11 @@ pub(super) fn is_likely(start: &[u8]) -> bool {
 }
 
 /// Reads a file of a known size.
-pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, IngestError> {
+pub(super) fn read(
+    mut input: impl Read,
+    file_bytes: u64,
+    reading: &mut Reading,
+) -> Result<Gaussians, IngestError> {
     let count = file_bytes.div_ceil(RECORD_BYTES as u64);
     let promised = u128::from(count) * RECORD_BYTES as u128;
     if promised != u128::from(file_bytes) {
@@ -56,8 +61,7 @@ pub(super) fn read(mut input: impl Read, file_bytes: u64) -> Result<Gaussians, I
         gaussians.logit_opacities.push(activation::logit(opacity));
         gaussians.quats_wxyz.push(quat_wxyz(&record));
     }
-    validate::check(&gaussians, &Field::plain_name)?;
-    Ok(gaussians)
+    reading.accept(gaussians, &Field::plain_name)
 }
 
 /// Position and scales.

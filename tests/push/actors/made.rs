@@ -86,7 +86,7 @@ async fn classes_and_scales_are_those_asked_for() {
         (ActorClass::Object, "object"),
     ] {
         let mut asked = NewActor { class, ..actor_of(name, &[&id]) };
-        asked.files[0].scale = 0.5;
+        asked.files[0].scale = Some(0.5);
         let made = client.push_actor(&asked).await.unwrap();
         assert_eq!((made.class, made.box_.length_m), (class, 0.5 * whole.box_.length_m));
         assert_eq!(get(&server, &format!("/v1/actors/{name}")).await.body["class"], name);
@@ -101,7 +101,7 @@ async fn a_pushed_vehicle_is_that_of_an_import() {
     let axes = "0 0 1 1 0 0 0 1 0";
     let wanted = imported(&truck, "truck", axes, RecordFormat::default(), 20_000);
     let mut asked = actor_of("truck", &[&upload(&client, &truck).await]);
-    asked.files[0].axes = axes.to_owned();
+    asked.files[0].axes = Some(axes.to_owned());
     asked.gaussians = Some(20_000);
     let made = client.push_actor(&asked).await.unwrap();
     assert_eq!(made.hash, wanted.hash);

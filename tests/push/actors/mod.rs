@@ -28,8 +28,8 @@ pub(super) fn ball(count: usize, seed: u64) -> Gaussians {
 pub(super) fn actor_of(name: &str, uploads: &[&str]) -> NewActor {
     let file = |id: &&str| PushFile {
         upload: (*id).to_owned(),
-        axes: "identity".to_owned(),
-        scale: 1.0,
+        axes: Some("identity".to_owned()),
+        scale: Some(1.0),
         name: None,
     };
     NewActor {

@@ -6,8 +6,10 @@
 
 A checkpoint's sky network is written to the same file: `wildcity import street.safetensors --sky
 street.safetensors` reads both. The last of these commands writes the moving objects, with the number of the object
-that each Gaussian belongs to: `wildcity actor import cars.safetensors --tracked` makes an asset of each. Supported are the checkpoints of gsplat (`splats`), drivestudio (`models`, of which
-one is converted), nerfstudio's splatfacto and INRIA (a tuple). Conversion needs numpy but not PyTorch, and runs no
+that each Gaussian belongs to: `wildcity actor import cars.safetensors --tracked` makes an asset of each. Supported are
+the checkpoints of gsplat (`splats`), drivestudio (`models`, of which one is converted), street_gaussians (`background`
+and one model per object, likewise), nerfstudio's splatfacto, INRIA (a tuple), and 3dgrut, whose particles are Gaussians
+only if they were trained with `render.particle_kernel_degree=2`. Conversion needs numpy but not PyTorch, and runs no
 code from the file.
 """
 
@@ -19,6 +21,7 @@ import os
 import struct
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Any
 
@@ -27,21 +30,23 @@ import numpy.typing as npt
 
 from .checkpoint import CheckpointError, load
 
-__all__ = ["CheckpointError", "convert", "load", "models", "sky", "splats"]
+__all__ = ["CheckpointError", "convert", "load", "models", "skipped", "sky", "splats"]
 
 _FIELD_NAMES = {
-    "means": ("means", "xyz"),
+    "means": ("means", "xyz", "positions"),
     "quats": ("quats", "rotation"),
-    "scales": ("scales", "scaling"),
-    "opacities": ("opacities", "opacity"),
-    "sh0": ("sh0", "features_dc"),
-    "shN": ("shN", "features_rest"),
+    "scales": ("scales", "scaling", "scale"),
+    "opacities": ("opacities", "opacity", "density"),
+    "sh0": ("sh0", "features_dc", "feature_dc", "features_albedo"),
+    "shN": ("shN", "features_rest", "feature_rest", "features_specular"),
     "point_ids": ("point_ids", "points_ids"),
 }
 """gsplat's names of the fields, and all names of the same field in other checkpoints."""
 
 _SKY_TENSORS = [f"sky_head.layers.{layer}.{part}" for layer in range(3) for part in ("weight", "bias")]
 """Tensors of drivestudio's SkyModel; it may also have `appearance_embedding.weight`."""
+
+_TRAINERS = "gsplat, drivestudio, street_gaussians, splatfacto, INRIA or 3dgrut"
 
 _Arrays = dict[str, npt.NDArray[Any]]
 
@@ -59,24 +64,34 @@ def convert(
     return len(tensors["means"])
 
 
+def skipped(source: str | PathLike[str], model: str | None = None) -> list[str]:
+    """Names of the arrays of a model that are not converted, such as `semantic`."""
+    return _chosen(source, model)[1].skipped
+
+
 def splats(source: str | PathLike[str], model: str | None = None) -> _Arrays:
     """The Gaussians of a checkpoint, with gsplat's names and shapes.
 
     means [N,3], quats [N,4] (w, x, y, z), scales [N,3] (natural logarithm), opacities [N] (logit), sh0 [N,1,3],
     shN [N,K,3]; of drivestudio's RigidNodes also point_ids [N], the object of each Gaussian. Raises `CheckpointError` if there is no such model, or several and `model` is None.
     """
-    found = models(source)
+    name, found = _chosen(source, model)
+    return _shaped_of(source, name, found.arrays)
+
+
+def _chosen(source: str | PathLike[str], model: str | None) -> tuple[str, _Found]:
+    """The model of a name, or the only one."""
+    found = _found(source)
+    if not found:
+        raise CheckpointError(f"{source} has no Gaussians of {_TRAINERS}")
+    names = ", ".join(repr(name) for name in found)
     if model is None:
         if len(found) != 1:
-            if not found:
-                raise CheckpointError(f"{source} has no Gaussians of gsplat, drivestudio, splatfacto or INRIA")
-            names = ", ".join(repr(name) for name in found)
             raise CheckpointError(f"{source} has several models: choose one of {names} (--model)")
-        return next(iter(found.values()))
+        return next(iter(found.items()))
     if model not in found:
-        names = ", ".join(repr(name) for name in found)
         raise CheckpointError(f"{source}: there is no model {model!r}, only {names}")
-    return found[model]
+    return model, found[model]
 
 
 def sky(source: str | PathLike[str]) -> _Arrays:
@@ -108,16 +123,43 @@ def _mappings(value: Any, depth: int = 0) -> Iterator[Mapping[str, Any]]:
 
 def models(source: str | PathLike[str]) -> dict[str, _Arrays]:
     """All models of Gaussians of a checkpoint, by name, each as `splats` returns it."""
-    found: dict[str, _Arrays] = {}
-    for name, arrays in _candidates(load(source), ""):
-        try:
-            found[name or "splats"] = _shaped(arrays)
-        except CheckpointError as error:
-            raise CheckpointError(f"{source}, model {name!r}: {error}") from error
-    return found
+    return {name: _shaped_of(source, name, found.arrays) for name, found in _found(source).items()}
 
 
-def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _Arrays]]:
+@dataclass
+class _Found:
+    """Arrays of a model: of the known fields by gsplat's names, and the names of the others."""
+
+    arrays: _Arrays = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+
+
+def _found(source: str | PathLike[str]) -> dict[str, _Found]:
+    """All models of a checkpoint, as they are in the file."""
+    saved = load(source)
+    _check_kernel(source, saved)
+    return {name or "splats": found for name, found in _candidates(saved, "")}
+
+
+def _shaped_of(source: str | PathLike[str], name: str, arrays: _Arrays) -> _Arrays:
+    try:
+        return _shaped(arrays)
+    except CheckpointError as error:
+        raise CheckpointError(f"{source}, model {name!r}: {error}") from error
+
+
+def _check_kernel(source: str | PathLike[str], saved: Any) -> None:
+    """3dgrut's default ray tracer trains particles of degree 4, which are no Gaussians."""
+    for values in _mappings(saved):
+        degree = values.get("particle_kernel_degree", 2)
+        if degree != 2:
+            raise CheckpointError(
+                f"{source}: render.particle_kernel_degree is {degree!r}; only particles of degree 2 are Gaussians: "
+                "train with render.particle_kernel_degree=2"
+            )
+
+
+def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _Found]]:
     """All groups of arrays that have every field of Gaussians, with their path in the checkpoint."""
     if depth > 8:
         return
@@ -127,18 +169,30 @@ def _candidates(value: Any, name: str, depth: int = 0) -> Iterator[tuple[str, _A
         value = dict(zip(keys, value[0][1:7], strict=False))
     if not isinstance(value, Mapping):
         return
-    groups: dict[str, _Arrays] = {}
+    groups: dict[str, _Found] = {}
     for key, item in value.items():
         if isinstance(key, str) and isinstance(item, np.ndarray):
-            prefix, _, field = key.rpartition(".")
-            known = (ours for ours, theirs in _FIELD_NAMES.items() if field.lstrip("_") in theirs)
+            prefix, _, last = key.rpartition(".")
+            group = groups.setdefault(prefix, _Found())
+            known = [ours for ours, theirs in _FIELD_NAMES.items() if last.lstrip("_") in theirs]
             for ours in known:
-                groups.setdefault(prefix, {})[ours] = item
+                group.arrays[ours] = item
+            if not known:
+                group.skipped.append(key)
         elif isinstance(key, str):
             yield from _candidates(item, key, depth + 1)
-    for prefix, arrays in groups.items():
-        if _FIELD_NAMES.keys() - {"shN", "point_ids"} <= arrays.keys():
-            yield ".".join(part for part in (name, prefix) if part), arrays
+    for prefix, found in groups.items():
+        if _FIELD_NAMES.keys() - {"shN", "point_ids"} <= found.arrays.keys():
+            _cut_to_active(found.arrays, value.get("n_active_features"))
+            yield ".".join(part for part in (name, prefix) if part), found
+
+
+def _cut_to_active(arrays: _Arrays, degree: Any) -> None:
+    """3dgrut stores coefficients of all degrees, and says the highest one that its training had reached."""
+    rest = arrays.get("shN")
+    if isinstance(degree, int) and degree >= 0 and rest is not None and len(rest):
+        coefficients = (degree + 1) ** 2 - 1
+        arrays["shN"] = rest.reshape(len(rest), -1)[:, : 3 * coefficients]
 
 
 def _shaped(arrays: _Arrays) -> _Arrays:
@@ -158,7 +212,9 @@ def _shaped(arrays: _Arrays) -> _Arrays:
     shaped = {}
     for name, (values, shape) in wanted.items():
         if values.size != np.prod(shape) or (values.ndim > 0 and len(values) != n):
-            raise CheckpointError(f"{name} has shape {values.shape}, not {shape}")
+            changing = name == "sh0" and values.ndim == 3 and values.shape[1] > 1
+            reason = ": colours that change with time (fourier_dim above 1) are not read" if changing else ""
+            raise CheckpointError(f"{name} has shape {values.shape}, not {shape}{reason}")
         if not np.issubdtype(values.dtype, np.floating):
             raise CheckpointError(f"{name} is {values.dtype}, not a floating-point number")
         is_double = name == "means" and values.dtype == np.float64
@@ -204,15 +260,18 @@ def main(arguments: list[str] | None = None) -> int:
     """The command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m wildcity.convert", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("source", help="checkpoint of gsplat, drivestudio, splatfacto or INRIA")
+    parser.add_argument("source", help=f"checkpoint of {_TRAINERS}")
     parser.add_argument("target", help="safetensors file to write")
     parser.add_argument("--model", help="name of the model to convert, if there are several")
     chosen = parser.parse_args(arguments)
     try:
+        left_out = skipped(chosen.source, chosen.model)
         count = convert(chosen.source, chosen.target, chosen.model)
     except CheckpointError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+    if left_out:
+        print(f"warning: not converted: {', '.join(left_out)}", file=sys.stderr)
     print(f"{chosen.target}: {count} Gaussians")
     return 0
 

@@ -63,8 +63,8 @@ def push(
     twin: str,
     server: str = "http://127.0.0.1:8080",
     token: str | None = None,
-    axes: str = "identity",
-    scale: float = 1.0,
+    axes: str | None = None,
+    scale: float | None = None,
     frame: Literal["twin", "capture"] | None = None,
     cells: Literal["all"] | Sequence[tuple[int, int]] | None = None,
     base: int | None = None,
@@ -73,6 +73,7 @@ def push(
     profile: Sequence[str] = (),
     note: str | None = None,
     min_psnr_db: float | None = None,
+    drop_bad: bool = False,
     push_id: str | None = None,
     progress: Callable[[PushProgress], None] | None = None,
     timeout: float = 60.0,
@@ -84,7 +85,8 @@ def push(
     twin: name of the twin; it is created if it does not exist.
     server: `http://HOST:PORT` or `https://HOST:PORT`.
     token: for a server that was started with tokens; the default is `$WILDCITY_TOKEN`.
-    axes, scale: axis convention and metres per unit of the files, as in `wildcity import`.
+    axes, scale: axis convention and metres per unit of the files, as in `wildcity import`. The default is the axes that a
+        file records, or those with which the twin was imported.
     frame: "twin", which is the default, or "capture": the axes and the unit with which the capture was imported, before
         `wildcity twin align`. `report["frame"]` is the frame that was used; `report["aligned"]` is true if they differ.
     cells: the 64 m cells (x, y) to replace, or "all"; the default is those that contain Gaussians of the files.
@@ -93,11 +95,12 @@ def push(
         `["near=0.2"]`, and a description for people, of up to 1,000 characters.
     min_psnr_db: refuse the push if a view along the twin's drives has a lower PSNR than this, in dB, or if no view
         shows anything.
+    drop_bad: leave out Gaussians that cannot be drawn; otherwise the push is refused if there are any.
     push_id: id of the push; sending the same id again does not make a second version.
     progress: is called with every change of the progress.
     timeout: how long one HTTP answer may take, in seconds.
 
-    An interrupted upload continues where it stopped.
+    An interrupted upload continues where it stopped. What of a file is not read is a warning of Python.
 
     Raises `PushFailed` if the scene is refused, `Refused` if a request is refused, and `ConnectFailed` if the
     server does not answer; `ValueError` if `cells` or a SOG cannot be understood, and `OSError` if a file cannot be read.
@@ -114,6 +117,8 @@ def push(
     }
     if min_psnr_db is not None:
         request["golden"] = {"min_psnr_db": min_psnr_db}
+    if drop_bad:
+        request["drop_bad"] = True
     optional = {"frame": frame, "cells": wanted_cells, "base": base, "record": record, "note": note}
     request |= {name: value for name, value in optional.items() if value is not None}
     path = f"/v1/twins/{urllib.parse.quote(twin, safe='')}/pushes"
@@ -125,6 +130,9 @@ def push(
         report(PushProgress(answer["state"], counts["done"], counts["total"]))
         if answer["state"] in ("ready", "refused", "failed"):
             push = _finished_push(answer)
+            for file in push.report.get("files", []):
+                for warning in file.get("warnings", []):
+                    warnings.warn(f"{file['name']}: {warning}", stacklevel=2)
             if frame is None and push.report.get("aligned"):
                 warnings.warn(
                     f"version {push.version} of twin {twin}: the twin was aligned, and the files were taken to be in its "
@@ -219,8 +227,8 @@ def _checked_cells(
 def upload_all(
     http_client: HttpClient,
     paths: Sequence[str | os.PathLike[str]],
-    axes: str,
-    scale: float,
+    axes: str | None,
+    scale: float | None,
     report: Callable[[PushProgress], None],
 ) -> list[dict[str, Any]]:
     """Uploads files, and returns them in the form that a request needs. A file in a subfolder next to the first file is
@@ -232,7 +240,9 @@ def upload_all(
         folder = Path(paths[0]).parent
         is_beside = sent == path and path.is_relative_to(folder)
         name = path.relative_to(folder).as_posix() if is_beside else sent.name
-        files.append({"upload": upload, "axes": axes, "scale": scale, "name": name})
+        given = {"axes": axes, "scale": scale}
+        given = {field: value for field, value in given.items() if value is not None}
+        files.append({"upload": upload, **given, "name": name})
     return files
 
 

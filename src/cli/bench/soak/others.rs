@@ -86,8 +86,8 @@ impl Pusher {
             let write = move || fs::write(file, splat(self.at_m, pushes));
             tokio::task::spawn_blocking(write).await??;
             let upload = client.upload(&path, &mut |_, _| ()).await?;
-            let file =
-                PushFile { upload: upload.id, axes: "identity".to_owned(), scale: 1.0, name: None };
+            let axes = Some("identity".to_owned());
+            let file = PushFile { upload: upload.id, axes, scale: Some(1.0), name: None };
             let push = NewPush {
                 id: None,
                 files: vec![file],
@@ -99,6 +99,7 @@ impl Pusher {
                 profile: Vec::new(),
                 note: Some(format!("push {pushes} of a soak")),
                 preview: PreviewRequest::default(),
+                drop_bad: false,
             };
             let begun = client.push(&self.twin, &push).await?;
             let ended = client.wait_for_push(begun, &mut |_| ()).await?;

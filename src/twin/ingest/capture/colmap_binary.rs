@@ -97,9 +97,10 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
         let size = [bytes.u64()?, bytes.u64()?];
         let Some(model) = MODELS.iter().find(|model| model.id == number) else {
             return Err(bytes.wrong(format!(
-                "camera {id}: model {number} is not one of COLMAP's: is it a cameras.bin of COLMAP?"
+                "camera {id}: model {number} is not one of COLMAP's up to version 4: is it a cameras.bin of COLMAP?"
             )));
         };
+        model.check_supported().map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
         let parameters: Result<Vec<f64>, _> = (0..model.parameters).map(|_| bytes.f64()).collect();
         let camera = model.camera(size, &parameters?);
         let camera = camera.map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
@@ -134,7 +135,7 @@ fn read_images(
                 cameras_path.display()
             )));
         };
-        images.push(PosedImage { name, camera: *camera, world_from_camera });
+        images.push(PosedImage { name, camera: *camera, world_from_camera, time_us: None });
     }
     bytes.check_end()?;
     if images.is_empty() {

@@ -22,7 +22,8 @@ const fn model(id: i32, name: &'static str, parameters: usize) -> Model {
     Model { id, name, parameters }
 }
 
-pub(super) const MODELS: [Model; 12] = [
+/// All models of COLMAP 4. Those without parameters here are not supported.
+pub(super) const MODELS: [Model; 18] = [
     model(0, "SIMPLE_PINHOLE", 3),
     model(1, "PINHOLE", 4),
     model(2, "SIMPLE_RADIAL", 4),
@@ -30,14 +31,34 @@ pub(super) const MODELS: [Model; 12] = [
     model(4, "OPENCV", 8),
     model(5, "OPENCV_FISHEYE", 8),
     model(6, "FULL_OPENCV", 12),
-    model(7, "FOV", 5),
+    model(7, "FOV", 0),
     model(8, "SIMPLE_RADIAL_FISHEYE", 4),
     model(9, "RADIAL_FISHEYE", 5),
-    model(10, "THIN_PRISM_FISHEYE", 12),
-    model(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    model(10, "THIN_PRISM_FISHEYE", 0),
+    model(11, "RAD_TAN_THIN_PRISM_FISHEYE", 0),
+    model(12, "SIMPLE_DIVISION", 0),
+    model(13, "DIVISION", 0),
+    model(14, "SIMPLE_FISHEYE", 3),
+    model(15, "FISHEYE", 4),
+    model(16, "EUCM", 0),
+    model(17, "EQUIRECTANGULAR", 0),
 ];
 
 impl Model {
+    /// # Errors
+    /// The model is one of COLMAP's that has no lens here.
+    pub(super) fn check_supported(&self) -> Result<(), String> {
+        if self.parameters == 0 { Err(self.unsupported()) } else { Ok(()) }
+    }
+
+    fn unsupported(&self) -> String {
+        format!(
+            "the camera model {} is not supported: `colmap image_undistorter` writes images and a model of PINHOLE \
+             cameras",
+            self.name
+        )
+    }
+
     /// The camera with these parameters; `size` is in pixels.
     pub(super) fn camera(&self, size: [u64; 2], parameters: &[f64]) -> Result<Camera, String> {
         let pinhole = |fx, fy, cx, cy| Pinhole { fx, fy, cx, cy };
@@ -61,18 +82,15 @@ impl Model {
             ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
                 (pinhole(fx, fy, cx, cy), fisheye([k1, k2, k3, k4]))
             }
+            ("SIMPLE_FISHEYE", &[f, cx, cy]) => (pinhole(f, f, cx, cy), fisheye([0.0; 4])),
+            ("FISHEYE", &[fx, fy, cx, cy]) => (pinhole(fx, fy, cx, cy), fisheye([0.0; 4])),
             ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k]) => {
                 (pinhole(f, f, cx, cy), fisheye([k, 0.0, 0.0, 0.0]))
             }
             ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => {
                 (pinhole(f, f, cx, cy), fisheye([k1, k2, 0.0, 0.0]))
             }
-            (name, _) => {
-                return Err(format!(
-                    "the camera model {name} is not supported: `colmap image_undistorter` writes images and a model \
-                     of PINHOLE cameras"
-                ));
-            }
+            _ => return Err(self.unsupported()),
         };
         let side = |px: u64| u32::try_from(px).unwrap_or(u32::MAX);
         let [width_px, height_px] = size.map(side);

@@ -48,6 +48,7 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<u64, Camera>, CaptureError> {
         let Some(model) = MODELS.iter().find(|model| model.name == *name) else {
             return Err(wrong(format!("{name:?} is not a camera model of COLMAP; {FORM}")));
         };
+        model.check_supported().map_err(wrong)?;
         if parameters.len() != model.parameters {
             let (given, needed) = (parameters.len(), model.parameters);
             return Err(wrong(format!("{given} parameters; {name} has {needed}")));
@@ -99,7 +100,12 @@ fn read_images(
             )));
         };
         let world_from_camera = pose([qw, qx, qy, qz], [tx, ty, tz]).map_err(wrong)?;
-        images.push(PosedImage { name: name.to_owned(), camera: *camera, world_from_camera });
+        images.push(PosedImage {
+            name: name.to_owned(),
+            camera: *camera,
+            world_from_camera,
+            time_us: None,
+        });
         lines.next();
     }
     if images.is_empty() {

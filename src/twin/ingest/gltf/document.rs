@@ -11,6 +11,9 @@ use super::EXTENSION;
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Document {
+    /// Extensions without which the document is another scene.
+    #[serde(default)]
+    pub(super) extensions_required: Vec<String>,
     pub(super) scene: Option<usize>,
     #[serde(default)]
     pub(super) scenes: Vec<Scene>,
@@ -58,10 +61,21 @@ pub(super) struct Primitive {
 }
 
 impl Primitive {
-    /// The extension that compresses the attributes, if there is one.
-    pub(super) fn compressed_by(&self) -> Option<&str> {
+    /// The extension that compresses the attributes, if there is one, and its settings.
+    pub(super) fn compressed_by(&self) -> Option<(&str, &Value)> {
         let inner = self.extensions.get(EXTENSION)?.get("extensions")?.as_object()?;
-        inner.keys().map(String::as_str).find(|name| name.contains("compression"))
+        let mut inner = inner.iter().map(|(name, settings)| (name.as_str(), settings));
+        inner.find(|(name, _)| name.contains("compression"))
+    }
+}
+
+impl Document {
+    /// The bytes of a buffer view; `None` if it does not exist, or does not fit its buffer.
+    pub(super) fn view_bytes<'a>(&self, buffers: &[&'a [u8]], index: usize) -> Option<&'a [u8]> {
+        let view = self.buffer_views.get(index)?;
+        let start = usize::try_from(view.byte_offset).ok()?;
+        let end = start.checked_add(usize::try_from(view.byte_length).ok()?)?;
+        buffers.get(view.buffer)?.get(start..end)
     }
 }
 

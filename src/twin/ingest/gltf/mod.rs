@@ -4,8 +4,8 @@
 //! read, with the transforms of its nodes: POSITION, ROTATION (x, y, z, w), SCALE, OPACITY (0 to 1)
 //! and SH_DEGREE_l_COEF_n, or COLOR_0 where there are none. SCALE is a standard deviation; in
 //! earlier drafts it was its logarithm, which is detected by negative values: no standard deviation
-//! is negative. Kernel, colour space, projection, and sorting are ignored, as the extension allows;
-//! the render profile describes how the trainer rendered.
+//! is negative. Other kernels, colour spaces and projections than those that are drawn are named in a warning. Splats that
+//! KHR_gaussian_splatting_compression_spz_2 compresses are read as SPZ.
 //!
 //! The triangles of a scene without splats are covered with flat Gaussians (`mesh.rs`).
 
@@ -14,22 +14,39 @@ mod document;
 mod instances;
 mod material;
 mod mesh;
+mod splat_settings;
 mod triangle;
 mod uris;
 
 use std::collections::BTreeMap;
 
+use serde_json::Value;
+
 use wildcity_scene::{Gaussians, sh};
 
+use super::notes::Reading;
 use super::scene_files::SceneFiles;
-use super::validate::{self, Field};
-use super::{IngestError, activation, check_count};
+use super::validate::Field;
+use super::{IngestError, activation, check_count, spz};
 use accessor::Column;
 use document::{Document, Primitive};
 use uris::Uris;
 
 const FORMAT: &str = "glTF";
 const EXTENSION: &str = "KHR_gaussian_splatting";
+/// The extension whose buffer view is an SPZ of version 2.
+const SPZ: &str = "KHR_gaussian_splatting_compression_spz_2";
+/// Extensions that a document may require. Compressed buffer views are refused by their own names.
+const READ_EXTENSIONS: [&str; 8] = [
+    EXTENSION,
+    SPZ,
+    "EXT_meshopt_compression",
+    "KHR_draco_mesh_compression",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+];
 
 /// Whether JSON is glTF, in which an asset is required.
 pub(super) fn is_likely(json: &[u8]) -> bool {
@@ -48,7 +65,11 @@ pub(super) fn is_likely(json: &[u8]) -> bool {
 }
 
 /// Reads a binary glTF file, which is in memory.
-pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussians, IngestError> {
+pub(super) fn read_glb(
+    file: &[u8],
+    parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
+) -> Result<Gaussians, IngestError> {
     const JSON: u32 = u32::from_le_bytes(*b"JSON");
     const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
     let words: Vec<u32> =
@@ -93,7 +114,7 @@ pub(super) fn read_glb(file: &[u8], parts: &mut dyn SceneFiles) -> Result<Gaussi
         return Err(bad("chunks", reason));
     }
     let json = json.ok_or_else(|| bad("chunks", "there is no chunk JSON".into()))?;
-    read(json, buffer, parts)
+    read(json, buffer, parts, reading)
 }
 
 /// Reads a document, with the buffer within a GLB file.
@@ -101,9 +122,15 @@ pub(super) fn read(
     json: &[u8],
     own_buffer: Option<&[u8]>,
     parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let document: Document =
         serde_json::from_slice(json).map_err(|e| bad("JSON", e.to_string()))?;
+    let required = document.extensions_required.iter().map(String::as_str);
+    let skipped: Vec<&str> = required.filter(|name| !READ_EXTENSIONS.contains(name)).collect();
+    if !skipped.is_empty() {
+        reading.warn_skipped("required extensions", &skipped);
+    }
     // Buffers: from URIs, or within the GLB file.
     let mut uris = Uris::new(parts);
     let mut fetched = Vec::new();
@@ -139,7 +166,9 @@ pub(super) fn read(
             }
             found = true;
             let place = format!("node {}, primitive {index}", placed.node);
-            let mut part = read_primitive(&document, &buffers, primitive, &place, uris.parts())?;
+            splat_settings::check(primitive, reading);
+            let mut part =
+                read_primitive(&document, &buffers, primitive, &place, uris.parts(), reading)?;
             placed.apply(&mut part)?;
             all.append(&part);
             check_count(all.len() as u64)?;
@@ -148,8 +177,7 @@ pub(super) fn read(
     if !found {
         all = mesh::read(json, &placed, &buffers, &mut uris)?;
     }
-    validate::check(&all, &Field::plain_name)?;
-    Ok(all)
+    reading.accept(all, &Field::plain_name)
 }
 
 /// Reads one primitive, in the axes of its mesh.
@@ -159,9 +187,23 @@ fn read_primitive(
     primitive: &Primitive,
     place: &str,
     parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
-    if let Some(extension) = primitive.compressed_by() {
-        return Err(bad(place, format!("is compressed by {extension}; export it without")));
+    match primitive.compressed_by() {
+        Some((SPZ, settings)) => {
+            let view = settings.get("bufferView").and_then(Value::as_u64);
+            let bytes = view.and_then(|view| document.view_bytes(buffers, view as usize));
+            let bytes =
+                bytes.ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
+            let read = spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading);
+            // The axes are those of the glTF, whatever the SPZ within says.
+            reading.ignore_axes();
+            return read;
+        }
+        Some((extension, _)) => {
+            return Err(bad(place, format!("is compressed by {extension}; export it without")));
+        }
+        None => {}
     }
     let column = |name: &str, width: usize| {
         let index = primitive.attributes.get(name);

@@ -10,6 +10,7 @@
 //! payload's axes; the USD layers around it, which may rotate and move it, are not read.
 
 mod msgpack;
+mod settings;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
@@ -20,6 +21,7 @@ use half::f16;
 use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
+use super::notes::Reading;
 use super::objects::{self, TrackedObject};
 use super::unpack_budget::UnpackBudget;
 use super::validate::{self, Field};
@@ -29,24 +31,49 @@ use msgpack::Value;
 const FORMAT: &str = "NuRec";
 const LAYERS: &str = ".gaussians_nodes.";
 
+/// Fields of a layer that are read, or that hold nothing for the picture.
+const READ_FIELDS: [&str; 10] = [
+    "positions",
+    "rotations",
+    "scales",
+    "densities",
+    "features_albedo",
+    "features_specular",
+    "n_active_features",
+    "gaussian_cuboid_ids",
+    "extra_signal",
+    "shape",
+];
+
 /// Reads the static Gaussians of a payload.
-pub(super) fn read(payload: &[u8], budget: &mut UnpackBudget) -> Result<Gaussians, IngestError> {
+pub(super) fn read(
+    payload: &[u8],
+    budget: &mut UnpackBudget,
+    reading: &mut Reading,
+) -> Result<Gaussians, IngestError> {
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
     let payload = Payload::of(&root)?;
     let is_static = |name: &&str| payload.tracks_of(name).is_empty();
     let layers: Vec<&str> = payload.names.iter().copied().filter(is_static).collect();
+    let moving: Vec<&str> = payload.names.iter().copied().filter(|name| !is_static(name)).collect();
+    if !moving.is_empty() {
+        reading.warn_skipped("layers of moving objects", &moving);
+    }
     if layers.is_empty() {
         return Err(bad("a layer of static Gaussians", "is missing".into()));
     }
+    payload.warn_skipped(reading);
     let mut all = Gaussians::default();
     for name in layers {
         budget.check_stop()?;
+        if let Some(settings) = payload.settings.get(name) {
+            settings::warn_skipped(settings, name, reading);
+        }
         all.append(&payload.layer(name)?.read()?);
         check_count(all.len() as u64)?;
     }
-    validate::check(&all, &Field::plain_name)?;
-    Ok(all)
+    reading.accept(all, &Field::plain_name)
 }
 
 /// Reads the tracked objects of a payload: layers with tracks, split by track.
@@ -65,8 +92,9 @@ pub(super) fn read_tracked(
         }
         budget.check_stop()?;
         let layer = payload.layer(name)?;
-        let gaussians = layer.read()?;
+        let mut gaussians = layer.read()?;
         check_count(gaussians.len() as u64)?;
+        gaussians.clamp_activations();
         validate::check(&gaussians, &Field::plain_name)?;
         let ids = layer.cuboid_ids(gaussians.len(), tracks.len())?;
         let track = |id: i64| match tracks.get(usize::try_from(id).ok()?)? {
@@ -128,6 +156,18 @@ impl<'a> Payload<'a> {
         })
     }
 
+    /// Warns of what the model has besides the layers of Gaussians.
+    fn warn_skipped(&self, reading: &mut Reading) {
+        let is_read = |key: &&str| {
+            let field = key.strip_prefix(LAYERS).and_then(|rest| rest.rsplit('.').next());
+            field.is_some_and(|field| READ_FIELDS.contains(&field)) || *key == "._extra_state"
+        };
+        let skipped: Vec<&str> = self.fields.keys().copied().filter(|key| !is_read(key)).collect();
+        if !skipped.is_empty() {
+            reading.warn_skipped("entries of nre_data.state_dict", &skipped);
+        }
+    }
+
     /// The tracks of a layer; none for a static one.
     fn tracks_of(&self, layer: &str) -> &'a [Value<'a>] {
         match self.tracks.get(layer) {
@@ -139,29 +179,10 @@ impl<'a> Payload<'a> {
     /// A layer of Gaussians.
     fn layer(&self, name: &'a str) -> Result<Layer<'_>, IngestError> {
         if let Some(settings) = self.settings.get(name) {
-            check_activations(settings, name)?;
+            settings::check(settings, name)?;
         }
         Ok(Layer { fields: &self.fields, name })
     }
-}
-
-/// Checks that parameters have the activations that this reader assumes.
-fn check_activations(settings: &Value<'_>, layer: &str) -> Result<(), IngestError> {
-    let wanted = [
-        ("density_activation", "sigmoid"),
-        ("scale_activation", "exp"),
-        ("rotation_activation", "normalize"),
-    ];
-    for (key, wanted) in wanted {
-        match settings.get(key) {
-            Some(Value::Text(found)) if *found != wanted => {
-                let reason = format!("is {found:?}; {wanted:?} is read");
-                return Err(bad(&format!("config.layers.{layer}.{key}"), reason));
-            }
-            _ => (),
-        }
-    }
-    Ok(())
 }
 
 /// The arrays of one layer.

@@ -14,6 +14,7 @@ pub(super) enum Value<'a> {
     Text(&'a str),
     Bytes(&'a [u8]),
     Count(u64),
+    Bool(bool),
     Other,
 }
 
@@ -90,8 +91,9 @@ impl<'a> Parser<'a> {
             0x80..=0x8f => self.map(kind & 0x0f, depth)?,
             0x90..=0x9f => self.array(kind & 0x0f, depth)?,
             0xa0..=0xbf => self.text(kind & 0x1f)?,
-            // nil, false, true; small negative numbers.
-            0xc0 | 0xc2 | 0xc3 | 0xe0..=0xff => Value::Other,
+            0xc2 | 0xc3 => Value::Bool(kind == 0xc3),
+            // nil; small negative numbers.
+            0xc0 | 0xe0..=0xff => Value::Other,
             0xc4..=0xc6 => {
                 let length = self.number(1 << (kind - 0xc4))?;
                 Value::Bytes(self.take(length)?)

@@ -13,7 +13,8 @@ use wildcity_scene::{Gaussians, sh};
 use super::header::{Element, Header, Property, error};
 use super::{Body, degree, file_name};
 use crate::ingest::activation;
-use crate::ingest::validate::{self, Field};
+use crate::ingest::notes::Reading;
+use crate::ingest::validate::Field;
 use crate::ingest::{IngestError, Progress, check_count};
 
 /// Number of Gaussians in a chunk.
@@ -24,6 +25,7 @@ pub(super) fn read(
     input: impl BufRead,
     header: &Header,
     file_bytes: u64,
+    reading: &mut Reading,
     progress: Progress<'_>,
 ) -> Result<Gaussians, IngestError> {
     // Find the columns, and check the size of the file.
@@ -40,7 +42,8 @@ pub(super) fn read(
 
     // Value ranges, then vertices, then higher SH degrees: the order of the body.
     let mut chunks = Vec::with_capacity(count.div_ceil(CHUNK));
-    let mut body = Body { input, done: header.bytes, file_bytes, progress };
+    let encoding = header.encoding;
+    let mut body = Body { input, encoding, done: header.bytes, file_bytes, progress };
     body.rows(chunk, |row| chunks.push(ranges.value(row)))?;
     let coefficients = sh::coefficients(sh_degree);
     let mut gaussians = Gaussians::with_capacity(sh_degree, count);
@@ -68,8 +71,8 @@ pub(super) fn read(
             }
         })?;
     }
-    validate::check(&gaussians, &|field| file_name(field, sh_degree))?;
-    Ok(gaussians)
+    body.check_end()?;
+    reading.accept(gaussians, &|field| file_name(field, sh_degree))
 }
 
 /// Columns of the coefficients above degree 0, coefficient-major, then red, green, blue.
@@ -82,7 +85,11 @@ fn higher_degrees(colour: &Element, sh_degree: u8) -> Result<Vec<Property>, Inge
 /// The tables chunk, vertex, and (if there is one) sh, in that order and of matching lengths.
 fn tables(header: &Header) -> Result<(&Element, &Element, Option<&Element>), IngestError> {
     let bad = |reason: String| error("compressed elements".into(), reason);
-    let (chunk, vertex, colour) = match &header.elements[..] {
+    let known = |element: &&Element| {
+        element.count > 0 || ["chunk", "vertex", "sh"].contains(&element.name.as_str())
+    };
+    let elements: Vec<&Element> = header.elements.iter().filter(known).collect();
+    let (chunk, vertex, colour) = match elements[..] {
         [chunk, vertex] => (chunk, vertex, None),
         [chunk, vertex, colour] => (chunk, vertex, Some(colour)),
         _ => return Err(bad("chunk, vertex and perhaps sh are expected".into())),

@@ -1,4 +1,4 @@
-//! The header of a binary PLY file.
+//! The header of a PLY file.
 //!
 //! Source: Greg Turk, "The PLY Polygon File Format" (1994).
 
@@ -10,10 +10,22 @@ use crate::limits;
 /// A parsed header.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Header {
+    /// How the numbers of the body are written.
+    pub(super) encoding: Encoding,
     /// In the order of the body.
     pub(super) elements: Vec<Element>,
+    /// The texts of the comments.
+    pub(super) comments: Vec<String>,
     /// Where the body starts, in bytes.
     pub(super) bytes: u64,
+}
+
+/// How the numbers of a body are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Encoding {
+    Ascii,
+    BigEndian,
+    LittleEndian,
 }
 
 /// A table of the body.
@@ -35,7 +47,7 @@ pub(super) struct Property {
     pub(super) offset: usize,
 }
 
-/// The type of a column, little-endian.
+/// The type of a column. In a row it is little-endian, whatever the encoding of the file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Scalar {
     I8,
@@ -53,9 +65,10 @@ impl Header {
     pub(super) fn read(input: &mut impl BufRead) -> Result<Self, IngestError> {
         let mut input = input.take(limits::PLY_HEADER_BYTES as u64);
         let mut elements: Vec<Element> = Vec::new();
+        let mut comments = Vec::new();
         let mut bytes = 0;
         let mut number = 0;
-        let mut has_format = false;
+        let mut encoding = None;
         let mut line = Vec::new();
         loop {
             number += 1;
@@ -74,11 +87,13 @@ impl Header {
             match words[..] {
                 ["ply"] if number == 1 => {}
                 _ if number == 1 => return Err(bad(format!("{text:?} must be ply"))),
-                [] | ["comment" | "obj_info", ..] => {}
-                ["format", "binary_little_endian", "1.0"] => has_format = true,
-                ["format", ..] => {
-                    return Err(bad(format!("{text:?} must be format binary_little_endian 1.0")));
+                [] => {}
+                ["comment" | "obj_info", ref words @ ..] => comments.push(words.join(" ")),
+                ["format", name, "1.0"] => {
+                    let known = Encoding::parse(name);
+                    encoding = Some(known.ok_or_else(|| bad(format!("{text:?} {FORMATS}")))?);
                 }
+                ["format", ..] => return Err(bad(format!("{text:?} {FORMATS}"))),
                 ["element", name, count] => {
                     let count = count
                         .parse()
@@ -89,7 +104,10 @@ impl Header {
                     elements.push(Element { name: name.to_owned(), count, ..Element::default() });
                 }
                 ["property", "list", ..] => {
-                    return Err(bad(format!("{text:?}: Gaussians have no lists")));
+                    // A list in an empty table takes no byte: MeshLab writes `element face 0`.
+                    if elements.last().is_none_or(|element| element.count > 0) {
+                        return Err(bad(format!("{text:?}: Gaussians have no lists")));
+                    }
                 }
                 ["property", kind, name] => {
                     let scalar = Scalar::parse(kind)
@@ -103,11 +121,10 @@ impl Header {
                 _ => return Err(bad(format!("{text:?} is unknown in a header"))),
             }
         }
-        if !has_format {
-            let reason = "there is no line format binary_little_endian 1.0";
-            return Err(error("end".into(), reason.into()));
-        }
-        Ok(Self { elements, bytes })
+        let encoding = encoding.ok_or_else(|| {
+            error("end".into(), "there is no line format binary_little_endian 1.0".into())
+        })?;
+        Ok(Self { encoding, elements, comments, bytes })
     }
 
     /// The element of a name.
@@ -118,17 +135,36 @@ impl Header {
     /// Compares the size that the header implies with the file's, before anything is allocated for
     /// it.
     pub(super) fn check_size(&self, file_bytes: u64) -> Result<(), IngestError> {
-        let size = |e: &Element| u128::from(e.count) * e.stride as u128;
-        let promised = self.elements.iter().map(size).sum();
+        let is_ascii = self.encoding == Encoding::Ascii;
+        // A number in text has at least one digit and a separator, which the last one may lack.
+        let row_bytes = |e: &Element| if is_ascii { 2 * e.properties.len() } else { e.stride };
+        let size = |e: &Element| u128::from(e.count) * row_bytes(e) as u128;
+        let promised: u128 = self.elements.iter().map(size).sum();
         let held = u128::from(file_bytes.saturating_sub(self.bytes));
-        if promised == held {
+        if promised == held || is_ascii && promised <= held + 1 {
             return Ok(());
         }
+        let least = if is_ascii { "at least " } else { "" };
         let tables = self.elements.iter();
-        let content: Vec<_> =
-            tables.map(|e| format!("{} {} of {} bytes", e.count, e.name, e.stride)).collect();
+        let content: Vec<_> = tables
+            .map(|e| format!("{} {} of {least}{} bytes", e.count, e.name, row_bytes(e)))
+            .collect();
         let content = content.join(", ");
         Err(IngestError::Size { format: "PLY", promised, held, content })
+    }
+}
+
+/// The formats that are read.
+const FORMATS: &str = "must be format binary_little_endian 1.0, binary_big_endian 1.0 or ascii 1.0";
+
+impl Encoding {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "ascii" => Self::Ascii,
+            "binary_big_endian" => Self::BigEndian,
+            "binary_little_endian" => Self::LittleEndian,
+            _ => return None,
+        })
     }
 }
 
@@ -188,7 +224,8 @@ impl Scalar {
         })
     }
 
-    const fn bytes(self) -> usize {
+    /// Size in a row, in bytes.
+    pub(super) const fn bytes(self) -> usize {
         match self {
             Self::I8 | Self::U8 => 1,
             Self::I16 | Self::U16 => 2,

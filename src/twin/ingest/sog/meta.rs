@@ -1,13 +1,23 @@
 //! meta.json in both versions, and tables that map the bytes of the images to values.
 
+use std::collections::BTreeMap;
+
 use serde::Deserialize;
+use serde::de::IgnoredAny;
 
 use crate::ingest::activation;
 use wildcity_scene::sh;
 
-/// The keys of meta.json that are used; others are skipped.
+/// Keys of meta.json that are not read and have no effect on the picture.
+const WITHOUT_EFFECT: [&str; 1] = ["asset"];
+
+/// The keys of meta.json that are used.
 #[derive(Deserialize)]
 pub(super) struct Meta {
+    /// How the scene was trained.
+    pub(super) model: Option<String>,
+    /// The same in the first text of the format: with anti-aliasing or without.
+    pub(super) antialias: Option<bool>,
     version: Option<u32>,
     count: Option<u64>,
     pub(super) means: Means,
@@ -16,6 +26,16 @@ pub(super) struct Meta {
     pub(super) sh0: Coded,
     #[serde(rename = "shN")]
     pub(super) sh_n: Option<Higher>,
+    #[serde(flatten)]
+    others: BTreeMap<String, IgnoredAny>,
+}
+
+impl Meta {
+    /// Names of the keys that are not read, but for those without an effect.
+    pub(super) fn skipped(&self) -> impl Iterator<Item = &str> {
+        let names = self.others.keys().map(String::as_str);
+        names.filter(|name| !WITHOUT_EFFECT.contains(name))
+    }
 }
 
 #[derive(Deserialize)]

@@ -16,8 +16,9 @@ mod streamed;
 use crate::limits;
 use wildcity_scene::{Gaussians, sh};
 
+use super::notes::{BLUR_PX2, Reading};
 use super::scene_files::SceneFiles;
-use super::validate::{self, Field};
+use super::validate::Field;
 use super::{IngestError, activation, check_count};
 pub use files::SogFiles;
 use image::{Image, NamedFile};
@@ -34,10 +35,14 @@ pub(super) fn read(
     json: &[u8],
     folder: &str,
     parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     match serde_json::from_slice::<Kind>(json) {
-        Ok(Kind { lod_levels: Some(_), .. }) => streamed::read(json, folder, parts),
-        Ok(Kind { means: Some(_), .. }) => read_one(json, "meta.json", folder, parts),
+        Ok(Kind { lod_levels: Some(_), .. }) => streamed::read(json, folder, parts, reading),
+        Ok(Kind { means: Some(_), .. }) => {
+            let gaussians = read_one(json, "meta.json", folder, parts, reading)?;
+            reading.accept(gaussians, &Field::plain_name)
+        }
         Ok(_) => Err(bad("meta.json", "has neither means nor lodLevels".into())),
         Err(e) => Err(bad("meta.json", e.to_string())),
     }
@@ -51,14 +56,20 @@ struct Kind {
     lod_levels: Option<serde::de::IgnoredAny>,
 }
 
-/// Reads a scene of one meta.json; errors call that file `name`.
+/// Reads a scene of one meta.json, whose Gaussians are not checked yet; errors call that file `name`.
 fn read_one(
     json: &[u8],
     name: &str,
     folder: &str,
     parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let meta: Meta = serde_json::from_slice(json).map_err(|e| bad(name, e.to_string()))?;
+    note_model(&meta, reading);
+    let skipped: Vec<&str> = meta.skipped().collect();
+    if !skipped.is_empty() {
+        reading.warn_skipped(&format!("keys of {name}"), &skipped);
+    }
     let tables = Tables::of(&meta).map_err(|reason| bad(name, reason))?;
     let count = check_count(tables.count)?;
     // All files are read first, because the limit of unpacking depends on their total size.
@@ -134,8 +145,23 @@ fn read_one(
         }
         _ => gaussians.sh.extend(colours.pixels(count).flat_map(dc)),
     }
-    validate::check(&gaussians, &Field::plain_name)?;
     Ok(gaussians)
+}
+
+/// Notes how the scene was trained.
+fn note_model(meta: &Meta, reading: &mut Reading) {
+    if meta.antialias == Some(true) {
+        reading.set_antialiased(BLUR_PX2, "\"antialias\": true".to_owned());
+    }
+    let said_by = |model: &str| format!("\"model\": {model:?}");
+    match meta.model.as_deref() {
+        Some("antialiased") => reading.set_antialiased(BLUR_PX2, said_by("antialiased")),
+        Some("2dgs") => reading.set_flat(&said_by("2dgs")),
+        None | Some("default") => {}
+        Some(other) => {
+            reading.warn(format!("{} is unknown and has no effect", said_by(other)));
+        }
+    }
 }
 
 fn bad(place: &str, reason: String) -> IngestError {

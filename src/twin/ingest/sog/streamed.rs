@@ -7,7 +7,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Deserialize;
 
+use crate::ingest::notes::Reading;
 use crate::ingest::scene_files::SceneFiles;
+use crate::ingest::validate::Field;
 use crate::ingest::{IngestError, check_count};
 use crate::limits;
 use wildcity_scene::Gaussians;
@@ -48,6 +50,7 @@ pub(super) fn read(
     json: &[u8],
     folder: &str,
     parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let meta: LodMeta = serde_json::from_slice(json).map_err(|e| bad(NAME, e.to_string()))?;
     if let Some(version) = meta.version.filter(|&version| version != 1) {
@@ -62,7 +65,7 @@ pub(super) fn read(
     check_count(u64::try_from(total).unwrap_or(u64::MAX))?;
     let mut all = Gaussians::default();
     for (file, places) in places {
-        let block = read_block(&meta.filenames[file], folder, parts)?;
+        let block = read_block(&meta.filenames[file], folder, parts, reading)?;
         for FileRange { offset, count, .. } in places {
             let held = block.len() as u64;
             let end = offset.saturating_add(count);
@@ -75,10 +78,10 @@ pub(super) fn read(
         }
     }
     if let Some(environment) = &meta.environment {
-        let block = read_block(environment, folder, parts)?;
+        let block = read_block(environment, folder, parts, reading)?;
         all.append(&block);
     }
-    Ok(all)
+    reading.accept(all, &Field::plain_name)
 }
 
 /// The finest ranges of every file, in order, and checked not to overlap.
@@ -111,9 +114,12 @@ fn read_block(
     name: &str,
     folder: &str,
     parts: &mut dyn SceneFiles,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let path = format!("{folder}{name}");
     let json = parts.read(&path, limits::SCENE_JSON_BYTES)?;
     let folder = path.rfind('/').map_or("", |slash| &path[..=slash]);
-    read_one(&json, name, folder, parts)
+    let block = read_one(&json, name, folder, parts, reading)?;
+    // Ranges count Gaussians of the whole block, so they are left out when all blocks are joined.
+    if reading.drops_bad() { Ok(block) } else { reading.accept(block, &Field::plain_name) }
 }

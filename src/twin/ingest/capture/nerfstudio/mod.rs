@@ -3,22 +3,22 @@
 //! Poses are `world_from_camera` with OpenGL's camera: x right, y up, z backwards. Intrinsics are of the file or of a
 //! frame, which overrides the file's (nerfstudio's data conventions; instant-ngp's docs/nerf_dataset_tips.md).
 
-use std::collections::BTreeMap;
+mod intrinsics;
+
 use std::path::Path;
 
 use glam::{DMat3, DVec3};
 use serde::Deserialize;
-use serde_json::Value;
 
-use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
-use wildcity_scene::geometry::{Camera, Pose};
+use wildcity_scene::geometry::Pose;
 use wildcity_scene::views::{MOST_STOPS, refused_stops};
 
 use super::{CaptureError, Place, PosedImage, rotation_of};
 use crate::ingest::file::read_whole;
 use crate::limits;
+use intrinsics::{Intrinsics, Wrong};
 
-/// The file; fields that are not listed are ignored.
+/// The file. Fields without an effect on cameras and images, such as `aabb_scale` and `ply_file_path`, are not listed.
 #[derive(Deserialize)]
 struct Transforms {
     frames: Vec<Frame>,
@@ -44,16 +44,9 @@ pub struct FrameImage {
     pub posed: PosedImage,
     /// File of its mask (`mask_path`), if it has one.
     pub mask: Option<String>,
-    /// Time at which it was taken (`time_us`), in microseconds, if the file has it.
-    pub time_us: Option<i64>,
     /// Its exposure (`exposure_stops`) in stops relative to the scene's, if the file has it.
     pub exposure_stops: Option<f64>,
 }
-
-/// Numbers of a camera, by their names in the file.
-#[derive(Clone, Default, Deserialize)]
-#[serde(transparent)]
-struct Intrinsics(BTreeMap<String, Value>);
 
 /// Reads the file, or the one in a folder.
 ///
@@ -85,14 +78,14 @@ pub fn read_frames(path: &Path) -> Result<Vec<FrameImage>, CaptureError> {
     let frames = file.frames.into_iter().enumerate();
     let read = |(index, mut frame): (usize, Frame)| {
         let mask = frame.mask_path.take();
-        let Frame { time_us, exposure_stops, .. } = frame;
+        let exposure_stops = frame.exposure_stops;
         if let Some(stops) = refused_stops(exposure_stops) {
             let place = Place::Field(format!("frames[{index}].exposure_stops"));
             let reason = format!("{stops}; give -{MOST_STOPS} to {MOST_STOPS}");
             return Err(CaptureError::at(path, place, reason));
         }
         let posed = posed(path, index, frame, &file.intrinsics)?;
-        Ok(FrameImage { posed, mask, time_us, exposure_stops })
+        Ok(FrameImage { posed, mask, exposure_stops })
     };
     frames.map(read).collect()
 }
@@ -125,84 +118,8 @@ fn posed(
     let position = [rows[0][3], rows[1][3], rows[2][3]];
     let world_from_camera =
         Pose::checked(position, q_wxyz).map_err(|cause| matrix(&cause.to_string()))?;
-    let mut intrinsics = shared.clone();
-    intrinsics.0.extend(frame.intrinsics.0);
-    let camera = intrinsics.camera();
+    let camera = shared.overridden_by(frame.intrinsics).camera();
     let camera = camera.map_err(|Wrong { field, reason }| wrong(field, reason))?;
-    Ok(PosedImage { name: frame.file_path, camera, world_from_camera })
-}
-
-/// A field that cannot be used.
-struct Wrong {
-    field: &'static str,
-    reason: String,
-}
-
-impl Intrinsics {
-    fn camera(&self) -> Result<Camera, Wrong> {
-        let width = self.side("w")?;
-        let height = self.side("h")?;
-        let fx = match self.number("fl_x")? {
-            Some(fx) => fx,
-            None => match self.number("camera_angle_x")? {
-                Some(angle_rad) => 0.5 * f64::from(width) / (0.5 * angle_rad).tan(),
-                None => {
-                    let reason = "is missing, and camera_angle_x too: add it to the frame or to the file, in pixels";
-                    return Err(Wrong { field: "fl_x", reason: reason.to_owned() });
-                }
-            },
-        };
-        let fy = self.number("fl_y")?.unwrap_or(fx);
-        let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
-        let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
-        let or_zero = |name| self.number(name).map(Option::unwrap_or_default);
-        let k = [or_zero("k1")?, or_zero("k2")?, or_zero("k3")?, or_zero("k4")?];
-        let p = [or_zero("p1")?, or_zero("p2")?];
-        let lens = match self.0.get("camera_model").and_then(Value::as_str) {
-            Some("OPENCV_FISHEYE") => Lens::Fisheye(Fisheye::new(k, None)),
-            None | Some("OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "perspective") => {
-                let [k1, k2, k3, k4] = k;
-                Lens::opencv(OpenCv::new([k1, k2, k3, k4, 0.0, 0.0], p, [0.0; 4]))
-            }
-            Some(other) => {
-                let reason = format!(
-                    "is {other:?}; OPENCV, PINHOLE and OPENCV_FISHEYE can be read: undistort the images"
-                );
-                return Err(Wrong { field: "camera_model", reason });
-            }
-        };
-        let camera = Camera {
-            width_px: width,
-            height_px: height,
-            pinhole: Pinhole { fx, fy, cx, cy },
-            lens,
-            windshield: None,
-            native_size_px: None,
-        };
-        let checked = camera.check();
-        checked.map_err(|cause| Wrong { field: "intrinsics", reason: cause.to_string() })?;
-        Ok(camera)
-    }
-
-    fn number(&self, field: &'static str) -> Result<Option<f64>, Wrong> {
-        match self.0.get(field) {
-            None | Some(Value::Null) => Ok(None),
-            Some(value) => match value.as_f64() {
-                Some(number) => Ok(Some(number)),
-                None => Err(Wrong { field, reason: format!("is {value}, not a number") }),
-            },
-        }
-    }
-
-    fn side(&self, field: &'static str) -> Result<u32, Wrong> {
-        let side = self.number(field)?;
-        let usable = side.filter(|side| side.fract() == 0.0 && (1.0..=1e6).contains(side));
-        usable.map(|side| side as u32).ok_or_else(|| {
-            let given = side.map_or("is missing".to_owned(), |side| format!("is {side:?}"));
-            let reason = format!(
-                "{given}: add the size of the images to the frame or to the file, in pixels"
-            );
-            Wrong { field, reason }
-        })
-    }
+    let time_us = frame.time_us;
+    Ok(PosedImage { name: frame.file_path, camera, world_from_camera, time_us })
 }

@@ -5,7 +5,10 @@
 //! point), opacities (u8), colours (3 u8), ln scales (3 u8, sixteenths from -10), rotations and the
 //! higher colour coefficients (u8, 128ths from -1; coefficient-major, then red, green, blue).
 //! Version 4 has an uncompressed header of 32 bytes and a table of the streams' sizes
-//! after it. Between the two there may be extensions, which are skipped.
+//! after it. Between the two, or after the payload of earlier versions, there may be extensions: the one of the
+//! coordinate system is read, others are named in a warning.
+
+mod extensions;
 
 use std::io::{self, BufRead, Read};
 
@@ -13,8 +16,9 @@ use flate2::bufread::GzDecoder;
 
 use wildcity_scene::{Gaussians, sh};
 
+use super::notes::{BLUR_PX2, Reading};
 use super::unpack_budget::{self, UnpackBudget};
-use super::validate::{self, Field};
+use super::validate::Field;
 use super::{IngestError, activation, check_count};
 
 const FORMAT: &str = "SPZ";
@@ -26,6 +30,8 @@ const HEADER_BYTES: u64 = 16;
 const HEADER_4_BYTES: u64 = 32;
 /// Two u64 per stream: compressed and uncompressed bytes.
 const STREAM_ENTRY_BYTES: u64 = 16;
+/// Set if the scene was trained with opacity compensation.
+const FLAG_ANTIALIASED: u8 = 1;
 /// Set if there are extensions: before the table in version 4, after the payload in the others.
 const FLAG_EXTENSIONS: u8 = 2;
 /// The factor that colours were multiplied by before quantisation, so that values beyond 0 to 1 fit
@@ -37,8 +43,10 @@ pub(super) fn read(
     mut input: impl BufRead,
     file_bytes: u64,
     budget: UnpackBudget,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let header = Header::read(&mut input)?;
+    header.note_flags(reading);
     let count = header.count;
     let attributes = header.attributes();
     if header.version < 4 {
@@ -48,10 +56,15 @@ pub(super) fn read(
             let content = format!("{count} Gaussians of SH degree {}", header.sh_degree);
             return Err(IngestError::Size { format: FORMAT, promised, held, content });
         }
-        return decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take));
+        let rows = |attribute: usize, take: &mut dyn FnMut(&[u8])| {
+            attributes[attribute].rows(&mut input, take)
+        };
+        let gaussians = decode(&header, rows, reading)?;
+        extensions::read(&mut input, (held - promised) as u64, reading)?;
+        return Ok(gaussians);
     }
-    let streams = read_table(&mut input, &header, file_bytes, budget)?;
-    decode(&header, |attribute, take| {
+    let streams = read_table(&mut input, &header, file_bytes, budget, reading)?;
+    let rows = |attribute: usize, take: &mut dyn FnMut(&[u8])| {
         let attribute = &attributes[attribute];
         let broken = |error: io::Error| attribute.broken(&error);
         let mut packed = (&mut input).take(streams[attribute.index]);
@@ -62,7 +75,8 @@ pub(super) fn read(
             return Err(body(attribute.name, "the stream is longer than its table says".into()));
         }
         Ok(())
-    })
+    };
+    decode(&header, rows, reading)
 }
 
 /// Reads a gzip stream that holds versions 2 or 3, of a known compressed size.
@@ -70,8 +84,19 @@ pub(super) fn read_gzip(
     input: impl BufRead,
     file_bytes: u64,
     mut budget: UnpackBudget,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     budget.read(file_bytes);
+    read_gzip_within(input, file_bytes, &mut budget, reading)
+}
+
+/// As [`read_gzip`], of a stream whose compressed bytes the budget already counts.
+pub(super) fn read_gzip_within(
+    input: impl BufRead,
+    file_bytes: u64,
+    budget: &mut UnpackBudget,
+    reading: &mut Reading,
+) -> Result<Gaussians, IngestError> {
     let mut input = GzDecoder::new(input);
     let header = Header::read(&mut input)?;
     if header.version > 3 {
@@ -80,13 +105,24 @@ pub(super) fn read_gzip(
     }
     let unpacked_bytes = u128::from(HEADER_BYTES) + header.body_bytes();
     budget.unpack(FORMAT, "the gzip stream", unpacked_bytes)?;
+    header.note_flags(reading);
     let attributes = header.attributes();
-    let gaussians =
-        decode(&header, |attribute, take| attributes[attribute].rows(&mut input, take))?;
+    let rows = |attribute: usize, take: &mut dyn FnMut(&[u8])| {
+        attributes[attribute].rows(&mut input, take)
+    };
+    let gaussians = decode(&header, rows, reading)?;
     // Read to the end, so that the checksum is verified.
     let limit = unpack_budget::limit_bytes(file_bytes);
-    let more = io::copy(&mut (&mut input).take(limit), &mut io::sink());
-    let more = more.map_err(|e| body("the end", format!("the gzip stream is damaged: {e}")))?;
+    let damaged = |e: io::Error| body("the end", format!("the gzip stream is damaged: {e}"));
+    let mut after = Vec::new();
+    if header.flags & FLAG_EXTENSIONS != 0 {
+        let kept = limit.min(extensions::LEGACY_BYTES);
+        (&mut input).take(kept).read_to_end(&mut after).map_err(damaged)?;
+        extensions::read(&mut &after[..], after.len() as u64, reading)?;
+    }
+    let left = limit - (after.len() as u64).min(limit);
+    let more = io::copy(&mut (&mut input).take(left), &mut io::sink());
+    let more = more.map_err(damaged)? + after.len() as u64;
     if more > 0 && header.flags & FLAG_EXTENSIONS == 0 {
         let reason = format!("more than the {unpacked_bytes} bytes that the header promises");
         return Err(body("the end", reason));
@@ -133,6 +169,17 @@ impl Header {
         }
         let count = u32::from_le_bytes(count);
         Ok(Self { version, count, sh_degree, fraction_bits, flags, streams })
+    }
+
+    /// Notes what the flags say.
+    fn note_flags(&self, reading: &mut Reading) {
+        if self.flags & FLAG_ANTIALIASED != 0 {
+            reading.set_antialiased(BLUR_PX2, "bit 0 of the SPZ flags".to_owned());
+        }
+        let unknown = self.flags & !(FLAG_ANTIALIASED | FLAG_EXTENSIONS);
+        if unknown != 0 {
+            reading.warn(format!("SPZ flags {unknown:#04x} are unknown and have no effect"));
+        }
     }
 
     /// The attributes in the order of the file.
@@ -199,12 +246,13 @@ impl Attribute {
 /// Rows that are read at once.
 const ROWS_AT_ONCE: usize = 4096;
 
-/// Skips to version 4's table of streams, and reads the compressed size of every attribute from it.
+/// Reads the extensions up to version 4's table of streams, and the compressed size of every attribute from it.
 fn read_table(
     input: &mut impl Read,
     header: &Header,
     file_bytes: u64,
     mut budget: UnpackBudget,
+    reading: &mut Reading,
 ) -> Result<Vec<u64>, IngestError> {
     budget.read(file_bytes);
     let attributes = header.attributes();
@@ -223,7 +271,7 @@ fn read_table(
         let reason = format!("the table cannot be at {table_at} in a file of {file_bytes} bytes");
         return Err(bad("bytes 16 to 19", reason));
     }
-    io::copy(&mut input.take(table_at - HEADER_4_BYTES), &mut io::sink())?;
+    extensions::read(input, table_at - HEADER_4_BYTES, reading)?;
     let mut packed = Vec::with_capacity(attributes.len());
     for attribute in &attributes {
         let mut entry = [0; STREAM_ENTRY_BYTES as usize];
@@ -253,6 +301,7 @@ fn read_table(
 fn decode(
     header: &Header,
     mut rows: impl FnMut(usize, &mut dyn FnMut(&[u8])) -> Result<(), IngestError>,
+    reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
     let count = check_count(header.count.into())?;
     let mut gaussians = Gaussians::with_capacity(header.sh_degree, count);
@@ -292,8 +341,7 @@ fn decode(
             }
         })?;
     }
-    validate::check(&gaussians, &Field::plain_name)?;
-    Ok(gaussians)
+    reading.accept(gaussians, &Field::plain_name)
 }
 
 /// Version 2: x, y, z around 127.5; w is positive and makes the length 1.

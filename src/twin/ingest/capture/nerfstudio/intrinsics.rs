@@ -1,0 +1,224 @@
+//! Cameras of transforms.json, by the formulas of the programs that train from it.
+//!
+//! nerfstudio (cameras/camera_utils.py, data/dataparsers/nerfstudio_dataparser.py): lenses of perspective models are
+//! `(x, y) (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸)` and OpenCV's tangential terms p1, p2; those of fisheye models are OpenCV's
+//! `fisheye`, with the same tangential terms. A frame or the file may have `distortion_params` in their place: k1 to k4,
+//! p1, p2. instant-ngp (src/nerf_loader.cu, read_lens): OpenCV's lens, or with `is_fisheye` OpenCV's `fisheye`.
+
+use std::collections::BTreeMap;
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use wildcity_scene::geometry::Camera;
+use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
+
+/// Fields of a camera, by their names in the file.
+#[derive(Clone, Default, Deserialize)]
+#[serde(transparent)]
+pub(super) struct Intrinsics(BTreeMap<String, Value>);
+
+/// A field that cannot be used.
+pub(super) struct Wrong {
+    pub(super) field: &'static str,
+    pub(super) reason: String,
+}
+
+/// Models of nerfstudio with a pinhole or OpenCV's lens. `perspective` is of exporters of simulators.
+const PERSPECTIVE: [&str; 6] =
+    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "perspective"];
+const FISHEYE: [&str; 3] = ["OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"];
+
+/// Fields of instant-ngp that make another camera than the ones that are read, unless they are false or zero.
+const REFUSED: [(&str, &str); 6] = [
+    ("ftheta_p0", "an f-theta lens: undistort the images"),
+    ("latlong", "a panorama: cut pinhole images from it"),
+    ("equirectangular", "a panorama: cut pinhole images from it"),
+    ("rolling_shutter", "a rolling shutter: give the pose of each image's middle row, without it"),
+    ("transform_matrix_start", "a motion during the exposure: give transform_matrix alone"),
+    ("transform_matrix_end", "a motion during the exposure: give transform_matrix alone"),
+];
+
+/// Coefficients of a lens.
+struct Distortion {
+    k: [f64; 4],
+    p: [f64; 2],
+}
+
+impl Intrinsics {
+    /// These fields of a file, with those of a frame in their place.
+    pub(super) fn overridden_by(&self, frame: Self) -> Self {
+        let mut fields = self.0.clone();
+        fields.extend(frame.0);
+        Self(fields)
+    }
+
+    pub(super) fn camera(&self) -> Result<Camera, Wrong> {
+        for (field, reason) in REFUSED {
+            if self.0.get(field).is_some_and(is_set) {
+                return Err(Wrong { field, reason: format!("is not read: it is {reason}") });
+            }
+        }
+        let width = self.side("w")?;
+        let height = self.side("h")?;
+        let [fx, fy] = self.focal_px(f64::from(width), f64::from(height))?;
+        let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
+        let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
+        let camera = Camera {
+            width_px: width,
+            height_px: height,
+            pinhole: Pinhole { fx, fy, cx, cy },
+            lens: self.lens()?,
+            windshield: None,
+            native_size_px: None,
+        };
+        let checked = camera.check();
+        checked.map_err(|cause| Wrong { field: "intrinsics", reason: cause.to_string() })?;
+        Ok(camera)
+    }
+
+    /// Focal lengths: in pixels, or as an angle of view of instant-ngp; one of the two stands for both.
+    fn focal_px(&self, width: f64, height: f64) -> Result<[f64; 2], Wrong> {
+        let along = |side: f64, fl: &'static str, angle: &'static str, fov: &'static str| {
+            let of_angle = |angle_rad: f64| 0.5 * side / (0.5 * angle_rad).tan();
+            let of_fov = self.number(fov)?.map(|degrees| of_angle(degrees.to_radians()));
+            let given = match self.number(fl)? {
+                Some(focal) => Some(focal),
+                None => self.number(angle)?.map(of_angle),
+            };
+            match (given, of_fov) {
+                (Some(given), Some(of_fov)) if (given / of_fov - 1.0).abs() > 1e-3 => {
+                    let reason = format!(
+                        "says a focal length of {of_fov:.2}, and {fl} or {angle} {given:.2}"
+                    );
+                    Err(Wrong { field: fov, reason })
+                }
+                (given, of_fov) => Ok(given.or(of_fov)),
+            }
+        };
+        let x = along(width, "fl_x", "camera_angle_x", "x_fov")?;
+        let y = along(height, "fl_y", "camera_angle_y", "y_fov")?;
+        match (x, y) {
+            (Some(x), y) => Ok([x, y.unwrap_or(x)]),
+            (None, Some(y)) => Ok([y, y]),
+            (None, None) => {
+                let reason = "is missing, and camera_angle_x too: add it to the frame or to the file, in pixels";
+                Err(Wrong { field: "fl_x", reason: reason.to_owned() })
+            }
+        }
+    }
+
+    fn lens(&self) -> Result<Lens, Wrong> {
+        let model = match self.0.get("camera_model") {
+            None | Some(Value::Null) => None,
+            Some(Value::String(model)) => Some(model.as_str()),
+            Some(other) => {
+                let reason = format!("is {other}, not a text");
+                return Err(Wrong { field: "camera_model", reason });
+            }
+        };
+        let is_ngp_fisheye = match self.0.get("is_fisheye") {
+            None | Some(Value::Null) => false,
+            Some(Value::Bool(is_fisheye)) => *is_fisheye,
+            Some(other) => {
+                let reason = format!("is {other}, not true or false");
+                return Err(Wrong { field: "is_fisheye", reason });
+            }
+        };
+        let Distortion { k, p } = self.distortion()?;
+        match model {
+            Some(model) if is_ngp_fisheye && !FISHEYE.contains(&model) => {
+                let reason =
+                    format!("is true, and camera_model is {model:?}: remove one of the two");
+                Err(Wrong { field: "is_fisheye", reason })
+            }
+            Some(model) if FISHEYE.contains(&model) => fisheye(k, p),
+            None if is_ngp_fisheye => fisheye(k, p),
+            Some(model) if !PERSPECTIVE.contains(&model) => {
+                let reason = format!(
+                    "is {model:?}; {} and {} can be read: undistort the images",
+                    PERSPECTIVE[..5].join(", "),
+                    FISHEYE.join(", ")
+                );
+                Err(Wrong { field: "camera_model", reason })
+            }
+            _ => perspective(k, p),
+        }
+    }
+
+    fn distortion(&self) -> Result<Distortion, Wrong> {
+        let field = "distortion_params";
+        let or_zero = |name| self.number(name).map(Option::unwrap_or_default);
+        match self.0.get(field) {
+            None | Some(Value::Null) => Ok(Distortion {
+                k: [or_zero("k1")?, or_zero("k2")?, or_zero("k3")?, or_zero("k4")?],
+                p: [or_zero("p1")?, or_zero("p2")?],
+            }),
+            Some(list) => match <[f64; 6]>::deserialize(list) {
+                Ok([k1, k2, k3, k4, p1, p2]) => Ok(Distortion { k: [k1, k2, k3, k4], p: [p1, p2] }),
+                Err(_) => {
+                    let reason =
+                        format!("is {list}; six numbers can be read: k1, k2, k3, k4, p1, p2");
+                    Err(Wrong { field, reason })
+                }
+            },
+        }
+    }
+
+    fn number(&self, field: &'static str) -> Result<Option<f64>, Wrong> {
+        match self.0.get(field) {
+            None | Some(Value::Null) => Ok(None),
+            Some(value) => match value.as_f64() {
+                Some(number) => Ok(Some(number)),
+                None => Err(Wrong { field, reason: format!("is {value}, not a number") }),
+            },
+        }
+    }
+
+    fn side(&self, field: &'static str) -> Result<u32, Wrong> {
+        let side = self.number(field)?;
+        let usable = side.filter(|side| side.fract() == 0.0 && (1.0..=1e6).contains(side));
+        usable.map(|side| side as u32).ok_or_else(|| {
+            let given = side.map_or("is missing".to_owned(), |side| format!("is {side:?}"));
+            let reason = format!(
+                "{given}: add the size of the images to the frame or to the file, in pixels"
+            );
+            Wrong { field, reason }
+        })
+    }
+}
+
+/// Whether a value asks for something: it is neither null, false, zero, nor a list of these.
+fn is_set(value: &Value) -> bool {
+    match value {
+        Value::Null | Value::Bool(false) => false,
+        Value::Number(number) => number.as_f64() != Some(0.0),
+        Value::Array(values) => values.iter().any(is_set),
+        _ => true,
+    }
+}
+
+fn perspective([k1, k2, k3, k4]: [f64; 4], p: [f64; 2]) -> Result<Lens, Wrong> {
+    if k4 != 0.0 {
+        // OpenCV's fourth coefficient is in the denominator, and nerfstudio's is of r to the power of 8.
+        let reason = format!(
+            "is {k4}: a lens that is no fisheye is read with k1, k2, k3, p1 and p2; calibrate it without k4, or \
+             undistort the images"
+        );
+        return Err(Wrong { field: "k4", reason });
+    }
+    Ok(Lens::opencv(OpenCv::new([k1, k2, k3, 0.0, 0.0, 0.0], p, [0.0; 4])))
+}
+
+fn fisheye(k: [f64; 4], p: [f64; 2]) -> Result<Lens, Wrong> {
+    for (field, value) in [("p1", p[0]), ("p2", p[1])] {
+        if value != 0.0 {
+            let reason = format!(
+                "is {value}: a fisheye lens is read without tangential distortion; calibrate it without, or undistort \
+                 the images"
+            );
+            return Err(Wrong { field, reason });
+        }
+    }
+    Ok(Lens::Fisheye(Fisheye::new(k, None)))
+}

@@ -1,0 +1,156 @@
+//! What a file says besides its Gaussians: how they were trained, their axes, and what was not read.
+
+use serde_json::{Map, Value};
+
+use wildcity_scene::validate::{self, Field};
+use wildcity_scene::{Gaussians, ProfileOverrides};
+
+use super::{Axes, IngestError};
+
+/// Blur of trainers with opacity compensation that follow gsplat, in px².
+pub(super) const BLUR_PX2: f64 = 0.3;
+/// Blur of Brush's mode `mip` and of mip-splatting, in px².
+pub(super) const BLUR_BRUSH_PX2: f64 = 0.1;
+/// Names in one warning of what is not read.
+const NAMED_SKIPPED: usize = 12;
+/// Warnings of one scene; further ones are counted.
+const MAX_WARNINGS: usize = 32;
+
+/// What a scene says besides its Gaussians.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FileNotes {
+    /// That the scene was trained with anti-aliasing.
+    pub antialiasing: Option<Antialiasing>,
+    /// The axes that it is in.
+    pub axes: Option<FileAxes>,
+    /// What was not read, or is drawn in another way than its authors may expect. Each names a part of the file.
+    pub warnings: Vec<String>,
+    /// Number of Gaussians outside their bounds that were left out.
+    pub dropped: u64,
+}
+
+/// Training with opacity compensation.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Antialiasing {
+    /// Variance added to both axes of the screen covariance, in px².
+    pub blur_px2: f64,
+    /// The part of the file that says so.
+    pub said_by: String,
+}
+
+/// Axes that a file records.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FileAxes {
+    /// The axes.
+    pub axes: Axes,
+    /// The part of the file that says so.
+    pub said_by: String,
+}
+
+impl FileNotes {
+    /// The fields of the render profile that the scene was trained with.
+    pub fn profile(&self) -> ProfileOverrides {
+        let mut fields = Map::new();
+        if let Some(antialiasing) = &self.antialiasing {
+            fields.insert("antialiased".to_owned(), Value::Bool(true));
+            fields.insert("blur".to_owned(), antialiasing.blur_px2.into());
+        }
+        ProfileOverrides::new(fields)
+    }
+
+    /// Adds a warning; each once, and only the first of many.
+    fn warn(&mut self, warning: String) {
+        let is_new = !self.warnings.contains(&warning);
+        if is_new && self.warnings.len() < MAX_WARNINGS {
+            self.warnings.push(warning);
+        } else if is_new && self.warnings.len() == MAX_WARNINGS {
+            self.warnings.push("further parts are not read".to_owned());
+        }
+    }
+}
+
+/// The reading of one scene, of one file or several.
+pub(super) struct Reading {
+    drop_bad: bool,
+    notes: FileNotes,
+}
+
+impl Reading {
+    /// `drop_bad` leaves out Gaussians outside their bounds; without it they are errors.
+    pub(super) fn new(drop_bad: bool) -> Self {
+        Self { drop_bad, notes: FileNotes::default() }
+    }
+
+    pub(super) fn into_notes(self) -> FileNotes {
+        self.notes
+    }
+
+    /// Whether Gaussians outside their bounds are left out.
+    pub(super) fn drops_bad(&self) -> bool {
+        self.drop_bad
+    }
+
+    /// Warns of a part of the file.
+    pub(super) fn warn(&mut self, warning: String) {
+        self.notes.warn(warning);
+    }
+
+    /// Warns of parts of the file that are not read.
+    pub(super) fn warn_skipped(&mut self, kind: &str, names: &[&str]) {
+        let mut named = names[..names.len().min(NAMED_SKIPPED)].join(", ");
+        if names.len() > NAMED_SKIPPED {
+            named += &format!(" and {} more", names.len() - NAMED_SKIPPED);
+        }
+        self.warn(format!("{kind} not read: {named}"));
+    }
+
+    /// The scene was trained with opacity compensation.
+    pub(super) fn set_antialiased(&mut self, blur_px2: f64, said_by: String) {
+        let before = self.notes.antialiasing.replace(Antialiasing { blur_px2, said_by });
+        if let Some(before) = before.filter(|before| before.blur_px2 != blur_px2) {
+            let said_by = before.said_by;
+            self.warn(format!("{said_by}: says another blur than a later part, which is used"));
+        }
+    }
+
+    /// The scene consists of 2D Gaussians.
+    pub(super) fn set_flat(&mut self, said_by: &str) {
+        self.warn(format!(
+            "{said_by}: these are 2D Gaussians; they are drawn as 3D ones of the smallest thickness"
+        ));
+    }
+
+    /// The scene is in these axes.
+    pub(super) fn set_axes(&mut self, axes: Axes, said_by: String) {
+        self.notes.axes = Some(FileAxes { axes, said_by });
+    }
+
+    /// Takes back the axes, with a warning.
+    pub(super) fn ignore_axes(&mut self) {
+        if let Some(FileAxes { said_by, .. }) = self.notes.axes.take() {
+            self.warn(format!("{said_by} within the file has no effect"));
+        }
+    }
+
+    /// Checks Gaussians; `name` gives the name of a field in the file. Infinite opacities and vanishing scales become the
+    /// nearest values that can be stored.
+    ///
+    /// # Errors
+    /// Gaussians outside their bounds, unless they are left out.
+    pub(super) fn accept(
+        &mut self,
+        mut gaussians: Gaussians,
+        name: &(dyn Fn(Field) -> String + Sync),
+    ) -> Result<Gaussians, IngestError> {
+        gaussians.clamp_activations();
+        match validate::check(&gaussians, name) {
+            Ok(()) => Ok(gaussians),
+            Err(bad) if self.drop_bad => {
+                self.notes.dropped += bad.count;
+                let kept = (0..gaussians.len()).filter(|&i| validate::is_valid(&gaussians, i));
+                Ok(gaussians.select(kept))
+            }
+            Err(bad) => Err(bad.into()),
+        }
+    }
+}

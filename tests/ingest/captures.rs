@@ -1,0 +1,239 @@
+//! Cameras of captures: every model projects as the program that the file is of.
+//!
+//! The pixels are those of OpenCV 4 (`projectPoints`, `fisheye.projectPoints`), whose models are COLMAP's
+//! (src/colmap/sensor/models.h) and instant-ngp's, and of nerfstudio's formula (cameras/camera_utils.py) in NumPy.
+
+use glam::DVec3;
+
+use wildcity_scene::geometry::Camera;
+use wildcity_twin::ingest::capture::{read_colmap, read_nerfstudio_frames};
+
+use crate::data::real;
+
+/// Points in the axes of the camera.
+const POINTS: [[f64; 3]; 3] = [[0.5, -0.3, 2.0], [-1.2, 0.8, 3.0], [2.0, 1.5, 4.0]];
+
+type Pixels = [[f64; 2]; 3];
+
+/// Models of COLMAP with their numbers and parameters.
+const COLMAP: [(&str, i32, &[f64], Pixels); 11] = [
+    ("SIMPLE_PINHOLE", 0, &[700.0, 640.0, 400.0], PINHOLE),
+    (
+        "PINHOLE",
+        1,
+        &[700.0, 710.0, 640.0, 400.0],
+        [[815.0, 293.5], [360.0, 589.333333], [990.0, 666.25]],
+    ),
+    (
+        "SIMPLE_RADIAL",
+        2,
+        &[700.0, 640.0, 400.0, -0.1],
+        [[813.5125, 295.8925], [366.471111, 582.352593], [976.328125, 652.246094]],
+    ),
+    (
+        "RADIAL",
+        3,
+        &[700.0, 640.0, 400.0, -0.1, 0.02],
+        [[813.537788, 295.877327], [366.172002, 582.551999], [977.396240, 653.047180]],
+    ),
+    (
+        "OPENCV",
+        4,
+        &[700.0, 710.0, 640.0, 400.0, -0.1, 0.02, 0.001, -0.002],
+        [[813.191288, 294.588661], [365.251113, 585.727884], [976.411865, 656.606671]],
+    ),
+    ("OPENCV_FISHEYE", 5, &[700.0, 710.0, 640.0, 400.0, -0.03, -0.005, -0.001, 0.0007], FISHEYE),
+    (
+        "FULL_OPENCV",
+        6,
+        &[700.0, 710.0, 640.0, 400.0, -0.1, 0.02, 0.001, -0.002, -0.004, 0.01, 0.003, 0.001],
+        [[813.039615, 294.680964], [365.943324, 585.259818], [974.842847, 655.413097]],
+    ),
+    (
+        "SIMPLE_RADIAL_FISHEYE",
+        8,
+        &[700.0, 640.0, 400.0, -0.03],
+        [[809.869030, 298.078582], [380.570711, 572.952859], [949.887351, 632.415513]],
+    ),
+    (
+        "RADIAL_FISHEYE",
+        9,
+        &[700.0, 640.0, 400.0, -0.03, -0.005],
+        [[809.863515, 298.081891], [380.623337, 572.917775], [949.735065, 632.301299]],
+    ),
+    (
+        "SIMPLE_FISHEYE",
+        14,
+        &[700.0, 640.0, 400.0],
+        [[810.280138, 297.831917], [378.998337, 574.001108], [952.815617, 634.611712]],
+    ),
+    (
+        "FISHEYE",
+        15,
+        &[700.0, 710.0, 640.0, 400.0],
+        [[810.280138, 296.372373], [378.998337, 576.486838], [952.815617, 637.963308]],
+    ),
+];
+
+const PINHOLE: Pixels = [[815.0, 295.0], [360.0, 586.666667], [990.0, 662.5]];
+const FISHEYE: Pixels =
+    [[809.863432, 296.625969], [380.625153, 575.386801], [949.727637, 635.614238]];
+/// nerfstudio's lens of perspective models with k1, k2, k3, p1, p2 = -0.1, 0.02, -0.004, 0.001, -0.002.
+const NERFSTUDIO: Pixels =
+    [[813.190858, 294.588922], [365.264939, 585.718536], [976.328419, 656.543192]];
+
+fn check(camera: &Camera, wanted: &Pixels, about: &str) {
+    for (point, wanted) in POINTS.iter().zip(wanted) {
+        let pixel = camera.project(DVec3::from_array(*point)).unwrap();
+        let off = (pixel - glam::DVec2::from_array(*wanted)).length();
+        assert!(off < 1e-4, "{about}: {point:?} is at {pixel}, not {wanted:?}");
+    }
+}
+
+/// The camera of a COLMAP model of one image, as text.
+fn of_text(name: &str, parameters: &str) -> Result<Camera, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let cameras = format!("1 {name} 1280 800 {parameters}\n");
+    std::fs::write(dir.path().join("cameras.txt"), cameras).unwrap();
+    std::fs::write(dir.path().join("images.txt"), "1 1 0 0 0 0 0 0 1 a.png\n\n").unwrap();
+    let read = read_colmap(dir.path()).map_err(|error| error.to_string())?;
+    Ok(read[0].camera)
+}
+
+/// The same, in the binary form.
+fn of_bytes(number: i32, parameters: &[f64]) -> Result<Camera, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let one = 1_u64.to_le_bytes();
+    let id = 1_i32.to_le_bytes();
+    let mut cameras = [&one[..], &id, &number.to_le_bytes()].concat();
+    cameras.extend([1280_u64, 800].iter().flat_map(|side| side.to_le_bytes()));
+    cameras.extend(parameters.iter().flat_map(|value| value.to_le_bytes()));
+    let mut images = [&one[..], &id].concat();
+    images.extend([1.0_f64, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0].iter().flat_map(|v| v.to_le_bytes()));
+    images.extend([&id[..], b"a.png\0", &0_u64.to_le_bytes()].concat());
+    std::fs::write(dir.path().join("cameras.bin"), cameras).unwrap();
+    std::fs::write(dir.path().join("images.bin"), images).unwrap();
+    let read = read_colmap(dir.path()).map_err(|error| error.to_string())?;
+    Ok(read[0].camera)
+}
+
+#[test]
+fn models_of_colmap_are_those_of_opencv() {
+    for (name, number, parameters, wanted) in COLMAP {
+        let text: Vec<String> = parameters.iter().map(f64::to_string).collect();
+        check(&of_text(name, &text.join(" ")).unwrap(), &wanted, name);
+        check(&of_bytes(number, parameters).unwrap(), &wanted, name);
+    }
+}
+
+#[test]
+fn models_of_colmap_without_a_lens_are_not_supported() {
+    for (number, name) in [
+        (7, "FOV"),
+        (10, "THIN_PRISM_FISHEYE"),
+        (11, "RAD_TAN_THIN_PRISM_FISHEYE"),
+        (12, "SIMPLE_DIVISION"),
+        (13, "DIVISION"),
+        (16, "EUCM"),
+        (17, "EQUIRECTANGULAR"),
+    ] {
+        let wanted = format!("the camera model {name} is not supported");
+        for text in [of_text(name, "1 2 3").unwrap_err(), of_bytes(number, &[]).unwrap_err()] {
+            assert!(text.contains(&wanted), "{text}");
+        }
+    }
+    assert!(of_text("LENS", "1").unwrap_err().contains("\"LENS\" is not a camera model of COLMAP"));
+    assert!(of_bytes(99, &[]).unwrap_err().contains("model 99 is not one of COLMAP's"));
+}
+
+/// The camera of a transforms.json with these fields of the file.
+fn of_transforms(fields: &str) -> Result<Camera, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("transforms.json");
+    let frame =
+        r#"{"file_path": "a.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}"#;
+    let text = format!(r#"{{"w": 1280, "h": 800, {fields}, "frames": [{frame}]}}"#);
+    std::fs::write(&path, text).unwrap();
+    let read = read_nerfstudio_frames(&path).map_err(|error| error.to_string())?;
+    Ok(read[0].posed.camera)
+}
+
+#[test]
+fn lenses_of_transforms_are_those_of_their_programs() {
+    let focal = r#""fl_x": 700, "fl_y": 710, "cx": 640, "cy": 400"#;
+    let k = r#""k1": -0.03, "k2": -0.005, "k3": -0.001, "k4": 0.0007"#;
+    let opencv = r#""k1": -0.1, "k2": 0.02, "k3": -0.004, "p1": 0.001, "p2": -0.002"#;
+    let list = r#""distortion_params": [-0.1, 0.02, -0.004, 0, 0.001, -0.002]"#;
+    let cases = [
+        // nerfstudio, its exporters of Metashape and Record3D.
+        (format!(r#"{focal}, "camera_model": "OPENCV", {opencv}"#), NERFSTUDIO),
+        (format!(r#"{focal}, "camera_model": "OPENCV", {list}"#), NERFSTUDIO),
+        (format!(r#"{focal}, "camera_model": "OPENCV_FISHEYE", {k}"#), FISHEYE),
+        // instant-ngp.
+        (format!(r#"{focal}, {opencv}"#), NERFSTUDIO),
+        (format!(r#"{focal}, "is_fisheye": true, {k}"#), FISHEYE),
+        // Angles of view: 2 atan(640 / 700) and 2 atan(400 / 700).
+        (r#""camera_angle_x": 1.4813038638856655, "camera_angle_y": 1.0382922284930458284930458"#.to_owned(), PINHOLE),
+        (r#""x_fov": 84.87245957707, "is_fisheye": false"#.to_owned(), PINHOLE),
+        (r#""fl_y": 700, "rolling_shutter": [0, 0, 0, 0]"#.to_owned(), PINHOLE),
+    ];
+    for (fields, wanted) in cases {
+        let camera = of_transforms(&fields).unwrap_or_else(|error| panic!("{fields}: {error}"));
+        let off = POINTS.iter().zip(&wanted).map(|(point, wanted)| {
+            let pixel = camera.project(DVec3::from_array(*point)).unwrap();
+            (pixel - glam::DVec2::from_array(*wanted)).length()
+        });
+        assert!(off.fold(0.0, f64::max) < 1e-3, "{fields}");
+    }
+}
+
+#[test]
+fn fields_of_transforms_that_make_another_camera_are_named() {
+    let focal = r#""fl_x": 700"#;
+    for (fields, named) in [
+        (r#""k4": 0.02"#, "k4: is 0.02"),
+        (r#""camera_model": "OPENCV", "k4": 0.02"#, "k4: is 0.02"),
+        (r#""camera_model": "OPENCV_FISHEYE", "p1": 0.1"#, "p1: is 0.1"),
+        (
+            r#""camera_model": "OPENCV", "is_fisheye": true"#,
+            "is_fisheye: is true, and camera_model",
+        ),
+        (r#""is_fisheye": 1"#, "is_fisheye: is 1, not true or false"),
+        (r#""camera_model": "FISHEYE624""#, "camera_model: is \"FISHEYE624\""),
+        (r#""camera_model": 4"#, "camera_model: is 4, not a text"),
+        (r#""distortion_params": [1, 2]"#, "distortion_params: is [1,2]"),
+        (r#""ftheta_p0": 0.1"#, "ftheta_p0: is not read"),
+        (r#""equirectangular": true"#, "equirectangular: is not read"),
+        (r#""rolling_shutter": [0, 0, 0.01, 0]"#, "rolling_shutter: is not read"),
+        (r#""x_fov": 50"#, "x_fov: says a focal length of"),
+    ] {
+        let text = of_transforms(&format!("{focal}, {fields}")).unwrap_err();
+        assert!(text.contains(named), "{text}");
+    }
+}
+
+#[test]
+fn cases_of_captures_are_read_or_refused_by_name() {
+    let Some(fisheye) = real("cases/ingp_is_fisheye/ingp_fisheye.json") else { return };
+    let read = read_nerfstudio_frames(&fisheye).unwrap();
+    let at = read[0].posed.camera.project(DVec3::new(1.0, 0.0, 1.0)).unwrap();
+    // 700 θ (1 + k1 θ² + ..) of 45°.
+    let square = std::f64::consts::FRAC_PI_4.powi(2);
+    let k = [1.0, -0.03, -0.005, -0.001, 0.0007];
+    let radius = k.iter().rev().fold(0.0, |sum, k| sum * square + k) * square.sqrt();
+    assert!((at.x - 640.0 - 700.0 * radius).abs() < 1e-6, "{at}");
+    let k4 = real("cases/transforms_k4/ns_k4.json").unwrap();
+    assert!(read_nerfstudio_frames(&k4).unwrap_err().to_string().contains("frames[0].k4: is 0.02"));
+    let timed = real("cases/transforms_time_us/tj_time.json").unwrap();
+    let times_us: Vec<_> =
+        read_nerfstudio_frames(&timed).unwrap().iter().map(|frame| frame.posed.time_us).collect();
+    assert_eq!(times_us[..3], [Some(0), Some(500_000), Some(1_000_000)]);
+    for model in ["SIMPLE_FISHEYE", "bin_fisheye"] {
+        let file = if model == "bin_fisheye" { "cameras.bin" } else { "cameras.txt" };
+        let path = real(&format!("cases/colmap_new_models/{model}/{file}")).unwrap();
+        assert!(!read_colmap(path.parent().unwrap()).unwrap().is_empty());
+    }
+    let eucm = real("cases/colmap_new_models/EUCM/cameras.txt").unwrap();
+    let text = read_colmap(eucm.parent().unwrap()).unwrap_err().to_string();
+    assert!(text.contains("the camera model EUCM is not supported"), "{text}");
+}
