@@ -15,10 +15,12 @@ use glam::{DVec2, DVec3};
 use parking_lot::Mutex;
 use serde::{Deserialize, Serialize};
 
-use wildcity_scene::Gaussians;
-use wildcity_scene::chunk::BLOCK_M;
+use wildcity_scene::Chunk;
+use wildcity_scene::chunk::{BLOCK_M, column};
 use wildcity_scene::geometry::Pose;
-use wildcity_sim::contact::{MAX_SWEPT_SPEED_MPS, SolidPoint, Solids, StaticLimit, TestedBox};
+use wildcity_sim::contact::{
+    MAX_SWEPT_SPEED_MPS, SOLID_OPACITY, SolidPoint, Solids, StaticLimit, TestedBox,
+};
 use wildcity_sim::traffic::{EgoBox, EgoMotion, EgoState};
 use wildcity_sim::{Ego, EgoModel};
 use wildcity_twin::store::{Catalog, StoreError};
@@ -199,12 +201,9 @@ impl TwinSolids {
         let solids = match self.blocks.get(&section.hash) {
             Some(solids) => solids,
             None => {
-                let version = self.index.version();
-                let gaussians = self.catalog.section(version, chunk, section)?.to_gaussians();
-                // An opacity of one half has the logit 0. Most of the work is for Gaussians that are solid.
-                let solid = (0..gaussians.len()).filter(|i| gaussians.logit_opacities[*i] >= 0.0);
-                let points = solid.map(|index| point(&gaussians, index));
-                let solids = Arc::new(Solids::new(points));
+                let read = self.catalog.section(self.index.version(), chunk, section)?;
+                let solid = (0..read.len()).filter_map(|index| solid_point(&read, index));
+                let solids = Arc::new(Solids::new(solid));
                 self.blocks.insert(section.hash, solids.clone());
                 solids
             }
@@ -219,12 +218,14 @@ fn corner_m([x, y]: Block) -> DVec2 {
     BLOCK_M * DVec2::new(x as f64, y as f64) - 0.5 * wildcity_scene::chunk::CELL_M
 }
 
-/// A Gaussian of the twin, activated.
-fn point(gaussians: &Gaussians, index: usize) -> SolidPoint {
-    let logit = f64::from(gaussians.logit_opacities[index]);
-    SolidPoint {
-        mean_m: DVec3::from_array(gaussians.means_m[index]),
-        sigma_m: DVec3::from_array(gaussians.ln_scales[index].map(|ln| f64::from(ln).exp())),
-        opacity: 1.0 / (1.0 + (-logit).exp()),
-    }
+/// A Gaussian of a section in world axes; `None` if it is not solid, as most are not in a capture.
+fn solid_point(section: &Chunk, index: usize) -> Option<SolidPoint> {
+    let value = |column| f64::from(section.value(index, column));
+    let vector = |first| DVec3::new(value(first), value(first + 1), value(first + 2));
+    let opacity = value(column::LOG2_OPACITY).exp2();
+    (opacity >= SOLID_OPACITY).then(|| SolidPoint {
+        mean_m: section.origin_m() + vector(column::MEAN),
+        sigma_m: vector(column::SCALE),
+        opacity,
+    })
 }

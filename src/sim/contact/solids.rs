@@ -35,6 +35,9 @@ struct Solid {
     area_m2: f32,
 }
 
+/// A cell, and a cube within it.
+type CubeKey = ([i32; 2], [i32; 3]);
+
 /// A Gaussian with its cell, and its cube within the cell.
 struct CubePoint {
     cell: [i32; 2],
@@ -49,6 +52,10 @@ impl CubePoint {
         let from_corner_m = point.mean_m - corner_m(cell).extend(0.0);
         let cube = (from_corner_m / MERGED_M).floor().as_ivec3().to_array();
         Self { cell, cube, from_corner_m, area_m2: point.area_m2() }
+    }
+
+    fn key(&self) -> CubeKey {
+        (self.cell, self.cube)
     }
 }
 
@@ -107,18 +114,22 @@ impl Solids {
     /// The Gaussians among `points` that are solid, each in world axes.
     pub fn new(points: impl IntoIterator<Item = SolidPoint>) -> Self {
         let solid = points.into_iter().filter(|point| point.opacity >= SOLID_OPACITY);
-        let mut points: Vec<CubePoint> = solid.map(CubePoint::new).collect();
-        // Stable: a sum of areas depends on its order in the last digits.
-        points.sort_by_key(|point| (point.cell, point.cube));
+        let points: Vec<CubePoint> = solid.map(CubePoint::new).collect();
+        // By cube, and within a cube in the given order: a sum of areas depends on its order in the last digits.
+        let mut order: Vec<(CubeKey, usize)> =
+            points.iter().enumerate().map(|(index, point)| (point.key(), index)).collect();
+        order.sort_unstable();
         let mut cells: BTreeMap<[i32; 2], Vec<Solid>> = BTreeMap::new();
-        for cube in points.chunk_by(|a, b| (a.cell, a.cube) == (b.cell, b.cube)) {
-            let area_m2: f64 = cube.iter().map(|point| point.area_m2).sum();
-            let moment: DVec3 = cube.iter().map(|point| point.area_m2 * point.from_corner_m).sum();
+        for cube in order.chunk_by(|a, b| a.0 == b.0) {
+            let of_cube = || cube.iter().map(|(_, index)| &points[*index]);
+            let area_m2: f64 = of_cube().map(|point| point.area_m2).sum();
+            let moment: DVec3 = of_cube().map(|point| point.area_m2 * point.from_corner_m).sum();
             // A Gaussian without extent has no area, and no contact.
             if area_m2 > 0.0 {
                 let mean_m = (moment / area_m2).as_vec3().to_array();
                 let solid = Solid { mean_m, area_m2: area_m2 as f32 };
-                cells.entry(cube[0].cell).or_default().push(solid);
+                let (([x, y], _), _) = cube[0];
+                cells.entry([x, y]).or_default().push(solid);
             }
         }
         for solids in cells.values_mut() {
