@@ -11,6 +11,7 @@
 pub mod geojson;
 pub mod opendrive;
 pub mod openscenario;
+mod xml;
 
 /// Largest text that is read, in bytes.
 pub const TEXT_BYTES: usize = 256 << 20;

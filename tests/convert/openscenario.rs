@@ -2,8 +2,21 @@
 
 use wildcity_convert::openscenario::{Settings, read};
 use wildcity_sim::scenario::{
-    ActionSection, Document, EgoStart, Scenario, ScenarioFile, Surroundings,
+    ActionSection, Document, EgoStart, ProfileSection, QuantitySection, Scenario, ScenarioFile,
+    ShapeSection, Surroundings,
 };
+
+/// A linear change within a time.
+fn linear(to: f64, over_s: f64) -> ProfileSection {
+    ProfileSection {
+        to,
+        shape: ShapeSection::Linear,
+        over_s: Some(over_s),
+        over_m: None,
+        rate: None,
+        acceleration: None,
+    }
+}
 
 /// An ego, a car that cuts in, and a pedestrian that crosses: every element that is read.
 pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
@@ -121,7 +134,12 @@ pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
 "#;
 
 pub(crate) fn settings() -> Settings {
-    Settings { name: "cut-in".into(), twin: "street".into(), ego: "Ego".into() }
+    Settings {
+        name: "cut-in".into(),
+        twin: "street".into(),
+        ego: "Ego".into(),
+        ..Settings::default()
+    }
 }
 
 fn resolved(file: ScenarioFile) -> Scenario {
@@ -132,14 +150,17 @@ fn resolved(file: ScenarioFile) -> Scenario {
 
 #[test]
 fn a_scenario_is_read_and_runs() {
-    let file = read(CUT_IN.as_bytes(), &settings()).unwrap();
+    let file = read(CUT_IN.as_bytes(), &settings()).unwrap().file;
     assert_eq!(file.ego.dynamics.unwrap().speed, 10.0);
     assert_eq!(file.end.time_s, Some(20.0));
     let van = file.actors.iter().find(|actor| actor.name == "cut-in").unwrap();
-    assert_eq!(van.script[0].when.within_m, Some(15.0));
+    let near = van.script[0].when.measure.as_ref().unwrap();
+    assert_eq!((near.quantity, near.below), (QuantitySection::Distance, Some(15.0)));
+    // From the box's middle back to the reference point.
+    assert_eq!((near.ahead_m, near.to_ahead_m), (Some(-1.4), Some(-1.3)));
     assert_eq!(van.script[1].when.after.as_deref(), Some("cut-in/swerve"));
     // From 8 to 2 m/s in 2 s.
-    assert_eq!(van.script[1].then, [ActionSection::Speed { to: 2.0, rate: 3.0 }]);
+    assert_eq!(van.script[1].then, [ActionSection::SpeedProfile(linear(2.0, 2.0))]);
     // It is written as our JSON, and read again.
     let text = serde_json::to_vec_pretty(&file).unwrap();
     let again = Document::parse(&text).unwrap().with(&Default::default()).unwrap();
