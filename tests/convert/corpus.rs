@@ -20,11 +20,18 @@ fn files(dir: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
+/// Directories of catalogs that files take for granted: `$WILDCITY_OPENSCENARIO_CATALOGS`, with `:` between them.
+fn catalogs() -> Vec<PathBuf> {
+    std::env::var_os("WILDCITY_OPENSCENARIO_CATALOGS")
+        .map_or_else(Vec::new, |paths| std::env::split_paths(&paths).collect())
+}
+
 /// Imports a file and resolves the scenario.
 fn import(path: &Path, parts: &[Part]) -> Result<(), String> {
     let bytes = std::fs::read(path).unwrap();
     let text = String::from_utf8_lossy(&bytes);
-    let name_of = |object: &str| Some(object.split_once("name=\"")?.1.split_once('"')?.0.to_owned());
+    let name_of =
+        |object: &str| Some(object.split_once("name=\"")?.1.split_once('"')?.0.to_owned());
     let names: Vec<String> = text.split("<ScenarioObject ").skip(1).filter_map(name_of).collect();
     let ego = names.iter().find(|name| *name == "Ego").or(names.first()).cloned();
     let settings = Settings {
@@ -33,10 +40,14 @@ fn import(path: &Path, parts: &[Part]) -> Result<(), String> {
         ego: ego.unwrap_or_default(),
         directory: Some(path.parent().unwrap().to_owned()),
         leave_out: parts.iter().copied().collect(),
+        catalogs: match parts {
+            [] => Vec::new(),
+            _ => catalogs(),
+        },
         ..Settings::default()
     };
     let imported = read(&bytes, &settings).map_err(|error| error.to_string())?;
-    let json = serde_json::to_vec_pretty(&imported.file).unwrap();
+    let json = serde_json::to_vec(&imported.file).unwrap();
     let document = Document::parse(&json).map_err(|error| format!("JSON: {error}"))?;
     let file = document.with(&document.first_values()).map_err(|error| format!("JSON: {error}"))?;
     let nothing = |_: &str| Err("there is none".to_owned());
@@ -62,7 +73,8 @@ fn most_public_files_import() {
     let mut scenarios = 0;
     let mut refusals: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for path in &paths {
-        let is_catalog = String::from_utf8_lossy(&std::fs::read(path).unwrap()).contains("<Catalog ");
+        let is_catalog =
+            String::from_utf8_lossy(&std::fs::read(path).unwrap()).contains("<Catalog ");
         if is_catalog {
             continue;
         }
@@ -71,13 +83,15 @@ fn most_public_files_import() {
         match import(path, &all) {
             Ok(()) => with_parts += 1,
             Err(error) => {
-                let kind: String = error.chars().filter(|c| !c.is_ascii_digit()).take(120).collect();
+                let kind: String =
+                    error.chars().filter(|c| !c.is_ascii_digit()).take(120).collect();
                 let name = path.file_name().unwrap().to_string_lossy().into_owned();
                 refusals.entry(kind).or_default().push(format!("{name}: {error}"));
             }
         }
     }
-    let mut lines = vec![format!("{scenarios} scenarios, {plain} import, {with_parts} with parts left out")];
+    let mut lines =
+        vec![format!("{scenarios} scenarios, {plain} import, {with_parts} with parts left out")];
     let mut kinds: Vec<_> = refusals.into_values().collect();
     kinds.sort_by_key(|kind| std::cmp::Reverse(kind.len()));
     lines.extend(kinds.iter().map(|kind| format!("{:4}  {}", kind.len(), kind[0])));

@@ -71,7 +71,7 @@ fn lanes_have_their_places_directions_and_links() {
 fn what_is_no_map_is_refused() {
     let place = |text: &str| opendrive::read(text.as_bytes(), None).unwrap_err();
     assert_eq!(place("<OpenDRIVE/>").place, "OpenDRIVE");
-    assert_eq!(place("{}").place, "OpenDRIVE");
+    assert_eq!(place("{}").place, "XML");
     let far = ROADS.replace("x=\"0.0\" y=\"0.0\"", "x=\"400000.0\" y=\"5000000.0\"");
     let error = place(&far);
     assert!(error.message.contains("--origin 400000.0,5000000.0"), "{error}");
@@ -94,8 +94,7 @@ fn assert_near(found: [f64; 3], wanted: [f64; 3]) {
 fn roads_far_from_the_origin_move_to_it_and_give_its_place_on_the_earth() {
     let anchor = "EPSG:32632,691000,5334000".parse().unwrap();
     let origin = Some([691_000.0, 5_334_000.0]);
-    for (name, origin) in [("utm", origin), ("utm_off", None), ("utm_off", origin)]
-    {
+    for (name, origin) in [("utm", origin), ("utm_off", None), ("utm_off", origin)] {
         let Some(text) = case(&format!("xodr_utm/{name}.xodr")) else { return };
         let imported = opendrive::read(&text, origin).unwrap();
         let [from, to] = ends(&imported.map, "1/0/1");
@@ -163,7 +162,8 @@ fn edges_of_a_widening_lane_are_across_the_road() {
 /// The reader of roads takes a number that is none for 0: a lane of no length.
 #[test]
 fn numbers_that_are_none_are_refused() {
-    let curve = "<paramPoly3 aU=\"0\" bU=\"1\" cU=\"0\" dU=\"0\" aV=\"0\" bV=\"0\" cV=\"NaN\" dV=\"0\"/>";
+    let curve =
+        "<paramPoly3 aU=\"0\" bU=\"1\" cU=\"0\" dU=\"0\" aV=\"0\" bV=\"0\" cV=\"NaN\" dV=\"0\"/>";
     let text = ROADS.replacen("<line/>", curve, 1);
     let error = opendrive::read(text.as_bytes(), None).unwrap_err();
     assert!(error.place.ends_with("<paramPoly3>") && error.message.contains("cV"), "{error}");

@@ -84,7 +84,8 @@ fn anchor_text(geo: &GeoAnchor) -> String {
 /// EAST,NORTH.
 pub(in crate::cli) fn origin(text: &str) -> Result<[f64; 2], String> {
     let expected = || {
-        "expected two numbers, for example 691000,5334000 in metres or 11.58,48.14 in degrees".to_owned()
+        "expected two numbers, for example 691000,5334000 in metres or 11.58,48.14 in degrees"
+            .to_owned()
     };
     let (east, north) = text.split_once(',').ok_or_else(expected)?;
     let number = |text: &str| {

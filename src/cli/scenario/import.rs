@@ -38,6 +38,10 @@ pub(in crate::cli) struct Import {
     #[arg(long, value_name = "FILE")]
     roads: Option<PathBuf>,
 
+    /// Another directory of catalogs; once for each.
+    #[arg(long, value_name = "DIR")]
+    catalogs: Vec<PathBuf>,
+
     /// Easting and northing of the twin's origin, as in `wildcity map import --origin` of these roads.
     #[arg(long, value_name = "EAST,NORTH", value_parser = crate::cli::map::origin, allow_hyphen_values = true)]
     origin: Option<[f64; 2]>,
@@ -47,7 +51,8 @@ pub(in crate::cli) struct Import {
     parameters: Vec<(String, String)>,
 
     /// Parts to leave out: controllers, ego (actions of the entity that the agent drives), environment, appearance,
-    /// signals, stop (conditions of the end that are no time), custom. Each that is left out is listed.
+    /// signals, stop (conditions of the end that are no time), distances, routes,
+    /// trailers, custom. Each that is left out is listed.
     #[arg(long, value_name = "PART,...", value_delimiter = ',', value_parser = part)]
     leave_out: Vec<openscenario::Part>,
 
@@ -66,6 +71,7 @@ impl Import {
             twin: self.twin.clone(),
             ego: self.ego.clone(),
             directory: Some(self.file.parent().unwrap_or(Path::new("")).to_owned()),
+            catalogs: self.catalogs.clone(),
             roads: self.roads.clone(),
             origin: self.origin,
             parameters: self.parameters.iter().cloned().collect(),
@@ -74,6 +80,9 @@ impl Import {
         let imported = openscenario::read(&bytes, &settings).with_context(context)?;
         let scenario = imported.file;
         let mut text = serde_json::to_vec_pretty(&scenario)?;
+        if text.len() > wildcity_sim::limits::SCENARIO_BYTES {
+            text = serde_json::to_vec(&scenario)?;
+        }
         text.push(b'\n');
         output::write(&self.out, &text)?;
         let mut out = io::stdout().lock();

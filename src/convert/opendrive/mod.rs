@@ -8,7 +8,9 @@ mod frame;
 use glam::DVec3;
 use wildcity_scene::geo::GeoAnchor;
 use wildcity_sim::map::{Area, AreaKind, Lane, LaneKind, MapFile};
-use xodr::{Direction, LanePosition, LaneType, Point, RoadId, RoadNetwork, RoadPosition, SpeedLimit};
+use xodr::{
+    Direction, LanePosition, LaneType, Point, RoadId, RoadNetwork, RoadPosition, SpeedLimit,
+};
 
 use crate::{ConvertError, text_of};
 
@@ -182,4 +184,3 @@ fn kind_of(kind: LaneType) -> Option<LaneKind> {
 pub(crate) fn array(point: Point) -> [f64; 3] {
     [point.x, point.y, point.z].map(f64::from)
 }
-

@@ -27,11 +27,23 @@ pub(super) fn private_act(
     context: &Context<'_>,
 ) -> Result<Option<Act>, ConvertError> {
     match kind.name() {
-        "LongitudinalAction" => Ok(Some(Act::Speed(speed_of(&kind.only_child()?, context)?))),
+        "LongitudinalAction" => {
+            let action = kind.only_child()?;
+            if action.name() == "LongitudinalDistanceAction" {
+                return action.leave_out(Part::Distances).map(|()| None);
+            }
+            if let Some(act) = match_of(&action, name, context)? {
+                return Ok(Some(act));
+            }
+            let profile = speed_of(&action, context)?;
+            // A rate of 0 keeps the speed.
+            Ok((profile.rate != Some(0.0)).then_some(Act::Speed(profile)))
+        }
         "LateralAction" => {
             let action = kind.only_child()?;
             match action.name() {
                 "LaneChangeAction" => lane_change_of(&action, name, context).map(Some),
+                "LateralDistanceAction" => action.leave_out(Part::Distances).map(|()| None),
                 "LaneOffsetAction" => Ok(Some(Act::Offset(offset_of(&action)?))),
                 _ => Err(action.unread()),
             }
@@ -42,15 +54,50 @@ pub(super) fn private_act(
                 "FollowTrajectoryAction" => {
                     Ok(Some(Act::Trajectory(trajectory_of(&action, context)?)))
                 }
+                "AssignRouteAction" | "AcquirePositionAction" | "RandomRouteAction" => {
+                    action.leave_out(Part::Routes).map(|()| None)
+                }
                 _ => Err(action.unread()),
             }
         }
+        "SynchronizeAction" => kind.leave_out(Part::Distances).map(|()| None),
+        "TrailerAction" => kind.leave_out(Part::Trailers).map(|()| None),
         "ControllerAction" | "ActivateControllerAction" => {
             kind.leave_out(Part::Controllers).map(|()| None)
         }
         "AppearanceAction" | "VisibilityAction" => kind.leave_out(Part::Appearance).map(|()| None),
         _ => Err(kind.unread()),
     }
+}
+
+/// A speed that follows that of another entity; `None` for another action.
+pub(super) fn match_of(
+    speed: &Element<'_>,
+    own: &str,
+    context: &Context<'_>,
+) -> Result<Option<Act>, ConvertError> {
+    let Some(target) = speed.find("SpeedActionTarget")? else { return Ok(None) };
+    let target = target.only_child()?;
+    if target.name() != "RelativeTargetSpeed" || !target.find_flag("continuous")?.unwrap_or(false) {
+        return Ok(None);
+    }
+    speed.only(&["SpeedActionDynamics", "SpeedActionTarget"])?;
+    let dynamics = speed.need("SpeedActionDynamics")?;
+    if dynamics_of(&dynamics)?.shape != ShapeSection::Step {
+        let message = "is read as a step only, because the other's speed may change meanwhile";
+        return Err(dynamics.wrong(message));
+    }
+    let name = target.text("entityRef")?;
+    if !context.entities.contains_key(&name) || name == own {
+        return Err(target.wrong(&format!("there is no other entity {name:?}")));
+    }
+    let value = target.number("value")?;
+    let (factor, delta_mps) = match target.text("speedTargetValueType")?.as_str() {
+        "delta" => (1.0, value),
+        "factor" => (value, 0.0),
+        _ => return Err(target.wrong("speedTargetValueType is delta or factor")),
+    };
+    Ok(Some(Act::Match { of: context.actor_name(&name), factor, delta_mps }))
 }
 
 /// The aim and the dynamics of a `<SpeedAction>`.
@@ -76,7 +123,17 @@ pub(super) fn speed_of(
         return Err(target.wrong(&format!("is {to:?} m/s; at most {most} m/s are accepted")));
     }
     let dynamics = speed.need("SpeedActionDynamics")?;
-    Ok(ProfileSection { to, ..dynamics_of(&dynamics)? })
+    let profile = dynamics_of(&dynamics)?;
+    match (profile.over_m, profile.shape) {
+        (None, _) => {}
+        (Some(_), ShapeSection::Linear) => {
+            dynamics.note("is a constant acceleration over the distance");
+        }
+        (Some(_), _) => {
+            return Err(dynamics.wrong("is read over a distance only as linear; give a time"));
+        }
+    }
+    Ok(ProfileSection { to, ..profile })
 }
 
 /// A speed relative to that with which an entity begins.
@@ -119,13 +176,32 @@ fn dynamics_of(dynamics: &Element<'_>) -> Result<ProfileSection, ConvertError> {
     match dimension.as_str() {
         "time" => Ok(ProfileSection { over_s: Some(extent), ..profile }),
         "distance" => Ok(ProfileSection { over_m: Some(extent), ..profile }),
-        "rate" if extent >= 1e-3 => Ok(ProfileSection { rate: Some(extent), ..profile }),
-        "rate" => Err(dynamics.wrong("a rate of 0 never arrives; give a larger one")),
+        "rate" if extent == 0.0 || extent >= 1e-3 => {
+            Ok(ProfileSection { rate: Some(extent), ..profile })
+        }
+        "rate" => Err(dynamics.wrong("is slower than 0.001 per second; give a larger rate")),
         other => {
             let message = format!("dynamicsDimension={other:?}; rate, time or distance is read");
             Err(dynamics.wrong(&message))
         }
     }
+}
+
+/// The change of speed of a `<SpeedProfileEntry>`, and how long it takes, in seconds.
+pub(super) fn profile_entry(entry: &Element<'_>) -> Result<(Act, f64), ConvertError> {
+    entry.only(&[])?;
+    let to = entry.number("speed")?;
+    if !(0.0..=limits::ACTOR_SPEED_M_S).contains(&to) {
+        let most = limits::ACTOR_SPEED_M_S;
+        return Err(entry.wrong(&format!("speed={to:?}; 0 to {most} m/s are accepted")));
+    }
+    let over_s = entry.number("time")?;
+    let profile = match over_s {
+        over_s if over_s < 0.0 => return Err(entry.wrong("time is below 0")),
+        over_s if over_s < 0.01 => NOWHERE,
+        over_s => ProfileSection { shape: ShapeSection::Linear, over_s: Some(over_s), ..NOWHERE },
+    };
+    Ok((Act::Speed(ProfileSection { to, ..profile }), over_s))
 }
 
 fn shape_of(dynamics: &Element<'_>) -> Result<ShapeSection, ConvertError> {
@@ -135,7 +211,9 @@ fn shape_of(dynamics: &Element<'_>) -> Result<ShapeSection, ConvertError> {
         "sinusoidal" => Ok(ShapeSection::Sinusoidal),
         "cubic" => Ok(ShapeSection::Cubic),
         other => {
-            let message = format!("dynamicsShape={other:?} is not read; step, linear, sinusoidal or cubic is");
+            let message = format!(
+                "dynamicsShape={other:?} is not read; step, linear, sinusoidal or cubic is"
+            );
             Err(dynamics.wrong(&message))
         }
     }
@@ -155,7 +233,8 @@ fn lane_change_of(
             let of = target.text("entityRef")?;
             let count = target.whole("value")?;
             let entity = context.entities.get(&of);
-            let entity = entity.ok_or_else(|| target.wrong(&format!("there is no entity {of:?}")))?;
+            let entity =
+                entity.ok_or_else(|| target.wrong(&format!("there is no entity {of:?}")))?;
             let spot = entity.place.and_then(|place| place.spot);
             let (Some(lane), Some(spot)) = (entity.lane, spot) else {
                 return Err(target.wrong(&format!("{of:?} is on no lane")));
@@ -171,7 +250,11 @@ fn lane_change_of(
         }
         _ => return Err(target.unread()),
     };
-    let profile = dynamics_of(&action.need("LaneChangeActionDynamics")?)?;
+    let dynamics = action.need("LaneChangeActionDynamics")?;
+    let profile = dynamics_of(&dynamics)?;
+    if profile.rate == Some(0.0) {
+        return Err(dynamics.wrong("a rate of 0 never arrives; give a larger one"));
+    }
     Ok(Act::Lane { lane, offset_m, profile })
 }
 
@@ -208,6 +291,9 @@ pub(super) fn trajectory_of(
         "TimeReference",
         "TrajectoryFollowingMode",
     ])?;
+    if follow.number_or_0("initialDistanceOffset")? != 0.0 {
+        return Err(follow.wrong("initialDistanceOffset is not read; begin the trajectory there"));
+    }
     if let Some(mode) = follow.find("TrajectoryFollowingMode")? {
         mode.expect("followingMode", &["position", "follow"])?;
     }

@@ -2,10 +2,11 @@
 
 use glam::DVec2;
 
+use wildcity_sim::limits;
 use wildcity_sim::scenario::{
     ActionSection, ActorSection, CollideSection, CourseSection, DynamicsSection, EgoBoxSection,
-    EgoSection, ModelSection, PathSection, PoseSection, ProfileSection, StartSection, TimedPosition,
-    TriggerSection,
+    EgoSection, ModelSection, PathSection, PoseSection, ProfileSection, ShapeSection, StartSection,
+    TimedPosition, TriggerSection,
 };
 
 use super::ledger::Ledger;
@@ -81,7 +82,9 @@ impl Builder<'_, '_> {
         match &entity.line {
             Some(Line { points, times_s: Some(times_s), .. }) => {
                 if moves {
-                    return Err("has timed positions and events that move it; keep one of them".into());
+                    return Err(
+                        "has timed positions and events that move it; keep one of them".into()
+                    );
                 }
                 actor.collide = Some(self.timed(entity, &place, points, times_s));
             }
@@ -105,6 +108,10 @@ impl Builder<'_, '_> {
         let triggers: Result<Vec<TriggerSection>, String> =
             entity.script.iter().map(|draft| self.trigger_of(draft, &mut drive)).collect();
         actor.script = triggers?;
+        let count = actor.script.len();
+        if count > limits::TRIGGERS {
+            return Err(format!("has {count} actions; at most {} are accepted", limits::TRIGGERS));
+        }
         Ok(actor)
     }
 
@@ -136,9 +143,10 @@ impl Builder<'_, '_> {
     fn ahead(&self, drive: &mut Drive<'_>) -> Result<PathSection, String> {
         let Drive { entity, place, length_m, .. } = *drive;
         let [ahead_m, left_m, _] = entity.center_m;
-        let lanes = self.context.roads.as_ref().zip(place.spot).map(|(roads, spot)| {
-            (spot, roads.line(spot, length_m + ahead_m.abs()))
-        });
+        let lanes =
+            self.context.roads.as_ref().zip(place.spot).map(|(roads, spot)| {
+                (spot, roads.line(spot, length_m + ahead_m.abs(), &entity.route))
+            });
         let Some((spot, line)) = lanes.filter(|(_, line)| line.points.len() >= 2) else {
             if let Some(reason) = &self.context.missing_roads {
                 return Err(format!("drives on roads that were not read: {reason}"));
@@ -195,7 +203,7 @@ impl Builder<'_, '_> {
         drive.lanes = None;
         match roads.zip(spot) {
             Some((roads, spot)) => {
-                let lanes = roads.line(spot, drive.length_m);
+                let lanes = roads.line(spot, drive.length_m, &drive.entity.route);
                 self.note_forks(drive.entity, &lanes);
                 let left_m = side(spot) * spot.at.offset;
                 points.extend(moved_left(&lanes.points, left_m).into_iter().skip(1));
@@ -214,6 +222,11 @@ impl Builder<'_, '_> {
         for act in &draft.then {
             match act {
                 Act::Speed(profile) => then.push(ActionSection::SpeedProfile(*profile)),
+                Act::Match { of, factor, delta_mps } => then.push(ActionSection::SpeedMatch {
+                    of: of.clone(),
+                    factor: (*factor != 1.0).then_some(*factor),
+                    delta: (*delta_mps != 0.0).then_some(*delta_mps),
+                }),
                 Act::Offset(profile) => {
                     let sign = drive.lanes.as_ref().map_or(1.0, |(spot, _)| side(*spot));
                     let to = sign * profile.to + left_m;
@@ -225,7 +238,12 @@ impl Builder<'_, '_> {
                     else {
                         return Err(format!("changes to lane {lane}, but is on no lane"));
                     };
-                    let target = roads.line_of_lane(line, *spot, *lane, drive.length_m)?;
+                    let target = roads.line_of_lane(
+                        line,
+                        *spot,
+                        *lane,
+                        (drive.length_m, &drive.entity.route),
+                    )?;
                     let sign = side(*spot);
                     let spot = *spot;
                     let points = target.points.clone();
@@ -238,8 +256,19 @@ impl Builder<'_, '_> {
                     self.note_forks(drive.entity, &target);
                     drive.lanes = Some((spot, target));
                 }
+                Act::Place(place) => {
+                    drive.place = *place;
+                    let path = self.ahead(drive)?;
+                    then.push(ActionSection::Path(CourseSection {
+                        points: path.points,
+                        at_m: Some(path.station_m),
+                        ..CourseSection::default()
+                    }));
+                    then.push(step_aside(path.offset_m.unwrap_or(0.0)));
+                }
                 Act::Trajectory(Line { times_s: Some(_), .. }) => {
-                    let message = "follows a trajectory with times in an event; use <None> as time reference";
+                    let message =
+                        "follows a trajectory with times in an event; use <None> as time reference";
                     return Err(message.into());
                 }
                 Act::Trajectory(line) => {
@@ -251,22 +280,34 @@ impl Builder<'_, '_> {
                         ..CourseSection::default()
                     }));
                     // On the line at once.
-                    then.push(ActionSection::OffsetProfile(ProfileSection {
-                        to: left_m,
-                        shape: wildcity_sim::scenario::ShapeSection::Step,
-                        over_s: None,
-                        over_m: None,
-                        rate: None,
-                        acceleration: None,
-                    }));
+                    then.push(step_aside(left_m));
                 }
                 Act::Halt(trigger) => then.push(ActionSection::Halt { trigger: trigger.clone() }),
                 Act::Spawn => then.push(ActionSection::Spawn {}),
                 Act::Remove => then.push(ActionSection::Remove {}),
             }
         }
+        if then.len() > limits::ACTIONS {
+            let most = limits::ACTIONS;
+            return Err(format!(
+                "ends more than {most} events by the priority of {:?}",
+                draft.name
+            ));
+        }
         Ok(TriggerSection { name: Some(draft.name.clone()), when: draft.when.clone(), then })
     }
+}
+
+/// At once at another offset.
+fn step_aside(to: f64) -> ActionSection {
+    ActionSection::OffsetProfile(ProfileSection {
+        to,
+        shape: ShapeSection::Step,
+        over_s: None,
+        over_m: None,
+        rate: None,
+        acceleration: None,
+    })
 }
 
 /// Offsets of a file are to the left of the road; those of an actor are to its own left.

@@ -7,6 +7,7 @@ use std::rc::Rc;
 
 use roxmltree::{Document, Node};
 
+use super::Settings;
 use super::element::{Element, Parameters, Source};
 use super::ledger::Ledger;
 use crate::{ConvertError, TEXT_BYTES, xml};
@@ -27,15 +28,18 @@ pub(super) struct Catalogs<'a> {
     ledger: &'a Ledger,
 }
 
-/// Reads the files of the catalogs if the scenario refers to any: XML files in directories relative to `dir`.
+/// Reads the files of the catalogs if the scenario refers to any: XML files in directories relative to its own, and
+/// in those of the settings.
 pub(super) fn texts_of(
     root: &Element<'_>,
     node: Node<'_, '_>,
-    dir: Option<&Path>,
+    settings: &Settings,
 ) -> Result<Vec<CatalogText>, ConvertError> {
     let is_used = node.descendants().any(|node| node.has_tag_name("CatalogReference"));
     let Some(locations) = root.find("CatalogLocations")? else { return Ok(Vec::new()) };
+    let dir = settings.directory.as_ref();
     let mut directories: BTreeSet<PathBuf> = BTreeSet::new();
+    directories.extend(settings.catalogs.iter().filter(|_| is_used).cloned());
     for catalog in locations.children() {
         catalog.only(&["Directory"])?;
         let directory = catalog.need("Directory")?;
@@ -87,9 +91,8 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, ConvertError> {
 
 fn read_text(path: &Path) -> Result<String, ConvertError> {
     let bytes = read_bytes(path)?;
-    let text = crate::text_of(&bytes).map_err(|error| {
-        ConvertError::new(format!("{}", path.display()), error.message)
-    })?;
+    let text = crate::text_of(&bytes)
+        .map_err(|error| ConvertError::new(format!("{}", path.display()), error.message))?;
     Ok(text.to_owned())
 }
 
@@ -108,7 +111,8 @@ impl<'a> Catalogs<'a> {
             for catalog in catalogs.filter(|node| node.has_tag_name("Catalog")) {
                 let name = catalog.attribute("name").unwrap_or_default();
                 for entry in catalog.children().filter(Node::is_element) {
-                    let key = (name.to_owned(), entry.attribute("name").unwrap_or_default().to_owned());
+                    let key =
+                        (name.to_owned(), entry.attribute("name").unwrap_or_default().to_owned());
                     entries.entry(key).or_insert((entry, source));
                 }
             }
@@ -127,14 +131,13 @@ impl<'a> Catalogs<'a> {
             );
             return Err(reference.wrong(&message));
         };
-        let entry =
-            Element::new(*node, reference.parameters().clone(), self.ledger, *source);
+        let entry = Element::new(*node, reference.parameters().clone(), self.ledger, *source);
         let entry = declared(&entry)?;
         let mut parameters = BTreeMap::clone(entry.parameters());
         if let Some(assignments) = reference.find("ParameterAssignments")? {
             assignments.only(&["ParameterAssignment"])?;
             for assignment in assignments.children() {
-                let name = assignment.text("parameterRef")?;
+                let name = assignment.raw("parameterRef")?;
                 parameters.insert(plain_parameter(&name), assignment.text("value")?);
             }
         }

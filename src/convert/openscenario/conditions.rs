@@ -1,6 +1,8 @@
 //! Conditions of triggers.
 
-use wildcity_sim::scenario::{ConditionSection, EdgeSection, MeasureSection, PhaseSection, QuantitySection};
+use wildcity_sim::scenario::{
+    ConditionSection, EdgeSection, MeasureSection, PhaseSection, QuantitySection,
+};
 
 use super::element::Element;
 use super::model::Context;
@@ -9,6 +11,9 @@ use crate::ConvertError;
 
 /// In front of a name in `after` whose triggers are not known yet, with the type of the storyboard's element.
 pub(super) const PENDING: char = '\u{1}';
+
+/// Slower than this stands, in m/s.
+const STANDS_MPS: f64 = 0.01;
 
 /// The condition of a trigger: one of its groups. `is_immediate` says whether it is evaluated from the start on.
 pub(super) fn trigger_of(
@@ -74,7 +79,7 @@ fn condition_of(
     match kind.name() {
         "ByValueCondition" => {
             let value = kind.only_child()?;
-            by_value(&value, (edge, delay_s), is_immediate)
+            by_value(&value, context, (edge, delay_s), is_immediate)
         }
         "ByEntityCondition" => Ok(with_edge(by_entity(&kind, context)?, edge, delay_s)),
         _ => Err(kind.unread()),
@@ -82,16 +87,13 @@ fn condition_of(
 }
 
 /// A condition with an edge and a delay.
-fn with_edge(
-    part: ConditionSection,
-    edge: Option<EdgeSection>,
-    delay_s: f64,
-) -> ConditionSection {
+fn with_edge(part: ConditionSection, edge: Option<EdgeSection>, delay_s: f64) -> ConditionSection {
     ConditionSection { edge, later_s: (delay_s > 0.0).then_some(delay_s), ..part }
 }
 
 fn by_value(
     kind: &Element<'_>,
+    context: &Context<'_>,
     (edge, delay_s): (Option<EdgeSection>, f64),
     is_immediate: bool,
 ) -> Result<ConditionSection, ConvertError> {
@@ -123,7 +125,8 @@ fn by_value(
                 "completeState" => PhaseSection::Ended,
                 other => return Err(kind.wrong(&format!("state={other:?} is not read"))),
             };
-            let name = kind.text("storyboardElementRef")?;
+            let name = kind.text("storyboardElementRef");
+            let name = name.or_else(|_| kind.raw("storyboardElementRef"))?;
             // A name may be a path.
             let name = name.rsplit("::").next().unwrap_or_default();
             Ok(ConditionSection {
@@ -133,21 +136,42 @@ fn by_value(
                 ..Default::default()
             })
         }
-        "ParameterCondition" => constant(kind, delay_s),
+        "ParameterCondition" => value_of(kind, "parameterRef", context, delay_s),
+        "VariableCondition" => value_of(kind, "variableRef", context, delay_s),
         _ => Err(kind.unread()),
     }
 }
 
-/// A parameter has one value: actions that change one are refused.
-fn constant(
+/// A parameter or a variable has one value, or actions set another one.
+fn value_of(
     kind: &Element<'_>,
+    attribute: &str,
+    context: &Context<'_>,
     delay_s: f64,
 ) -> Result<ConditionSection, ConvertError> {
-    let name = super::catalogs::plain_parameter(&kind.raw("parameterRef")?);
-    let Some(value) = kind.parameters().get(&name) else {
-        return Err(kind.wrong(&format!("there is no parameter {name:?}; declare it")));
+    let name = super::catalogs::plain_parameter(&kind.raw(attribute)?);
+    let value = kind.parameters().get(&name).or_else(|| context.variables.get(&name));
+    let Some(value) = value else {
+        return Err(kind.wrong(&format!("there is no parameter or variable {name:?}; declare it")));
     };
-    let holds = super::catalogs::compare(&kind.text("rule")?, value, &kind.text("value")?);
+    let [rule, bound] = [kind.text("rule")?, kind.text("value")?];
+    let holds = super::catalogs::compare(&rule, value, &bound);
+    let sets: Vec<_> = context.sets.iter().filter(|(other, ..)| *other == name).collect();
+    if !sets.is_empty() {
+        let is_set = |value: &str| super::catalogs::compare(&rule, value, &bound) == Some(true);
+        let is_plain = sets.iter().all(|(_, value, event)| is_set(value) && !event.is_empty());
+        if holds != Some(false) || !is_plain {
+            return Err(
+                kind.wrong("is read if it holds from the first event on that sets the value")
+            );
+        }
+        let parts = sets.into_iter().map(|(_, _, event)| ConditionSection {
+            after: Some(format!("{PENDING}event{PENDING}{event}{PENDING}{}", kind.line())),
+            delay_s: (delay_s > 0.0).then_some(delay_s),
+            ..Default::default()
+        });
+        return Ok(any_of(parts.collect()));
+    }
     match holds {
         Some(true) => Ok(ConditionSection {
             time_s: (delay_s > 0.0).then_some(delay_s),
@@ -171,6 +195,10 @@ fn by_entity(by: &Element<'_>, context: &Context<'_>) -> Result<ConditionSection
     triggering.only(&["EntityRef"])?;
     let rule = triggering.text("triggeringEntitiesRule")?;
     let kind = by.need("EntityCondition")?.only_child()?;
+    let held_s = match kind.name() {
+        "StandStillCondition" => Some(kind.number("duration")?).filter(|held_s| *held_s > 0.0),
+        _ => None,
+    };
     let mut parts = Vec::new();
     for entity in triggering.children() {
         let name = entity.text("entityRef")?;
@@ -178,7 +206,7 @@ fn by_entity(by: &Element<'_>, context: &Context<'_>) -> Result<ConditionSection
             return Err(entity.wrong(&format!("there is no entity {name:?}")));
         }
         let measure = measure_of(&kind, &name, context)?;
-        parts.push(ConditionSection { measure: Some(measure), ..Default::default() });
+        parts.push(ConditionSection { measure: Some(measure), held_s, ..Default::default() });
     }
     match (rule.as_str(), parts.len()) {
         (_, 0) => Err(triggering.wrong("is empty")),
@@ -213,9 +241,22 @@ fn measure_of(
     name: &str,
     context: &Context<'_>,
 ) -> Result<MeasureSection, ConvertError> {
-    use QuantitySection::{Distance, Headway, Lateral, Longitudinal, Point, Speed, Travelled};
+    use QuantitySection::{
+        Distance, Headway, Lateral, Longitudinal, Point, Speed, TimeToCollision, Travelled,
+    };
     match kind.name() {
         "SpeedCondition" => bounded(kind, body(Speed, name, context)),
+        "StandStillCondition" => {
+            Ok(MeasureSection { below: Some(STANDS_MPS), ..body(Speed, name, context) })
+        }
+        "CollisionCondition" => {
+            let other = kind.only_child()?;
+            if other.name() != "EntityRef" {
+                return Err(other.unread());
+            }
+            let measure = to_entity((kind, &other), body(Distance, name, context), context)?;
+            Ok(MeasureSection { free: Some(true), below: Some(0.0), ..measure })
+        }
         "TraveledDistanceCondition" => {
             let above = Some(kind.number("value")?);
             Ok(MeasureSection { above, ..body(Travelled, name, context) })
@@ -242,39 +283,54 @@ fn measure_of(
                     return Err(kind.wrong(&format!("relativeDistanceType={other:?} is not read")));
                 }
             };
-            let measure = to_entity(kind, body(quantity, name, context), context)?;
+            let measure = to_entity((kind, kind), body(quantity, name, context), context)?;
             bounded(kind, measure)
         }
-        "TimeHeadwayCondition" => {
-            let along_route = kind.find_flag("alongRoute")?;
-            let is_straight = match kind.find_text("relativeDistanceType")?.as_deref() {
-                None => along_route != Some(true),
-                Some("longitudinal") => false,
-                Some("cartesianDistance" | "euclidianDistance") => true,
-                Some(other) => {
-                    return Err(kind.wrong(&format!("relativeDistanceType={other:?} is not read")));
-                }
-            };
-            let measure = to_entity(kind, body(Headway, name, context), context)?;
-            let on_course = match along_route {
-                Some(true) => Some(true),
-                _ => measure.on_course,
-            };
-            let straight = is_straight.then_some(true);
-            let on_course = on_course.filter(|_| !is_straight);
-            bounded(kind, MeasureSection { straight, on_course, ..measure })
+        "TimeHeadwayCondition" => time_of(kind, kind, body(Headway, name, context), context),
+        "TimeToCollisionCondition" => {
+            let target = kind.need("TimeToCollisionConditionTarget")?.only_child()?;
+            if target.name() != "EntityRef" {
+                return Err(target.unread());
+            }
+            time_of(kind, &target, body(TimeToCollision, name, context), context)
         }
         _ => Err(kind.unread()),
     }
 }
 
-/// A distance to the entity that a condition names.
-fn to_entity(
+/// A time: a distance by a speed.
+fn time_of(
     kind: &Element<'_>,
+    target: &Element<'_>,
     measure: MeasureSection,
     context: &Context<'_>,
 ) -> Result<MeasureSection, ConvertError> {
-    let other = kind.text("entityRef")?;
+    let along_route = kind.find_flag("alongRoute")?;
+    let is_straight = match kind.find_text("relativeDistanceType")?.as_deref() {
+        None => along_route != Some(true),
+        Some("longitudinal") => false,
+        Some("cartesianDistance" | "euclidianDistance") => true,
+        Some(other) => {
+            return Err(kind.wrong(&format!("relativeDistanceType={other:?} is not read")));
+        }
+    };
+    let measure = to_entity((kind, target), measure, context)?;
+    let on_course = match along_route {
+        Some(true) => Some(true),
+        _ => measure.on_course,
+    };
+    let straight = is_straight.then_some(true);
+    let on_course = on_course.filter(|_| !is_straight);
+    bounded(kind, MeasureSection { straight, on_course, ..measure })
+}
+
+/// A distance to the entity that a condition names.
+fn to_entity(
+    (kind, target): (&Element<'_>, &Element<'_>),
+    measure: MeasureSection,
+    context: &Context<'_>,
+) -> Result<MeasureSection, ConvertError> {
+    let other = target.text("entityRef")?;
     let Some(to_ahead_m) = context.ahead_m(&other) else {
         return Err(kind.wrong(&format!("there is no entity {other:?}")));
     };

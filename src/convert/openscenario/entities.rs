@@ -28,6 +28,7 @@ pub(super) fn read_entities<'a>(
         for controller in object.all("ObjectController") {
             if controller.children().next().is_some() {
                 controller.leave_out(Part::Controllers)?;
+                context.placed_by_others.push((object.text("name")?, Part::Controllers));
             }
         }
         let mut described = object.children().filter(|child| child.name() != "ObjectController");
@@ -38,6 +39,9 @@ pub(super) fn read_entities<'a>(
         };
         let name = object.text("name")?;
         let entity = entity_of(&what, &name)?;
+        if let Some(trailer) = trailer_of(&what)? {
+            context.placed_by_others.push((trailer, Part::Trailers));
+        }
         if context.entities.values().any(|other| other.name == entity.name) {
             return Err(object.wrong(&format!("{name:?} is too like another name; rename it")));
         }
@@ -45,6 +49,35 @@ pub(super) fn read_entities<'a>(
         context.entities.insert(name, entity);
         if context.entities.len() > ENTITIES {
             return Err(object.wrong(&format!("at most {ENTITIES} entities are read")));
+        }
+    }
+    Ok(())
+}
+
+/// The entity that a vehicle tows.
+fn trailer_of(what: &Element<'_>) -> Result<Option<String>, ConvertError> {
+    let Some(trailer) = what.find("Trailer")? else { return Ok(None) };
+    let reference = trailer.only_child()?;
+    if reference.name() != "TrailerRef" {
+        return trailer.leave_out(Part::Trailers).map(|()| None);
+    }
+    let name = reference.text("entityRef")?;
+    if name.is_empty() {
+        return Ok(None);
+    }
+    trailer.leave_out(Part::Trailers)?;
+    Ok(Some(name))
+}
+
+/// Properties are a simulator's own: how an entity looks, but for one of esmini that moves its reference point.
+fn check_properties(properties: &Element<'_>) -> Result<(), ConvertError> {
+    for property in properties.all("Property") {
+        let is_offset = property.text("name")? == "refpoint_x_offset";
+        let value = property.text("value")?;
+        if is_offset && value.parse::<f64>() != Ok(0.0) {
+            return Err(
+                property.wrong(&format!("value={value:?} is not read; move the box's centre"))
+            );
         }
     }
     Ok(())
@@ -59,7 +92,14 @@ fn entity_of(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
         "Properties",
         "TrailerHitch",
         "TrailerCoupler",
+        "Trailer",
     ])?;
+    for part in ["TrailerHitch", "TrailerCoupler"] {
+        what.find(part)?;
+    }
+    if let Some(properties) = what.find("Properties")? {
+        check_properties(&properties)?;
+    }
     let category = what.find_text("vehicleCategory")?;
     let class = match (what.name(), category.as_deref()) {
         ("Vehicle", Some("bicycle")) => ActorClass::Bicycle,
@@ -71,8 +111,7 @@ fn entity_of(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
     let bounds = what.need("BoundingBox")?;
     bounds.only(&["Center", "Dimensions"])?;
     let dimensions = bounds.need("Dimensions")?;
-    let [length, width, height] =
-        ["length", "width", "height"].map(|name| dimensions.number(name));
+    let [length, width, height] = ["length", "width", "height"].map(|name| dimensions.number(name));
     let size = [length?, width?, height?];
     let center = bounds.need("Center")?;
     let [x, y, z] = ["x", "y", "z"].map(|name| center.number(name));
@@ -102,6 +141,7 @@ fn entity_of(what: &Element<'_>, name: &str) -> Result<Entity, ConvertError> {
         fastest_mps: 0.0,
         lane: None,
         line: None,
+        route: Vec::new(),
         script: Vec::new(),
         present: true,
     })

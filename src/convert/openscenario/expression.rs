@@ -128,6 +128,9 @@ impl Parser<'_> {
         let end = self.rest.find(|c: char| !c.is_ascii_alphabetic()).unwrap_or(self.rest.len());
         let (name, rest) = self.rest.split_at(end);
         self.rest = rest.trim_start();
+        if name == "pi" {
+            return Ok(std::f64::consts::PI);
+        }
         if !self.take('(') {
             return Err(format!("{name:?} is not a number"));
         }
@@ -185,7 +188,9 @@ mod tests {
         assert_eq!(of("7 % 4 + 2e1-1"), Ok(22.0));
         assert_eq!(of("pow(2, 3) + sqrt($speed) + max(1, -2) + sign(-5)"), Ok(14.0));
         assert_eq!(of("round(2.5) * floor(-0.5) + ceil(0.1) + abs(-3)"), Ok(1.0));
-        for wrong in ["", "1 +", "(1", "$other", "1 / 0", "pow(2)", "pow(2, 3", "2 3", "log(2)", "e"] {
+        for wrong in
+            ["", "1 +", "(1", "$other", "1 / 0", "pow(2)", "pow(2, 3", "2 3", "log(2)", "e"]
+        {
             assert!(of(wrong).is_err(), "{wrong}");
         }
         assert!(of(&"(".repeat(100_000)).is_err());

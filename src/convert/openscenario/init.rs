@@ -2,11 +2,12 @@
 
 use wildcity_sim::scenario::{ConditionSection, ShapeSection};
 
-use super::actions::{private_act, speed_of, trajectory_of};
+use super::actions::{match_of, private_act, speed_of, trajectory_of};
 use super::element::Element;
 use super::ledger::Part;
 use super::model::{Act, Context, Draft, Entity};
 use super::position::place_of;
+use super::route::{lanes_between, waypoints_of};
 use crate::ConvertError;
 
 /// An action of `Init` with its entity.
@@ -106,9 +107,44 @@ fn read_speed(
 ) -> Result<(), ConvertError> {
     let speed = action.only_child()?;
     let is_ego = name == context.ego;
+    if speed.name() == "LongitudinalDistanceAction" && !is_ego {
+        context.waiting.retain(|other| other != name);
+        return speed.leave_out(Part::Distances);
+    }
+    if is_ego
+        && let Some(dynamics) = speed.find("SpeedActionDynamics")?
+        && dynamics.find_text("dynamicsShape")?.as_deref() != Some("step")
+        && dynamics.find_number("value")? != Some(0.0)
+    {
+        // The agent begins from standstill.
+        context.waiting.retain(|other| other != name);
+        return action.leave_out(Part::Ego);
+    }
+    if !is_ego && let Some(act) = match_of(&speed, name, context)? {
+        let Act::Match { of, factor, delta_mps } = &act else { return Err(speed.unread()) };
+        let is_other = |entity: &&Entity| Some(&entity.name) == of.as_ref();
+        let other = match of {
+            None => context.entities.get(&context.ego),
+            Some(_) => context.entities.values().find(is_other),
+        };
+        if context.waiting.contains(&context.ego) || other.is_none() {
+            return Err(speed.wrong("refers to an entity whose speed is not known"));
+        }
+        let begin_mps = factor * other.map_or(0.0, |other| other.begin_mps) + delta_mps;
+        context.waiting.retain(|other| other != name);
+        let Some(entity) = context.entities.get_mut(name) else { return Err(speed.unread()) };
+        entity.begin_mps = begin_mps.clamp(0.0, wildcity_sim::limits::ACTOR_SPEED_M_S);
+        entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S;
+        add(entity, "init-speed", vec![act]);
+        return Ok(());
+    }
     let profile = match speed_of(&speed, context) {
         // Whatever moves the ego later is the agent's.
-        Err(_) if is_ego && speed.name() != "SpeedAction" => {
+        Err(_)
+            if is_ego
+                && (speed.name() != "SpeedAction"
+                    || match_of(&speed, name, context)?.is_some()) =>
+        {
             action.leave_out(Part::Ego)?;
             context.waiting.retain(|other| other != name);
             return Ok(());
@@ -122,6 +158,7 @@ fn read_speed(
         entity.fastest_mps = entity.fastest_mps.max(profile.to);
         match is_step {
             true => entity.begin_mps = profile.to,
+            false if profile.rate == Some(0.0) => {}
             false => add(entity, "init-speed", vec![Act::Speed(profile)]),
         }
     }
@@ -158,6 +195,16 @@ fn read_other(
     }
     if action.name() == "RoutingAction" {
         let follow = action.only_child()?;
+        if follow.name() == "AssignRouteAction" {
+            let waypoints = waypoints_of(&follow, context)?;
+            let roads = context.roads.as_ref().ok_or_else(|| follow.wrong("needs the roads"))?;
+            let lanes = lanes_between(&waypoints, roads);
+            let lanes = lanes.map_err(|message| follow.wrong(&message))?;
+            if let Some(entity) = context.entities.get_mut(name) {
+                entity.route = lanes;
+            }
+            return Ok(());
+        }
         if follow.name() == "FollowTrajectoryAction" {
             let line = trajectory_of(&follow, context)?;
             if let Some(entity) = context.entities.get_mut(name) {
@@ -175,10 +222,7 @@ fn read_other(
     Ok(())
 }
 
-fn read_entity_action(
-    action: &Element<'_>,
-    context: &mut Context<'_>,
-) -> Result<(), ConvertError> {
+fn read_entity_action(action: &Element<'_>, context: &mut Context<'_>) -> Result<(), ConvertError> {
     let name = action.text("entityRef")?;
     let kind = action.only_child()?;
     let place = match kind.name() {

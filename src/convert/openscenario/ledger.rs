@@ -22,19 +22,28 @@ pub enum Part {
     Signals,
     /// Conditions of the stop trigger that are no time.
     Stop,
+    /// Distances that an actor keeps, and motion that is synchronized with another's.
+    Distances,
+    /// Routes that are not read: actors take the straightest way.
+    Routes,
+    /// Trailers, and what tows them.
+    Trailers,
     /// Actions of a simulator's own.
     Custom,
 }
 
 impl Part {
     /// All parts, with their names.
-    pub const ALL: [(Self, &str); 7] = [
+    pub const ALL: [(Self, &str); 10] = [
         (Self::Controllers, "controllers"),
         (Self::Ego, "ego"),
         (Self::Environment, "environment"),
         (Self::Appearance, "appearance"),
         (Self::Signals, "signals"),
         (Self::Stop, "stop"),
+        (Self::Distances, "distances"),
+        (Self::Routes, "routes"),
+        (Self::Trailers, "trailers"),
         (Self::Custom, "custom"),
     ];
 
@@ -45,7 +54,7 @@ impl Part {
 }
 
 /// Attributes that cannot matter, by the elements that have them.
-const HARMLESS: [(&str, &[&str]); 25] = [
+const HARMLESS: [(&str, &[&str]); 27] = [
     ("*", &["name"]),
     ("OpenSCENARIO", &["noNamespaceSchemaLocation", "schemaLocation"]),
     ("FileHeader", &["author", "date", "description"]),
@@ -61,6 +70,9 @@ const HARMLESS: [(&str, &[&str]); 25] = [
     ("FrontAxle", &["maxSteering", "wheelDiameter", "trackWidth", "positionX", "positionZ"]),
     ("RearAxle", &["maxSteering", "wheelDiameter", "trackWidth", "positionZ"]),
     ("AdditionalAxle", &["maxSteering", "wheelDiameter", "trackWidth", "positionX", "positionZ"]),
+    // Where a trailer would be: none is read.
+    ("TrailerHitch", &["dx", "dz"]),
+    ("TrailerCoupler", &["dx", "dz"]),
     ("Property", &["name", "value"]),
     ("File", &["filepath"]),
     ("Directory", &["path"]),
@@ -129,7 +141,11 @@ impl Ledger {
     }
 
     /// Refuses the first element below a node, or the first attribute, that was not read.
-    pub(super) fn check(&self, file: (usize, &str), node: Node<'_, '_>) -> Result<(), ConvertError> {
+    pub(super) fn check(
+        &self,
+        file: (usize, &str),
+        node: Node<'_, '_>,
+    ) -> Result<(), ConvertError> {
         let key = (file.0, node.id());
         if self.left_out.borrow().contains(&key) {
             return Ok(());

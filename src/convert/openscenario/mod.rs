@@ -5,7 +5,7 @@
 //! | `element`, `expression` | elements, attributes, and formulas of parameters |
 //! | `ledger` | what was read: anything else is refused, or left out on request with a note |
 //! | `catalogs`, `entities` | catalogs and parameters; vehicles, pedestrians and objects |
-//! | `position`, `roads`, `trajectory` | places in the world and on roads, lines along lanes, trajectories |
+//! | `position`, `roads`, `route`, `trajectory` | places in the world and on roads, lines along lanes, trajectories |
 //! | `init`, `story`, `actions`, `conditions` | the storyboard |
 //! | `model`, `build` | what is known of the scenario, and its actors |
 //!
@@ -23,6 +23,7 @@ mod ledger;
 mod model;
 mod position;
 mod roads;
+mod route;
 mod story;
 mod trajectory;
 
@@ -53,6 +54,8 @@ pub struct Settings {
     pub ego: String,
     /// Directory of the file, from which it names catalogs and roads.
     pub directory: Option<PathBuf>,
+    /// More directories of catalogs.
+    pub catalogs: Vec<PathBuf>,
     /// The OpenDRIVE file of the roads, in place of the one that the file names.
     pub roads: Option<PathBuf>,
     /// Easting and northing of the twin's origin, as for the map of these roads.
@@ -93,10 +96,10 @@ pub fn read(bytes: &[u8], settings: &Settings) -> Result<Imported, ConvertError>
     let root = catalogs::declared(&root)?;
     let root = with_parameters(&root, &settings.parameters)?;
     check_header(&root)?;
-    let texts = catalogs::texts_of(&root, document.root_element(), settings.directory.as_deref())?;
+    let texts = catalogs::texts_of(&root, document.root_element(), settings)?;
     let documents = catalogs::documents_of(&texts);
     let catalogs = Catalogs::new(&documents, &ledger);
-    let file = file_of(&root, catalogs, settings, &ledger)?;
+    let file = file_of((&root, document.root_element()), catalogs, settings, &ledger)?;
     root.check_read()?;
     Ok(Imported { file, notes: ledger.notes() })
 }
@@ -136,8 +139,37 @@ fn check_header(root: &Element<'_>) -> Result<(), ConvertError> {
     Ok(())
 }
 
+/// The values that actions set: the name, the value, and the event; without an event, an empty text.
+fn sets_of(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
+    let actions = node.descendants().filter_map(|node| {
+        let name = match node.tag_name().name() {
+            "ParameterAction" => node.attribute("parameterRef"),
+            "VariableAction" => node.attribute("variableRef"),
+            _ => None,
+        };
+        let set = node.children().find(|child| child.has_tag_name("SetAction"));
+        let value = set.and_then(|set| set.attribute("value")).unwrap_or_default();
+        let event = node.ancestors().find(|node| node.has_tag_name("Event"));
+        let event = event.and_then(|event| event.attribute("name")).unwrap_or_default();
+        name.map(|name| (catalogs::plain_parameter(name), value.to_owned(), event.to_owned()))
+    });
+    actions.collect()
+}
+
+/// The values of variables at the start.
+fn variables_of(root: &Element<'_>) -> Result<BTreeMap<String, String>, ConvertError> {
+    let mut variables = BTreeMap::new();
+    if let Some(section) = root.find("VariableDeclarations")? {
+        section.only(&["VariableDeclaration"])?;
+        for declaration in section.children() {
+            variables.insert(declaration.raw("name")?, declaration.text("value")?);
+        }
+    }
+    Ok(variables)
+}
+
 fn file_of<'a>(
-    root: &Element<'a>,
+    (root, node): (&Element<'a>, roxmltree::Node<'_, '_>),
     catalogs: Catalogs<'a>,
     settings: &Settings,
     ledger: &'a Ledger,
@@ -150,6 +182,9 @@ fn file_of<'a>(
         ego: settings.ego.clone(),
         is_in_story: false,
         waiting: Vec::new(),
+        placed_by_others: Vec::new(),
+        variables: variables_of(root)?,
+        sets: sets_of(node),
         missing_roads,
     };
     entities::read_entities(&root.need("Entities")?, &mut context)?;
@@ -171,8 +206,14 @@ fn file_of<'a>(
     let builder = Builder { context: &context, ledger, end_s };
     let mut actors = Vec::new();
     for (name, entity) in context.entities.iter().filter(|(name, _)| **name != settings.ego) {
+        let by = context.placed_by_others.iter().find(|(other, _)| other == name);
+        if let Some((_, part)) = by.filter(|_| entity.place.is_none()) {
+            ledger.note(format!("entity {name:?}: is left out ({})", part.name()));
+            continue;
+        }
         let actor = builder.actor_of(entity);
-        actors.push(actor.map_err(|message| ConvertError::new(format!("entity {name:?}"), message))?);
+        actors
+            .push(actor.map_err(|message| ConvertError::new(format!("entity {name:?}"), message))?);
     }
     Ok(ScenarioFile {
         format: ScenarioFile::FORMAT.to_owned(),

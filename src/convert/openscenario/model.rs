@@ -49,6 +49,8 @@ pub(super) struct Entity {
     pub(super) lane: Option<i32>,
     /// The trajectory of `Init`.
     pub(super) line: Option<Line>,
+    /// The lanes of its route.
+    pub(super) route: Vec<xodr::LaneId>,
     pub(super) script: Vec<Draft>,
     pub(super) present: bool,
 }
@@ -75,10 +77,22 @@ pub(super) struct Draft {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Act {
     Speed(ProfileSection),
+    /// As fast as an actor, or as the ego.
+    Match {
+        of: Option<String>,
+        factor: f64,
+        delta_mps: f64,
+    },
     /// To the lane with this id.
-    Lane { lane: i32, offset_m: f64, profile: ProfileSection },
+    Lane {
+        lane: i32,
+        offset_m: f64,
+        profile: ProfileSection,
+    },
     Offset(ProfileSection),
     Trajectory(Line),
+    /// At once at another place.
+    Place(Place),
     Halt(String),
     Spawn,
     Remove,
@@ -101,6 +115,12 @@ pub(super) struct Context<'a> {
     pub(super) is_in_story: bool,
     /// The entities whose speeds at the start are not read yet.
     pub(super) waiting: Vec<String>,
+    /// The entities that others place: trailers, and those of controllers that are left out.
+    pub(super) placed_by_others: Vec<(String, super::ledger::Part)>,
+    /// The values of variables at the start.
+    pub(super) variables: BTreeMap<String, String>,
+    /// The parameters and variables that actions set: the name, the value and the event.
+    pub(super) sets: Vec<(String, String, String)>,
     /// Why the roads that the scenario names were not read.
     pub(super) missing_roads: Option<String>,
 }

@@ -3,6 +3,7 @@
 use super::element::Element;
 use super::model::{Context, Place};
 use super::roads::RoadMap;
+use super::route::place_on_route;
 use crate::ConvertError;
 
 /// The place of a `<Position>`.
@@ -26,6 +27,11 @@ pub(super) fn place_of(
             let found = roads.road_place(&kind.text("roadId")?, s?, t?);
             let (xyz_m, yaw_rad, _) = found.map_err(|message| kind.wrong(&message))?;
             on_roads(xyz_m, heading_rad(&kind, yaw_rad)?, context)
+        }
+        "RoutePosition" => {
+            let roads = roads(&kind, context)?;
+            let at = place_on_route(&kind, context, roads)?;
+            lane_facing(&kind, at, roads)?
         }
         "RelativeLanePosition" => relative_lane_place(&kind, context)?,
         "RelativeRoadPosition" => {
@@ -87,7 +93,7 @@ fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Conver
     let lane = kind.whole("laneId")?;
     let at = roads.place(&kind.text("roadId")?, lane, s, offset);
     let at = at.map_err(|message| kind.wrong(&message))?;
-    lane_facing(kind, at, roads, None)
+    lane_facing(kind, at, roads)
 }
 
 /// A place on a lane with the heading of an `<Orientation>`; without one it faces as its traffic does.
@@ -95,11 +101,10 @@ fn lane_facing(
     kind: &Element<'_>,
     at: xodr::LanePosition,
     roads: &RoadMap,
-    base_rad: Option<f64>,
 ) -> Result<Place, ConvertError> {
     let half_turn = if roads.drives_up(at.lane) { 0.0 } else { std::f64::consts::PI };
     let traffic_rad = roads.heading_rad(at) + half_turn;
-    let yaw_rad = heading_rad(kind, base_rad.unwrap_or(traffic_rad))?;
+    let yaw_rad = heading_rad(kind, traffic_rad)?;
     Ok(Place { xyz_m: roads.point(at), yaw_rad, spot: roads.spot(at, yaw_rad) })
 }
 
@@ -123,12 +128,12 @@ fn relative_lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Plac
     let moved = roads.moved(from, way_m, is_along_lane).map_err(wrong)?;
     let mut at = roads.beside(moved, sign * count).map_err(wrong)?;
     at.offset = f64::from(sign) * offset_m;
-    lane_facing(kind, at, roads, None)
+    lane_facing(kind, at, roads)
 }
 
 /// The heading of an `<Orientation>`: absolute, or relative to a heading, which is returned without an `<Orientation>`.
 fn heading_rad(kind: &Element<'_>, base_rad: f64) -> Result<f64, ConvertError> {
-    kind.only(&["Orientation"])?;
+    kind.only(&["Orientation", "RouteRef", "InRoutePosition"])?;
     let Some(orientation) = kind.find("Orientation")? else { return Ok(base_rad) };
     note_tilt(&orientation)?;
     let heading_rad = orientation.find_number("h")?;

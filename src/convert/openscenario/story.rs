@@ -65,7 +65,7 @@ pub(super) fn read_story<'a>(
         let gate = gate_of(&act, &act_name, context, elements)?;
         for group in act.all("ManeuverGroup") {
             group.only(&["Actors", "Maneuver", "CatalogReference"])?;
-            group.expect("maximumExecutionCount", &["1"])?;
+            group.ignore(&["maximumExecutionCount"])?;
             let actors = group.need("Actors")?;
             actors.only(&["EntityRef"])?;
             actors.expect("selectTriggeringEntities", &["false", "0"])?;
@@ -86,6 +86,10 @@ pub(super) fn read_story<'a>(
                     ("maneuverGroup", &group_name),
                     ("maneuver", &maneuver_name),
                 ];
+                // Whatever the agent's entity does is not carried out at all.
+                if names.iter().any(|name| *name != context.ego) {
+                    group.expect("maximumExecutionCount", &["1"])?;
+                }
                 let scope = Scope {
                     names: around.map(|(kind, name)| (kind.to_owned(), name.clone())).to_vec(),
                     actors: names.clone(),
@@ -160,16 +164,31 @@ fn read_event<'a>(
         "parallel" => false,
         "skip" if scope.maneuver.all("Event").count() == 1 => false,
         _ => {
-            let message =
-                format!("priority={priority:?} is not read; override or parallel is, or skip alone");
+            let message = format!(
+                "priority={priority:?} is not read; override or parallel is, or skip alone"
+            );
             return Err(event.wrong(&message));
         }
     };
-    event.expect("maximumExecutionCount", &["1"])?;
-    let name = event.text("name")?;
+    let is_of_ego = scope.actors.iter().all(|name| *name == context.ego);
+    let is_global = event.all("Action").any(|action| action.all("PrivateAction").count() == 0);
+    let is_of_ego = is_of_ego && !is_global;
+    if !is_of_ego {
+        event.expect("maximumExecutionCount", &["1"])?;
+    }
+    event.ignore(&["maximumExecutionCount"])?;
+    // A name that is no formula is a text.
+    let name = event.text("name").or_else(|_| event.raw("name"))?;
     let start = event.find("StartTrigger")?;
-    let start = start.map(|start| trigger_of(&start, context, scope.gate.is_none())).transpose()?;
-    let start = start.unwrap_or_default();
+    let read = start.as_ref().map(|start| trigger_of(start, context, scope.gate.is_none()));
+    let start = match (read.transpose(), &start) {
+        // When the agent's entity would act does not matter, if nothing waits for it.
+        (Err(_), Some(start)) if is_of_ego => {
+            start.leave_out(Part::Ego)?;
+            unknown()
+        }
+        (start, _) => start?.unwrap_or_default(),
+    };
     let when = match &scope.gate {
         None => start,
         Some(gate) => {
@@ -190,6 +209,12 @@ fn read_event<'a>(
     Ok(())
 }
 
+/// A condition that was not read: nothing may wait for it.
+fn unknown() -> ConditionSection {
+    let after = Some(format!("{PENDING}unread{PENDING}{PENDING}"));
+    ConditionSection { after, ..ConditionSection::default() }
+}
+
 /// An event while its actions are read.
 struct EventRead<'e, 'a> {
     index: usize,
@@ -206,7 +231,7 @@ impl<'a> EventRead<'_, 'a> {
         context: &mut Context<'a>,
         elements: &mut Elements,
     ) -> Result<(), ConvertError> {
-        let action_name = action.find_text("name")?.unwrap_or_default();
+        let action_name = action.text("name").or_else(|_| action.raw("name")).unwrap_or_default();
         let key = ("action".to_owned(), action_name.clone());
         elements.by_name.entry(key).or_default().push(self.index);
         let kind = action.only_child()?;
@@ -224,6 +249,18 @@ impl<'a> EventRead<'_, 'a> {
                     "EntityAction" => {
                         let target = global.text("entityRef")?;
                         self.act_of(&global.only_child()?, &target, &action_name, context, elements)
+                    }
+                    "ParameterAction" | "VariableAction" => {
+                        let is_parameter = global.name() == "ParameterAction";
+                        let attribute = if is_parameter { "parameterRef" } else { "variableRef" };
+                        global.raw(attribute)?;
+                        let set = global.only_child()?;
+                        if set.name() != "SetAction" {
+                            return Err(set.unread());
+                        }
+                        // Conditions that read the value wait for the event.
+                        set.raw("value")?;
+                        self.mark_ego(Some(0.0), &set, context, elements)
                     }
                     "EnvironmentAction" => global.leave_out(Part::Environment),
                     "InfrastructureAction" => global.leave_out(Part::Signals),
@@ -254,6 +291,12 @@ impl<'a> EventRead<'_, 'a> {
             kind.leave_out(Part::Ego)?;
             return self.mark_ego(duration_s, kind, context, elements);
         }
+        if kind.name() == "LongitudinalAction" {
+            let profile = kind.only_child()?;
+            if profile.name() == "SpeedProfileAction" {
+                return self.speed_profile(&profile, target, action_name, context, elements);
+            }
+        }
         let act = match kind.name() {
             "AddEntityAction" => {
                 let place = place_of(&kind.need("Position")?, context)?;
@@ -261,13 +304,48 @@ impl<'a> EventRead<'_, 'a> {
                 Act::Spawn
             }
             "DeleteEntityAction" => Act::Remove,
+            "TeleportAction" => {
+                let place = place_of(&kind.need("Position")?, context)?;
+                let before = context.entities.get(target).and_then(|entity| entity.place);
+                set_place(target, place, context);
+                if let Some(entity) = context.entities.get_mut(target) {
+                    // The lane is the new one; the place stays that of the start.
+                    entity.place = before;
+                }
+                Act::Place(place)
+            }
             _ => match private_act(kind, target, context)? {
                 Some(act) => act,
                 // Left out: it has no duration.
-                None => return self.mark_ego(Some(0.0), kind, context, elements),
+                None => {
+                    let is_over = is_controller || is_look;
+                    return self.mark_ego(is_over.then_some(0.0), kind, context, elements);
+                }
             },
         };
-        self.add(act, target, action_name, context, elements, kind)
+        self.add((act, self.when.clone()), target, action_name, context, elements, kind)?;
+        Ok(())
+    }
+
+    /// Adds a change of speed for each entry of a profile, each when the one before is over.
+    fn speed_profile(
+        &self,
+        profile: &Element<'a>,
+        target: &str,
+        action_name: &str,
+        context: &mut Context<'a>,
+        elements: &mut Elements,
+    ) -> Result<(), ConvertError> {
+        profile.expect("followingMode", &["position"])?;
+        profile.only(&["SpeedProfileEntry"])?;
+        let mut when = self.when.clone();
+        for entry in profile.children() {
+            let (act, over_s) = super::actions::profile_entry(&entry)?;
+            let trigger = self.add((act, when), target, action_name, context, elements, &entry)?;
+            let delay_s = Some(over_s).filter(|over_s| *over_s > 0.0);
+            when = ConditionSection { after: Some(trigger), delay_s, ..Default::default() };
+        }
+        Ok(())
     }
 
     /// Marks the start of an event that has left out actions.
@@ -291,16 +369,17 @@ impl<'a> EventRead<'_, 'a> {
 
     fn add(
         &self,
-        act: Act,
+        (act, when): (Act, ConditionSection),
         target: &str,
         action_name: &str,
         context: &mut Context<'_>,
         elements: &mut Elements,
         kind: &Element<'_>,
-    ) -> Result<(), ConvertError> {
+    ) -> Result<String, ConvertError> {
         let Some(entity) = context.entities.get_mut(target) else { return Err(kind.unread()) };
         match &act {
             Act::Speed(profile) => entity.fastest_mps = entity.fastest_mps.max(profile.to),
+            Act::Match { .. } => entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S,
             Act::Lane { lane, .. } => entity.lane = Some(*lane),
             Act::Spawn if entity.script.is_empty() => entity.present = false,
             _ => {}
@@ -326,18 +405,32 @@ impl<'a> EventRead<'_, 'a> {
                 let name = trigger.strip_prefix(&own)?;
                 let draft = entity.script.iter().find(|draft| draft.name == name)?;
                 // A change of the same kind is replaced anyway.
-                let replaces = draft.then.iter().any(|other| {
-                    std::mem::discriminant(other) == std::mem::discriminant(&act)
-                });
+                let replaces = draft
+                    .then
+                    .iter()
+                    .any(|other| std::mem::discriminant(other) == std::mem::discriminant(&act));
                 let moves = draft.then.iter().any(Act::is_motion);
                 (moves && !replaces).then(|| Act::Halt(name.to_owned()))
             }));
         }
+        let is_line =
+            |draft: &Draft| draft.then.iter().any(|act| matches!(act, Act::Trajectory(_)));
+        let halts_line = then.iter().any(|act| match act {
+            Act::Halt(name) => {
+                entity.script.iter().any(|draft| draft.name == *name && is_line(draft))
+            }
+            _ => false,
+        });
+        if halts_line {
+            kind.note(
+                "ends a trajectory of its maneuver by its priority: the actor stays on the line",
+            );
+        }
         then.push(act);
-        entity.script.push(Draft { name, when: self.when.clone(), then });
+        entity.script.push(Draft { name, when, then });
         let triggers = &mut elements.events[self.index].triggers;
-        triggers.push((reference, action_name.to_owned()));
-        Ok(())
+        triggers.push((reference.clone(), action_name.to_owned()));
+        Ok(reference)
     }
 }
 
@@ -358,10 +451,14 @@ fn duration_s(kind: &Element<'_>) -> Result<Option<f64>, ConvertError> {
 /// Puts triggers in place of the names of storyboard elements, and adds the marks that conditions wait for.
 pub(super) fn resolve(elements: Elements, context: &mut Context<'_>) -> Result<(), ConvertError> {
     let mut elements = elements;
-    let mut marks = std::mem::take(&mut elements.marks);
-    for (_, mark) in &mut marks {
-        resolve_condition(&mut mark.when, &elements)?;
+    let marks = std::mem::take(&mut elements.marks);
+    // Marks that nothing waits for may have conditions that were not read.
+    let mut resolved = Vec::new();
+    for (key, mut mark) in marks {
+        let error = resolve_condition(&mut mark.when, &elements).err();
+        resolved.push((key, mark, error));
     }
+    let mut marks = resolved;
     for entity in context.entities.values_mut() {
         for draft in &mut entity.script {
             resolve_condition(&mut draft.when, &elements)?;
@@ -377,10 +474,13 @@ pub(super) fn resolve(elements: Elements, context: &mut Context<'_>) -> Result<(
             let actor = context.entities.get(key).map(|entity| &entity.name);
             actor.is_some_and(|actor| wanted.contains(&format!("{actor}/{}", mark.name)))
         };
-        let Some(at) = marks.iter().position(|(key, mark)| is_wanted(key, mark)) else {
+        let Some(at) = marks.iter().position(|(key, mark, _)| is_wanted(key, mark)) else {
             return Ok(());
         };
-        let (key, mark) = marks.remove(at);
+        let (key, mark, error) = marks.remove(at);
+        if let Some(error) = error {
+            return Err(error);
+        }
         names_of(&mark.when, &mut wanted);
         if let Some(entity) = context.entities.get_mut(&key) {
             entity.script.push(mark);
@@ -442,6 +542,9 @@ impl Elements {
         }
         if kind == "story" && is_fired {
             return Ok(vec![at_start()]);
+        }
+        if kind == "unread" {
+            return Err("waits for an event of the ego whose condition is not read".to_owned());
         }
         let key = (kind.to_owned(), name.to_owned());
         let Some(events) = self.by_name.get(&key) else {

@@ -41,7 +41,13 @@ fn polyline(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertE
     let mut times_s: Option<Vec<f64>> = Some(Vec::new());
     for vertex in shape.children() {
         vertex.only(&["Position"])?;
-        let place = place_of(&vertex.need("Position")?, context)?;
+        let position = vertex.need("Position")?;
+        let place = place_of(&position, context)?;
+        let kind = position.only_child()?;
+        let is_turned = kind.find_number("h")?.is_some_and(|h| h != 0.0);
+        if is_turned || kind.find("Orientation")?.is_some() {
+            shape.note("headings of points are not used: actors face along their line");
+        }
         points.push(place.xyz_m);
         match (&mut times_s, vertex.find_number("time")?) {
             (Some(times_s), Some(time_s)) => times_s.push(time_s),
@@ -144,7 +150,8 @@ fn de_boor(knots: &[f64], controls: &[[f64; 4]], order: usize, u: f64) -> [f64; 
     let degree = order - 1;
     let last = controls.len() - 1;
     // The span of the parameter; the end belongs to the last span that has a length.
-    let span = (degree..=last).rev().find(|span| knots[*span] <= u && knots[*span] < knots[span + 1]);
+    let span =
+        (degree..=last).rev().find(|span| knots[*span] <= u && knots[*span] < knots[span + 1]);
     let span = span.unwrap_or(degree);
     let mut points: Vec<[f64; 4]> = controls[span - degree..=span].to_vec();
     for level in 1..=degree {

@@ -83,6 +83,9 @@ pub struct CourseSection {
     /// is done at once.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub done_m: Option<f64>,
+    /// Place on the line to which the actor is put, in metres. If absent, it continues from the nearest place.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at_m: Option<f64>,
 }
 
 /// An actor on a course.

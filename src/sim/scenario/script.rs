@@ -60,8 +60,7 @@ pub(super) fn script_of(
         }
         let mut then = Vec::with_capacity(trigger.then.len());
         for (at, action) in trigger.then.iter().enumerate() {
-            let names = &references.triggers[own];
-            let action = action_of(action, &mut actor.behaviour, courses, names);
+            let action = action_of(action, &mut actor.behaviour, courses, (references, own));
             then.push(action.map_err(|error| error.within(&format!("{path}.do[{at}]")))?);
         }
         actor.script.push(Trigger { when, then });
@@ -135,6 +134,7 @@ fn condition_of(
         }),
     };
     let later_s = in_range("later_s", section.later_s.unwrap_or(0.0), [0.0, limits::LATER_S])?;
+    let held_us = microseconds("held_s", section.held_s.unwrap_or(0.0))?;
     let measure = section.measure.as_ref().map(|measure| measure_of(measure, references));
     let measure = measure.transpose().map_err(|error| error.within("measure"))?;
     Ok(Condition {
@@ -154,14 +154,12 @@ fn condition_of(
             EdgeSection::Falling => Edge::Falling,
             EdgeSection::Both => Edge::Both,
         }),
+        held_us,
         later_us: (later_s * 1e6).round() as i64,
     })
 }
 
-fn measure_of(
-    section: &MeasureSection,
-    references: &References<'_>,
-) -> Result<Measure, FileError> {
+fn measure_of(section: &MeasureSection, references: &References<'_>) -> Result<Measure, FileError> {
     let body = |field: &str, name: &Option<String>, ahead_m: Option<f64>| {
         let ahead = if field == "of" { "ahead_m" } else { "to_ahead_m" };
         let actor = match name {
@@ -197,6 +195,7 @@ fn measure_of(
         QuantitySection::Longitudinal => Quantity::Longitudinal(other),
         QuantitySection::Lateral => Quantity::Lateral(other),
         QuantitySection::Headway => Quantity::Headway(other),
+        QuantitySection::TimeToCollision => Quantity::TimeToCollision(other),
     };
     check_measure(section)?;
     Ok(Measure { quantity, of, above: section.above, below: section.below })
@@ -210,16 +209,18 @@ fn check_measure(section: &MeasureSection) -> Result<(), FileError> {
     if section.above.is_none() && section.below.is_none() {
         return Err(FileError::new("above", "is missing, as is below; write one of them"));
     }
-    use QuantitySection::{Distance, Headway, Lateral, Longitudinal, Point};
+    use QuantitySection::{Distance, Headway, Lateral, Longitudinal, Point, TimeToCollision};
     let quantity = section.quantity;
-    let is_relative = matches!(quantity, Distance | Longitudinal | Lateral | Headway);
-    let is_along = matches!(quantity, Longitudinal | Lateral | Headway);
+    let is_relative =
+        matches!(quantity, Distance | Longitudinal | Lateral | Headway | TimeToCollision);
+    let is_along = matches!(quantity, Longitudinal | Lateral | Headway | TimeToCollision);
+    let is_by_speed = matches!(quantity, Headway | TimeToCollision);
     let ignored = [
         ("xyz", section.xyz.is_some() && quantity != Point),
         ("to", section.to.is_some() && !is_relative),
         ("to_ahead_m", section.to_ahead_m.is_some() && !is_relative),
         ("free", section.free.is_some() && !is_relative),
-        ("straight", section.straight.is_some() && quantity != Headway),
+        ("straight", section.straight.is_some() && !is_by_speed),
         ("on_course", section.on_course.is_some() && !is_along),
     ];
     match ignored.iter().find(|(_, is_ignored)| *is_ignored) {
@@ -240,16 +241,17 @@ fn profile_of(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
         section.over_s.map(|s| Ok(Over::Time(in_range("over_s", s, [0.01, 1e4])?))),
         section.over_m.map(|m| Ok(Over::Distance(in_range("over_m", m, [0.01, 1e5])?))),
         section.rate.map(|rate| Ok(Over::Rate(in_range("rate", rate, [1e-3, 1e3])?))),
-        section.acceleration.map(|most| {
-            Ok(Over::Acceleration(in_range("acceleration", most, [1e-3, 1e3])?))
-        }),
+        section
+            .acceleration
+            .map(|most| Ok(Over::Acceleration(in_range("acceleration", most, [1e-3, 1e3])?))),
     ];
     let mut given = given.into_iter().flatten();
     match (shape, given.next(), given.next()) {
         (Shape::Step, None, _) => Ok((Over::Time(0.0), shape)),
         (Shape::Linear | Shape::Sinusoidal | Shape::Cubic, Some(over), None) => Ok((over?, shape)),
         _ => {
-            let message = "write exactly one of over_s, over_m, rate and acceleration; none for step";
+            let message =
+                "write exactly one of over_s, over_m, rate and acceleration; none for step";
             Err(FileError::new("shape", message))
         }
     }
@@ -274,7 +276,7 @@ fn action_of(
     section: &ActionSection,
     behaviour: &mut Behaviour,
     courses: &mut Courses<'_>,
-    names: &[String],
+    (references, own): (&References<'_>, usize),
 ) -> Result<Action, FileError> {
     let most_mps2 = limits::ACTOR_ACCELERATION_M_S2;
     let rate_of = |path: &str, rate: f64| in_range(path, rate, [0.01, most_mps2]);
@@ -296,11 +298,31 @@ fn action_of(
             let within = |error: FileError| error.within("speed_profile");
             let (over, shape) = profile_of(section).map_err(within)?;
             if section.acceleration.is_some() {
-                return Err(FileError::new("speed_profile.acceleration", "is for offsets; use rate"));
+                return Err(FileError::new(
+                    "speed_profile.acceleration",
+                    "is for offsets; use rate",
+                ));
             }
-            let to_mps =
-                in_range("speed_profile.to", section.to, [0.0, limits::ACTOR_SPEED_M_S])?;
+            let to_mps = in_range("speed_profile.to", section.to, [0.0, limits::ACTOR_SPEED_M_S])?;
             Action::SpeedProfile { to_mps, over, shape }
+        }
+        ActionSection::SpeedMatch { of, factor, delta } => {
+            let index = |name: &String| {
+                references.indices.get(name).copied().ok_or_else(|| {
+                    let message = format!("there is no actor {name:?}; the ego has no name");
+                    FileError::new("speed_match.of", message)
+                })
+            };
+            let most_mps = limits::ACTOR_SPEED_M_S;
+            Action::SpeedMatch {
+                of: of.as_ref().map(index).transpose()?,
+                factor: in_range("speed_match.factor", factor.unwrap_or(1.0), [0.0, 100.0])?,
+                delta_mps: in_range(
+                    "speed_match.delta",
+                    delta.unwrap_or(0.0),
+                    [-most_mps, most_mps],
+                )?,
+            }
         }
         ActionSection::OffsetProfile(section) => {
             let within = |error: FileError| error.within("offset_profile");
@@ -309,7 +331,9 @@ fn action_of(
             Action::OffsetProfile { to_m, over, shape }
         }
         ActionSection::Halt { trigger } => {
-            let found = names.iter().position(|name| !name.is_empty() && name == trigger);
+            let found = references.triggers[own]
+                .iter()
+                .position(|name| !name.is_empty() && name == trigger);
             let missing = || {
                 let message = format!("there is no trigger {trigger:?} of this actor");
                 FileError::new("halt.trigger", message)
@@ -325,11 +349,13 @@ fn action_of(
             let course = course.map_err(|error| error.within("path"))?;
             let done_m = line.done_m.map(|m| in_range("path.done_m", m, [0.0, course.length_m()]));
             let done_m = done_m.transpose()?;
+            let at_m = line.at_m.map(|m| in_range("path.at_m", m, [0.0, course.length_m()]));
+            let at_m = at_m.transpose()?;
             if let Behaviour::Follow(follow) = behaviour {
                 follow.courses.push(course);
-                Action::Course { course: follow.courses.len() - 1, done_m }
+                Action::Course { course: follow.courses.len() - 1, done_m, at_m }
             } else {
-                Action::Course { course: 0, done_m }
+                Action::Course { course: 0, done_m, at_m }
             }
         }
     };

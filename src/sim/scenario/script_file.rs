@@ -66,6 +66,9 @@ pub struct ConditionSection {
     /// One of these must hold.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub any: Vec<ConditionSection>,
+    /// The parts must have held for this time without a break, in seconds. If absent, 0.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub held_s: Option<f64>,
     /// Holds only at the instant at which the parts begin to hold (`rising`), cease to hold (`falling`), or either
     /// (`both`). The first evaluation is no such instant.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -111,8 +114,7 @@ pub struct MeasureSection {
     /// The actor that is measured. If absent, the ego.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub of: Option<String>,
-    /// From the middle of the actor's box forward to its reference point, in metres. If absent, 0. The ego's reference
-    /// point is its rear axle.
+    /// From the middle of its box forward to its reference point, in metres. If absent, 0.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ahead_m: Option<f64>,
     /// The actor to which a distance is measured. If absent, the ego.
@@ -131,7 +133,7 @@ pub struct MeasureSection {
     /// along the heading of the measured body.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub on_course: Option<bool>,
-    /// Whether `headway` is by the straight distance. If absent, it is by the distance along.
+    /// Whether `headway` and `time_to_collision` are by the straight distance. If absent, they are by the distance along.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub straight: Option<bool>,
     /// At least this.
@@ -161,6 +163,8 @@ pub enum QuantitySection {
     Lateral,
     /// The distance from `to` along, divided by the speed, in seconds.
     Headway,
+    /// The distance from `to` along, divided by the rate at which it becomes less, in seconds.
+    TimeToCollision,
 }
 
 /// The course of a value from its start to its aim.
@@ -228,6 +232,18 @@ pub enum ActionSection {
     },
     /// Changes the speed by a shape, whatever the acceleration.
     SpeedProfile(ProfileSection),
+    /// Drives as fast as another, until another action changes the speed.
+    SpeedMatch {
+        /// The other actor. If absent, the ego.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        of: Option<String>,
+        /// Share of its speed. If absent, 1.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        factor: Option<f64>,
+        /// Added to it, in m/s. If absent, 0.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        delta: Option<f64>,
+    },
     /// Moves to another offset from the course by a shape.
     OffsetProfile(ProfileSection),
     /// Continues on another course, from its nearest place.

@@ -16,6 +16,8 @@ const HEADWAY_MPS: f64 = 1e-3;
 pub(super) struct ConditionState {
     /// The last value of the parts.
     last: Option<bool>,
+    /// Since when the parts have held, in microseconds.
+    since_us: Option<i64>,
     /// The values at the instants at which they changed, oldest first: as far back as the condition's delay.
     changes: VecDeque<(i64, bool)>,
     parts: Vec<ConditionState>,
@@ -47,6 +49,9 @@ impl ConditionState {
 
     /// The value after the edge and the delay.
     fn delayed(&mut self, condition: &Condition, time_us: i64, value: bool) -> bool {
+        self.since_us = value.then(|| self.since_us.unwrap_or(time_us));
+        let since_us = self.since_us;
+        let value = since_us.is_some_and(|since_us| time_us - since_us >= condition.held_us);
         let last = self.last.replace(value);
         let value = match condition.edge {
             None => value,
@@ -99,6 +104,7 @@ impl Measures<'_> {
             Quantity::Distance(other) => self.distance_m(body, of, other),
             Quantity::Longitudinal(other) => self.along_m(body, of, other, true),
             Quantity::Lateral(other) => self.along_m(body, of, other, false),
+            Quantity::TimeToCollision(other) => self.time_to_collision_s(body, of, other),
             Quantity::Headway(other) => {
                 let way_m = match other.is_straight {
                     true => self.distance_m(body, of, other)?,
@@ -116,6 +122,22 @@ impl Measures<'_> {
                 self.bodies.iter().find(|other| other.actor.map(usize::from) == Some(actor))
             }
         }
+    }
+
+    /// The distance by the rate at which it becomes less, in seconds.
+    fn time_to_collision_s(&self, body: &LeadCandidate, of: &Body, other: Other) -> Option<f64> {
+        let to = self.body(&other.to)?;
+        let way_m = to.center_m - body.center_m;
+        let (distance_m, direction) = match other.is_straight {
+            true => (self.distance_m(body, of, other)?, way_m.normalize_or_zero()),
+            false => {
+                let forward = body.forward();
+                let sign = if way_m.dot(forward) < 0.0 { -1.0 } else { 1.0 };
+                (self.along_m(body, of, other, true)?, sign * forward)
+            }
+        };
+        let closing_mps = (body.velocity_mps - to.velocity_mps).dot(direction);
+        Some(if closing_mps > 0.0 { distance_m / closing_mps } else { f64::INFINITY })
     }
 
     /// The straight distance, in metres.
@@ -204,6 +226,13 @@ mod tests {
         assert_eq!(later, [false, false, true, false, true, true, false]);
         let rising = values(&part(Some(Edge::Rising), 1_000_000), parts);
         assert_eq!(rising, [false, false, false, true, false, false, false]);
+    }
+
+    #[test]
+    fn a_break_starts_the_time_again() {
+        let held = Condition { held_us: 2_000_000, ..Condition::default() };
+        let parts = [true, true, false, true, true, true, true];
+        assert_eq!(values(&held, parts), [false, false, false, false, false, true, true]);
     }
 
     #[test]

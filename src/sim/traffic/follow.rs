@@ -77,6 +77,24 @@ struct SpeedCommand {
     to_mps: f64,
     rate_mps2: f64,
     profile: Option<SpeedProfile>,
+    matched: Option<SpeedMatch>,
+}
+
+/// The speed of another body that an actor drives with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct SpeedMatch {
+    of: Option<usize>,
+    factor: f64,
+    delta_mps: f64,
+}
+
+impl SpeedMatch {
+    /// The speed now, in m/s; `None` if the other is absent.
+    fn speed_mps(&self, bodies: &[LeadCandidate]) -> Option<f64> {
+        let body = bodies.iter().find(|body| body.actor.map(usize::from) == self.of)?;
+        let speed_mps = self.factor * body.velocity_mps.length() + self.delta_mps;
+        Some(speed_mps.clamp(0.0, limits::ACTOR_SPEED_M_S))
+    }
 }
 
 /// A change of speed by a shape.
@@ -90,7 +108,10 @@ struct SpeedProfile {
 
 impl SpeedCommand {
     /// The acceleration for the next sub-step, in m/s².
-    fn acceleration(&self, speed_mps: f64, duration_s: f64) -> f64 {
+    fn acceleration(&self, speed_mps: f64, duration_s: f64, bodies: &[LeadCandidate]) -> f64 {
+        if let Some(matched) = self.matched {
+            return (matched.speed_mps(bodies).unwrap_or(speed_mps) - speed_mps) / duration_s;
+        }
         let Some(profile) = self.profile else {
             let needed = (self.to_mps - speed_mps) / duration_s;
             return needed.clamp(-self.rate_mps2, self.rate_mps2);
@@ -113,6 +134,7 @@ impl SpeedCommand {
 
     fn is_over(&self, speed_mps: f64) -> bool {
         match self.profile {
+            _ if self.matched.is_some() => false,
             Some(profile) => profile.elapsed_s >= profile.over_s,
             None => speed_mps == self.to_mps,
         }
@@ -155,11 +177,19 @@ impl CourseFollower {
         };
         match action {
             Action::Speed { to_mps, rate_mps2 } => {
-                next.command(SpeedCommand { to_mps, rate_mps2, profile: None }, trigger);
+                let command = SpeedCommand { to_mps, rate_mps2, profile: None, matched: None };
+                next.command(command, trigger);
             }
             Action::SpeedProfile { to_mps, over, shape } => {
                 let profile = Some(profile(over, shape, to_mps));
-                next.command(SpeedCommand { to_mps, rate_mps2: 0.0, profile }, trigger);
+                let command = SpeedCommand { to_mps, rate_mps2: 0.0, profile, matched: None };
+                next.command(command, trigger);
+            }
+            Action::SpeedMatch { of, factor, delta_mps } => {
+                let matched = Some(SpeedMatch { of, factor, delta_mps });
+                let to_mps = now.speed_mps;
+                let command = SpeedCommand { to_mps, rate_mps2: 0.0, profile: None, matched };
+                next.command(command, trigger);
             }
             Action::Offset { to_m, over_s } => {
                 next.lateral = now.lateral.moving_to(to_m, over_s, now.speed_mps);
@@ -169,12 +199,12 @@ impl CourseFollower {
                 next.lateral = now.lateral.by_profile(to_m, over, shape);
                 next.by.offset = Some(trigger);
             }
-            Action::Course { course, done_m } => {
+            Action::Course { course, done_m, at_m } => {
                 let place_m = self.pose(now).position_m;
                 let beside = self.courses[course].nearest(place_m);
                 next.course = course;
-                next.station_m = beside.station_m;
-                next.lateral = Lateral::at(beside.left_m);
+                next.station_m = at_m.unwrap_or(beside.station_m);
+                next.lateral = Lateral::at(if at_m.is_some() { 0.0 } else { beside.left_m });
                 next.by.offset = None;
                 next.by.course = done_m.map(|_| trigger);
                 next.course_done_m = done_m.unwrap_or(0.0);
@@ -196,7 +226,7 @@ impl CourseFollower {
     ) -> Option<CourseFollowerState> {
         let course = self.course(now);
         let lead = self.idm.and_then(|idm| self.lead(now, &idm, box_, own, bodies));
-        let acceleration = self.acceleration(now, lead, duration_s);
+        let acceleration = self.acceleration(now, lead, bodies, duration_s);
         let [way_m, speed_mps] = rolled(now.speed_mps, acceleration, duration_s);
 
         // A line that lies d to the left of one with curvature k is (1 - k d) as long.
@@ -225,9 +255,16 @@ impl CourseFollower {
     }
 
     /// Acceleration in m/s²: that of the model, that of a speed command, or the lesser of both.
-    fn acceleration(&self, now: &CourseFollowerState, lead: Option<Lead>, duration_s: f64) -> f64 {
-        let commanded =
-            now.speed_command.map(|command| command.acceleration(now.speed_mps, duration_s));
+    fn acceleration(
+        &self,
+        now: &CourseFollowerState,
+        lead: Option<Lead>,
+        bodies: &[LeadCandidate],
+        duration_s: f64,
+    ) -> f64 {
+        let commanded = now
+            .speed_command
+            .map(|command| command.acceleration(now.speed_mps, duration_s, bodies));
         let Some(idm) = self.idm else { return commanded.unwrap_or(0.0) };
         let lead = lead.unwrap_or(Lead { gap_m: f64::INFINITY, speed_mps: now.speed_mps });
         // During a commanded change to a lower speed, the free-road term would brake at its own rate.

@@ -27,7 +27,8 @@ pub use course::{Course, CourseFootPoint};
 pub use follow::CourseFollower;
 pub use idm::{Idm, rolled};
 pub use script::{
-    Action, After, Body, Condition, Edge, Measure, Near, Other, Over, Phase, Quantity, Shape, Trigger,
+    Action, After, Body, Condition, Edge, Measure, Near, Other, Over, Phase, Quantity, Shape,
+    Trigger,
 };
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 pub use track::{Track, TrackError, TrackKeyframe, Tracked};

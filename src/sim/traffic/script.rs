@@ -34,6 +34,8 @@ pub struct Condition {
     pub all: Vec<Condition>,
     /// One of these holds, if there are any.
     pub any: Vec<Condition>,
+    /// The parts have held for this time without a break, in microseconds.
+    pub held_us: i64,
     /// The condition holds only at the instant at which the parts begin to hold, or cease to hold.
     pub edge: Option<Edge>,
     /// The condition holds this much later than its parts and its edge, in microseconds.
@@ -104,6 +106,15 @@ pub enum Action {
         /// The course of the speed over time.
         shape: Shape,
     },
+    /// Drives as fast as another body, until another action changes the speed.
+    SpeedMatch {
+        /// Index of the actor; `None` for the ego.
+        of: Option<usize>,
+        /// Share of its speed.
+        factor: f64,
+        /// Added to it, in m/s.
+        delta_mps: f64,
+    },
     /// Changes its offset from the course.
     Offset {
         /// To this offset, in metres to the left.
@@ -126,6 +137,8 @@ pub enum Action {
         course: usize,
         /// Station of the course at which the action is done, in metres; at once without it.
         done_m: Option<f64>,
+        /// Station to which the actor is put, in metres; without it, it stays where it is.
+        at_m: Option<f64>,
     },
     /// Ends the changes of speed and offset of a trigger of this actor: both keep their present values.
     Halt {
@@ -235,6 +248,8 @@ pub enum Quantity {
     Lateral(Other),
     /// The distance along the heading by the speed, in seconds.
     Headway(Other),
+    /// The distance by the rate at which it becomes less, in seconds; endless if it does not.
+    TimeToCollision(Other),
 }
 
 /// The other body of a distance.

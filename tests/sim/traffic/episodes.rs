@@ -10,10 +10,9 @@ use wildcity_scene::random::Random;
 use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::Ground;
 use wildcity_sim::traffic::{
-    Phase,
     Action, Actor, ActorSpec, ActorState, After, Attack, Behaviour, Condition, Course,
-    CourseFollower, EgoBox, EgoMotion, EgoState, Idm, Near, Track, TrackKeyframe, Traffic, Trigger,
-    World,
+    CourseFollower, EgoBox, EgoMotion, EgoState, Idm, Near, Phase, Track, TrackKeyframe, Traffic,
+    Trigger, World,
 };
 
 use crate::vectors::{assert_near, cases, number};
