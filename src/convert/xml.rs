@@ -2,20 +2,17 @@
 
 use crate::ConvertError;
 
-/// Most elements and texts of a file.
-const NODES: u32 = 1_000_000;
-
 /// Most attributes of one element: no format here knows more than 30.
 const ATTRIBUTES: usize = 256;
 
 /// Deepest nesting of elements: no format here has more than 40.
 const DEPTH: usize = 256;
 
-/// Parses a text after [`check`].
-pub(crate) fn parse(text: &str) -> Result<roxmltree::Document<'_>, ConvertError> {
+/// Parses a text of at most so many elements and texts, after [`check`].
+pub(crate) fn parse(text: &str, nodes: u32) -> Result<roxmltree::Document<'_>, ConvertError> {
     check(text)?;
     let options =
-        roxmltree::ParsingOptions { allow_dtd: false, nodes_limit: NODES, ..Default::default() };
+        roxmltree::ParsingOptions { allow_dtd: false, nodes_limit: nodes, ..Default::default() };
     roxmltree::Document::parse_with_options(text, options)
         .map_err(|error| ConvertError::new("XML", error.to_string()))
 }

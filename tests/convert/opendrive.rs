@@ -73,6 +73,8 @@ fn what_is_no_map_is_refused() {
     assert_eq!(place("<OpenDRIVE/>").place, "OpenDRIVE");
     assert_eq!(place("{}").place, "XML");
     let far = ROADS.replace("x=\"0.0\" y=\"0.0\"", "x=\"400000.0\" y=\"5000000.0\"");
+    assert!(place(&far).message.contains("apart"), "{}", place(&far));
+    let far = far.replace("x=\"100.0\" y=\"0.0\"", "x=\"400100.0\" y=\"5000000.0\"");
     let error = place(&far);
     assert!(error.message.contains("--origin 400000.0,5000000.0"), "{error}");
     assert_eq!(opendrive::read(&[0xff, 0xfe], None).unwrap_err().place, "file");

@@ -115,7 +115,7 @@ pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
               <ByValueCondition><SimulationTimeCondition value="2" rule="greaterThan"/></ByValueCondition>
             </Condition></ConditionGroup></StartTrigger>
           </Event>
-          <Event name="Leave" priority="skip">
+          <Event name="Leave" priority="parallel">
             <Action name="gone"><GlobalAction><EntityAction entityRef="Walker"><DeleteEntityAction/></EntityAction></GlobalAction></Action>
             <StartTrigger><ConditionGroup><Condition name="t" delay="0" conditionEdge="rising">
               <ByEntityCondition>
@@ -161,7 +161,7 @@ fn a_scenario_is_read_and_runs() {
     let near = van.script[0].when.measure.as_ref().unwrap();
     assert_eq!((near.quantity, near.below), (QuantitySection::Distance, Some(15.0)));
     // From the box's middle back to the reference point.
-    assert_eq!((near.ahead_m, near.to_ahead_m), (Some(-1.4), Some(-1.3)));
+    assert_eq!((near.ahead_m, near.to_ahead_m), (Some(-1.4), Some(-1.5)));
     assert_eq!(van.script[1].when.after.as_deref(), Some("cut-in/swerve"));
     // From 8 to 2 m/s in 2 s. By its priority, it ends the event before it.
     let halt = ActionSection::Halt { trigger: "swerve".into() };

@@ -6,6 +6,9 @@ use wildcity_scene::geo::{GeoAnchor, ProjectedOrigin};
 use super::FARTHEST_M;
 use crate::{ConvertError, xml};
 
+/// Most elements and texts of a file: those of a city.
+const NODES: u32 = 50_000_000;
+
 /// The numbers of the elements that give a road its shape.
 const NUMBERS: [(&str, &[&str]); 14] = [
     ("road", &["length"]),
@@ -36,7 +39,7 @@ pub(super) struct Framed {
 
 /// Moves the coordinates of a file to `origin`, which is an easting and a northing, or else by the offset of its header.
 pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, ConvertError> {
-    let document = xml::parse(text)?;
+    let document = xml::parse(text, NODES)?;
     check_numbers(&document)?;
     let offset = offset_of(&document)?;
     let places = places_of(&document);
@@ -46,6 +49,9 @@ pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, Con
         true => text.to_owned(),
         false => moved(text, &document, shift_m),
     };
+    // Far from the origin, coordinates are those of the projection already, and so are heights.
+    let is_local = places.iter().flatten().all(|axis| axis.abs() <= f64::from(FARTHEST_M));
+    let offset = offset.filter(|_| is_local);
     let geo = origin_m.and_then(|origin_m| anchor_of(&document, origin_m, offset.as_ref()));
     Ok(Framed { text, geo, notes })
 }
@@ -137,9 +143,21 @@ fn shift_of(
             Ok((offset.xy_m, Some([-x, -y])))
         }
         (None, _) => {
-            let [east, north] = [0, 1].map(|axis| {
-                let least = places.iter().map(|place| place[axis]).fold(f64::INFINITY, f64::min);
-                (least / 1000.0).floor() * 1000.0
+            let bounds = [0, 1].map(|axis| {
+                let values = places.iter().map(|place| place[axis]);
+                [
+                    values.clone().fold(f64::INFINITY, f64::min),
+                    values.fold(-f64::INFINITY, f64::max),
+                ]
+            });
+            if bounds.iter().any(|[least, most]| most - least > 2.0 * most_m) {
+                let message =
+                    format!("its roads are more than {} m apart; cut the map", 2.0 * most_m);
+                return Err(ConvertError::new("OpenDRIVE", message));
+            }
+            let [east, north] = bounds.map(|[least, most]| match most - least < most_m {
+                true => (least / 1000.0).floor() * 1000.0,
+                false => (0.5 * (least + most)).round(),
             });
             let message = format!(
                 "its roads are more than {most_m} m from the origin, where they are not exact: give the easting and \
@@ -222,8 +240,7 @@ fn anchor_of(
         Some(_) => return None,
         None => projection.to_uppercase(),
     };
-    // A height of the file that its offset moves is that of the anchor.
-    let altitude_m = offset.map_or(0.0, |offset| offset.z_m.max(0.0));
+    let altitude_m = offset.map_or(0.0, |offset| offset.z_m);
     let anchor =
         GeoAnchor::Projected(ProjectedOrigin { projection, easting_m, northing_m, altitude_m });
     (is_wgs84 && !is_turned && anchor.check().is_ok()).then_some(anchor)

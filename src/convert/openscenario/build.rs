@@ -274,12 +274,14 @@ impl Builder<'_, '_> {
                 Act::Trajectory(line) => {
                     let (points, length_m) = self.continued(drive, line)?;
                     let most_m = length_of(&points);
+                    // It begins at the first point, wherever the actor is.
+                    let ahead_m = drive.entity.center_m[0].max(0.0);
                     then.push(ActionSection::Path(CourseSection {
                         points: Some(points),
+                        at_m: Some(ahead_m.min(most_m)),
                         done_m: Some(length_m.min(most_m)),
                         ..CourseSection::default()
                     }));
-                    // On the line at once.
                     then.push(step_aside(left_m));
                 }
                 Act::Halt(trigger) => then.push(ActionSection::Halt { trigger: trigger.clone() }),

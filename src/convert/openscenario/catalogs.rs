@@ -98,7 +98,9 @@ fn read_text(path: &Path) -> Result<String, ConvertError> {
 
 /// Parses the files of catalogs. Files that are no catalogs stay unused.
 pub(super) fn documents_of(texts: &[CatalogText]) -> Vec<(Document<'_>, &str)> {
-    let parsed = texts.iter().map(|text| Some((xml::parse(&text.text).ok()?, text.label.as_str())));
+    let parsed = texts
+        .iter()
+        .map(|text| Some((xml::parse(&text.text, super::NODES).ok()?, text.label.as_str())));
     parsed.flatten().collect()
 }
 

@@ -43,6 +43,9 @@ use ledger::Ledger;
 use model::Context;
 use roads::RoadMap;
 
+/// Most elements and texts of a file.
+const NODES: u32 = 1_000_000;
+
 /// Values that the file does not have.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
@@ -82,7 +85,7 @@ pub struct Imported {
 pub fn read(bytes: &[u8], settings: &Settings) -> Result<Imported, ConvertError> {
     // Some editors mark UTF-8 in front.
     let text = text_of(bytes)?.trim_start_matches('\u{feff}');
-    let document = xml::parse(text)?;
+    let document = xml::parse(text, NODES)?;
     let ledger = Ledger::new(settings.leave_out.clone());
     let source = Source { index: 0, label: "" };
     let root = Element::new(document.root_element(), Rc::default(), &ledger, source);

@@ -591,15 +591,20 @@ pub(super) fn stop_time_s(
     stop.only(&["ConditionGroup"])?;
     let mut end_s: Option<f64> = None;
     for group in stop.children() {
-        let is_time = |condition: &Element<'_>| {
-            let by_value = condition.only_child().and_then(|by| by.only_child());
-            by_value.is_ok_and(|kind| {
-                matches!(kind.name(), "SimulationTimeCondition" | "ParameterCondition")
-            })
-        };
-        let is_timed = group.children().all(|condition| is_time(&condition));
-        let condition = match is_timed {
-            true => group_of(&group, context, true),
+        let kinds: Vec<&str> = group
+            .children()
+            .filter_map(|condition| Some(condition.only_child().ok()?.only_child().ok()?.name()))
+            .collect();
+        if kinds.is_empty() {
+            return Err(group.wrong("is empty"));
+        }
+        let is_time = |kind: &&str| **kind == *"SimulationTimeCondition";
+        let condition = match kinds.iter().all(is_time) {
+            // A mistake in a time is no other kind of condition.
+            true => Ok(group_of(&group, context, true)?),
+            false if kinds.iter().all(|kind| is_time(kind) || *kind == "ParameterCondition") => {
+                group_of(&group, context, true)
+            }
             false => Err(group.unread()),
         };
         let Ok(condition) = condition else {

@@ -192,7 +192,10 @@ fn reference_m(body: &LeadCandidate, of: &Body) -> DVec3 {
 
 #[cfg(test)]
 mod tests {
+    use wildcity_scene::geometry::Pose;
+
     use super::*;
+    use crate::traffic::{ActorSpec, ActorState};
 
     fn part(edge: Option<Edge>, later_us: i64) -> Condition {
         Condition { edge, later_us, ..Condition::default() }
@@ -247,5 +250,53 @@ mod tests {
         assert!(value(&all(vec![leaf(1), leaf(5)])) && !value(&all(vec![leaf(1), leaf(6)])));
         assert!(value(&any(vec![leaf(1), leaf(6)])) && !value(&any(vec![leaf(6), leaf(7)])));
         assert!(value(&any(vec![all(vec![leaf(6)]), all(vec![leaf(2)])])));
+    }
+
+    /// A body of 4 m x 2 m along x, at a place and a speed.
+    fn car(actor: u16, [x, y]: [f64; 2], speed_mps: f64) -> LeadCandidate {
+        let spec = ActorSpec {
+            name: "car".into(),
+            class: wildcity_scene::ActorClass::Vehicle,
+            box_: wildcity_scene::ActorBox { length_m: 4.0, width_m: 2.0, height_m: 1.5 },
+            asset: None,
+        };
+        let state = ActorState {
+            index: actor,
+            world_from_actor: Pose { position_m: DVec3::new(x, y, 0.0), ..Pose::IDENTITY },
+            velocity_mps: speed_mps * DVec3::X,
+            yaw_rate_radps: 0.0,
+            present: true,
+        };
+        LeadCandidate::of_actor(&spec, &state)
+    }
+
+    #[test]
+    fn measures_are_between_reference_points_or_boxes() {
+        let bodies = [car(0, [0.0, 0.0], 10.0), car(1, [30.0, 4.0], 6.0)];
+        let measures = Measures { bodies: &bodies, travelled_m: &[1.0, 2.0, 3.0], course: None };
+        let [of, to] =
+            [(0, -1.0), (1, -2.0)].map(|(actor, ahead_m)| Body { actor: Some(actor), ahead_m });
+        let value = |quantity: Quantity| {
+            measures.value(&Measure { quantity, of, above: None, below: None }).unwrap()
+        };
+        let other = |is_free, is_straight| Other { to, is_free, is_on_course: false, is_straight };
+        let near =
+            |found: f64, wanted: f64| assert!((found - wanted).abs() < 1e-9, "{found} {wanted}");
+        near(value(Quantity::Speed), 10.0);
+        near(value(Quantity::Travelled), 2.0);
+        near(value(Quantity::Point(DVec3::new(-1.0, 3.0, 0.0))), 3.0);
+        // Between -1 and 28 along x, and from box to box between 2 and 28.
+        near(value(Quantity::Distance(other(false, false))), 29.0_f64.hypot(4.0));
+        near(value(Quantity::Distance(other(true, false))), 26.0_f64.hypot(2.0));
+        near(value(Quantity::Longitudinal(other(false, false))), 29.0);
+        near(value(Quantity::Longitudinal(other(true, false))), 26.0);
+        near(value(Quantity::Lateral(other(false, false))), 4.0);
+        near(value(Quantity::Lateral(other(true, false))), 2.0);
+        near(value(Quantity::Headway(other(true, false))), 2.6);
+        near(value(Quantity::TimeToCollision(other(true, false))), 6.5);
+        let absent = Body { actor: Some(7), ahead_m: 0.0 };
+        let speed =
+            Measure { quantity: Quantity::Speed, of: absent, above: Some(0.0), below: None };
+        assert!(!measures.holds(&speed));
     }
 }
