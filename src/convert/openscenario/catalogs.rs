@@ -1,14 +1,14 @@
 //! Catalogs: files beside the scenario, whose entries it refers to.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::rc::Rc;
 
 use roxmltree::{Document, Node};
 
 use super::Settings;
 use super::element::{Element, Parameters, Source};
+use super::files::{read_text, xml_files};
 use super::ledger::Ledger;
 use crate::{ConvertError, TEXT_BYTES, xml};
 
@@ -52,14 +52,7 @@ pub(super) fn texts_of(
     let mut texts = Vec::new();
     let mut bytes = 0;
     for directory in directories {
-        // A directory may be absent: only what is referred to must be there.
-        let Ok(files) = std::fs::read_dir(&directory) else { continue };
-        let mut paths: Vec<PathBuf> = files.filter_map(|file| Some(file.ok()?.path())).collect();
-        paths.retain(|path| {
-            path.extension().is_some_and(|extension| extension == "xosc" || extension == "xml")
-        });
-        paths.sort();
-        for path in paths {
+        for path in xml_files(&directory) {
             let text = read_text(&path)?;
             bytes += text.len();
             if texts.len() == FILES || bytes > TEXT_BYTES {
@@ -72,28 +65,6 @@ pub(super) fn texts_of(
         }
     }
     Ok(texts)
-}
-
-/// Reads a file, whose size is bounded.
-pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, ConvertError> {
-    let failed = |error: std::io::Error| {
-        ConvertError::new(format!("{}", path.display()), format!("{error}; it must be readable"))
-    };
-    let is_file = path.metadata().map_err(failed)?.is_file();
-    if !is_file {
-        return Err(ConvertError::new(format!("{}", path.display()), "is no file"));
-    }
-    let mut bytes = Vec::new();
-    let file = std::fs::File::open(path).map_err(failed)?;
-    file.take(TEXT_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(failed)?;
-    Ok(bytes)
-}
-
-fn read_text(path: &Path) -> Result<String, ConvertError> {
-    let bytes = read_bytes(path)?;
-    let text = crate::text_of(&bytes)
-        .map_err(|error| ConvertError::new(format!("{}", path.display()), error.message))?;
-    Ok(text.to_owned())
 }
 
 /// Parses the files of catalogs. Files that are no catalogs stay unused.

@@ -217,7 +217,7 @@ fn by_entity(by: &Element<'_>, context: &Context<'_>) -> Result<ConditionSection
     }
 }
 
-/// Who is measured, without bounds.
+/// A measure of a body, without bounds.
 fn body(quantity: QuantitySection, name: &str, context: &Context<'_>) -> MeasureSection {
     let of = context.actor_name(name);
     let ahead_m = context.ahead_m(name);

@@ -196,7 +196,7 @@ fn read_other(
     if action.name() == "RoutingAction" {
         let follow = action.only_child()?;
         if follow.name() == "AssignRouteAction" {
-            let waypoints = waypoints_of(&follow, context)?;
+            let waypoints = waypoints_of(&follow, context, place_of)?;
             let roads = context.roads.as_ref().ok_or_else(|| follow.wrong("needs the roads"))?;
             let lanes = lanes_between(&waypoints, roads);
             let lanes = lanes.map_err(|message| follow.wrong(&message))?;

@@ -4,9 +4,9 @@
 //! |---|---|
 //! | `element`, `expression` | elements, attributes, and formulas of parameters |
 //! | `ledger` | what was read: anything else is refused, or left out on request with a note |
-//! | `catalogs`, `entities` | catalogs and parameters; vehicles, pedestrians and objects |
+//! | `files`, `catalogs`, `entities` | files beside it, catalogs and parameters; vehicles, pedestrians and objects |
 //! | `position`, `roads`, `route`, `trajectory` | places in the world and on roads, lines along lanes, trajectories |
-//! | `init`, `story`, `actions`, `conditions` | the storyboard |
+//! | `init`, `story`, `elements`, `actions`, `conditions`, `stop` | the storyboard |
 //! | `model`, `build` | what is known of the scenario, and its actors |
 //!
 //! Everything else is refused with its name and line: a scenario with a part missing would be another scenario.
@@ -16,14 +16,17 @@ mod build;
 mod catalogs;
 mod conditions;
 mod element;
+mod elements;
 mod entities;
 mod expression;
+mod files;
 mod init;
 mod ledger;
 mod model;
 mod position;
 mod roads;
 mod route;
+mod stop;
 mod story;
 mod trajectory;
 
@@ -199,13 +202,13 @@ fn file_of<'a>(
     storyboard.only(&["Init", "Story", "StopTrigger"])?;
     init::read_init(&storyboard.need("Init")?, &mut context)?;
     context.is_in_story = true;
-    let mut elements = story::Elements::default();
+    let mut states = elements::Elements::default();
     for story in storyboard.all("Story") {
-        story::read_story(&story, &mut context, &mut elements)?;
+        story::read_story(&story, &mut context, &mut states)?;
     }
-    story::resolve(elements, &mut context)?;
+    elements::resolve(states, &mut context)?;
     let stop = storyboard.find("StopTrigger")?;
-    let end_s = stop.map(|stop| story::stop_time_s(&stop, &context)).transpose()?.flatten();
+    let end_s = stop.map(|stop| stop::stop_time_s(&stop, &context)).transpose()?.flatten();
     let builder = Builder { context: &context, ledger, end_s };
     let mut actors = Vec::new();
     for (name, entity) in context.entities.iter().filter(|(name, _)| **name != settings.ego) {
@@ -263,7 +266,7 @@ fn roads_of(
             path
         }
     };
-    let bytes = catalogs::read_bytes(&path)?;
+    let bytes = files::read_bytes(&path)?;
     let roads = opendrive::roads_of(&bytes, settings.origin).map_err(|error| {
         ConvertError::new(format!("{}, {}", path.display(), error.place), error.message)
     })?;

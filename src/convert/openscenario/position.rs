@@ -30,7 +30,7 @@ pub(super) fn place_of(
         }
         "RoutePosition" => {
             let roads = roads(&kind, context)?;
-            let at = place_on_route(&kind, context, roads)?;
+            let at = place_on_route(&kind, context, roads, place_of)?;
             lane_facing(&kind, at, roads)?
         }
         "RelativeLanePosition" => relative_lane_place(&kind, context)?,

@@ -6,18 +6,21 @@ use xodr::{LaneId, LanePosition};
 
 use super::catalogs::declared;
 use super::element::Element;
-use super::model::Context;
-use super::position::place_of;
+use super::model::{Context, Place};
 use super::roads::RoadMap;
 use crate::ConvertError;
 
 /// Most way-points of a route.
 const WAYPOINTS: usize = 1000;
 
+/// What reads the place of a `<Position>`: positions may be on routes themselves.
+pub(super) type PlaceOf = fn(&Element<'_>, &Context<'_>) -> Result<Place, ConvertError>;
+
 /// The places of a `<Route>`, or of the one that a reference names.
 pub(super) fn waypoints_of(
     holder: &Element<'_>,
     context: &Context<'_>,
+    place_of: PlaceOf,
 ) -> Result<Vec<LanePosition>, ConvertError> {
     holder.only(&["Route", "CatalogReference"])?;
     let (route, is_entry) = match holder.find("CatalogReference")? {
@@ -54,9 +57,10 @@ pub(super) fn place_on_route(
     kind: &Element<'_>,
     context: &Context<'_>,
     roads: &RoadMap,
+    place_of: PlaceOf,
 ) -> Result<LanePosition, ConvertError> {
     kind.only(&["RouteRef", "InRoutePosition", "Orientation"])?;
-    let waypoints = waypoints_of(&kind.need("RouteRef")?, context)?;
+    let waypoints = waypoints_of(&kind.need("RouteRef")?, context, place_of)?;
     let place = kind.need("InRoutePosition")?.only_child()?;
     if place.name() != "FromLaneCoordinates" {
         return Err(place.unread());

@@ -1,39 +1,17 @@
-//! Reads the stories: events, and the states of the storyboard's elements that others wait for.
+//! Reads the stories: their events, with the actions of entities.
 
-use std::collections::BTreeMap;
+use wildcity_sim::scenario::ConditionSection;
 
-use wildcity_sim::scenario::{ConditionSection, PhaseSection};
-
-use super::actions::private_act;
+use super::actions::{private_act, profile_entry};
 use super::catalogs::declared;
-use super::conditions::{PENDING, all_of, group_of, trigger_of};
+use super::conditions::trigger_of;
 use super::element::Element;
+use super::elements::{Elements, Event, unknown};
 use super::init::set_place;
 use super::ledger::Part;
 use super::model::{Act, Context, Draft};
 use super::position::place_of;
 use crate::ConvertError;
-
-/// The events by the elements of the storyboard that contain them.
-#[derive(Debug, Default)]
-pub(super) struct Elements {
-    events: Vec<Event>,
-    /// Indices of events by the type and the name of an element.
-    by_name: BTreeMap<(String, String), Vec<usize>>,
-    /// The triggers that fire when an act starts; `None` for an act that starts with the scenario.
-    acts: BTreeMap<String, Option<String>>,
-    /// Triggers that only mark an instant.
-    marks: Vec<(String, Draft)>,
-}
-
-/// An event.
-#[derive(Debug, Default)]
-struct Event {
-    /// `ACTOR/TRIGGER` of its actions, with the names of the actions.
-    triggers: Vec<(String, String)>,
-    /// The trigger that marks the start of an event of the ego, and the longest of its actions, in seconds, if known.
-    mark: Option<(String, Option<f64>)>,
-}
 
 /// The place of an event in the storyboard.
 struct Scope<'e, 'a> {
@@ -125,32 +103,6 @@ fn gate_of(
     Ok(gate)
 }
 
-impl Elements {
-    /// Adds a trigger that only marks an instant. Returns `ACTOR/TRIGGER`.
-    fn mark(
-        &mut self,
-        name: &str,
-        when: ConditionSection,
-        context: &Context<'_>,
-        element: &Element<'_>,
-    ) -> Result<String, ConvertError> {
-        let actor = context.entities.iter().find(|(name, _)| **name != context.ego);
-        // Without an actor, nothing can wait for it.
-        let Some((key, entity)) = actor else { return Ok(String::new()) };
-        let plain = super::plain_name(name);
-        let taken = |name: &str| self.marks.iter().any(|(_, draft)| draft.name == name);
-        let mut free = (1..1000).map(|index| match index {
-            1 => format!("at-{plain}"),
-            _ => format!("at-{plain}-{index}"),
-        });
-        let name = free.find(|name| !taken(name));
-        let name = name.ok_or_else(|| element.wrong("is there too often; rename some"))?;
-        let reference = format!("{}/{name}", entity.name);
-        self.marks.push((key.clone(), Draft { name, when, then: Vec::new() }));
-        Ok(reference)
-    }
-}
-
 fn read_event<'a>(
     event: &Element<'a>,
     scope: &Scope<'_, 'a>,
@@ -207,12 +159,6 @@ fn read_event<'a>(
         read.action(&action, context, elements)?;
     }
     Ok(())
-}
-
-/// A condition that was not read: nothing may wait for it.
-fn unknown() -> ConditionSection {
-    let after = Some(format!("{PENDING}unread{PENDING}{PENDING}"));
-    ConditionSection { after, ..ConditionSection::default() }
 }
 
 /// An event while its actions are read.
@@ -340,7 +286,7 @@ impl<'a> EventRead<'_, 'a> {
         profile.only(&["SpeedProfileEntry"])?;
         let mut when = self.when.clone();
         for entry in profile.children() {
-            let (act, over_s) = super::actions::profile_entry(&entry)?;
+            let (act, over_s) = profile_entry(&entry)?;
             let trigger = self.add((act, when), target, action_name, context, elements, &entry)?;
             let delay_s = Some(over_s).filter(|over_s| *over_s > 0.0);
             when = ConditionSection { after: Some(trigger), delay_s, ..Default::default() };
@@ -446,177 +392,4 @@ fn duration_s(kind: &Element<'_>) -> Result<Option<f64>, ConvertError> {
         }
     }
     Ok(matches!(kind.name(), "TeleportAction").then_some(0.0))
-}
-
-/// Puts triggers in place of the names of storyboard elements, and adds the marks that conditions wait for.
-pub(super) fn resolve(elements: Elements, context: &mut Context<'_>) -> Result<(), ConvertError> {
-    let mut elements = elements;
-    let marks = std::mem::take(&mut elements.marks);
-    // Marks that nothing waits for may have conditions that were not read.
-    let mut resolved = Vec::new();
-    for (key, mut mark) in marks {
-        let error = resolve_condition(&mut mark.when, &elements).err();
-        resolved.push((key, mark, error));
-    }
-    let mut marks = resolved;
-    for entity in context.entities.values_mut() {
-        for draft in &mut entity.script {
-            resolve_condition(&mut draft.when, &elements)?;
-        }
-    }
-    // Only what something waits for: first by actions, then by the marks themselves.
-    let mut wanted: Vec<String> = Vec::new();
-    for draft in context.entities.values().flat_map(|entity| &entity.script) {
-        names_of(&draft.when, &mut wanted);
-    }
-    loop {
-        let is_wanted = |key: &str, mark: &Draft| {
-            let actor = context.entities.get(key).map(|entity| &entity.name);
-            actor.is_some_and(|actor| wanted.contains(&format!("{actor}/{}", mark.name)))
-        };
-        let Some(at) = marks.iter().position(|(key, mark, _)| is_wanted(key, mark)) else {
-            return Ok(());
-        };
-        let (key, mark, error) = marks.remove(at);
-        if let Some(error) = error {
-            return Err(error);
-        }
-        names_of(&mark.when, &mut wanted);
-        if let Some(entity) = context.entities.get_mut(&key) {
-            entity.script.push(mark);
-        }
-    }
-}
-
-/// The triggers that a condition waits for.
-fn names_of(when: &ConditionSection, names: &mut Vec<String>) {
-    names.extend(when.after.clone());
-    when.all.iter().chain(&when.any).for_each(|part| names_of(part, names));
-}
-
-fn resolve_condition(when: &mut ConditionSection, elements: &Elements) -> Result<(), ConvertError> {
-    for part in when.all.iter_mut().chain(&mut when.any) {
-        resolve_condition(part, elements)?;
-    }
-    let Some(pending) = when.after.as_deref().and_then(|after| after.strip_prefix(PENDING)) else {
-        return Ok(());
-    };
-    let mut words = pending.split(PENDING);
-    let [kind, name, line] = [(); 3].map(|()| words.next().unwrap_or_default().to_owned());
-    let place = format!("line {line}, <StoryboardElementStateCondition>");
-    let phase = when.phase.unwrap_or(PhaseSection::Fired);
-    let parts = elements.afters(&kind, &name, phase, when.delay_s.unwrap_or(0.0));
-    let parts = parts.map_err(|message| ConvertError::new(place, message))?;
-    let after = all_of(parts);
-    *when = ConditionSection { after: None, phase: None, delay_s: None, ..when.clone() };
-    *when = match *when == ConditionSection::default() {
-        true => after,
-        false => all_of(vec![after, when.clone()]),
-    };
-    Ok(())
-}
-
-impl Elements {
-    /// The conditions that wait for an element of the storyboard.
-    fn afters(
-        &self,
-        kind: &str,
-        name: &str,
-        phase: PhaseSection,
-        delay_s: f64,
-    ) -> Result<Vec<ConditionSection>, String> {
-        let at_start = || ConditionSection { time_s: Some(delay_s), ..Default::default() };
-        let after = |trigger: &str, phase: PhaseSection, delay_s: f64| ConditionSection {
-            after: Some(trigger.to_owned()),
-            phase: (phase != PhaseSection::Fired).then_some(phase),
-            delay_s: (delay_s > 0.0).then_some(delay_s),
-            ..Default::default()
-        };
-        let is_fired = phase == PhaseSection::Fired;
-        if kind == "act" && is_fired {
-            return match self.acts.get(name) {
-                None => Err(format!("there is no act {name:?}")),
-                Some(None) => Ok(vec![at_start()]),
-                Some(Some(gate)) => Ok(vec![after(gate, phase, delay_s)]),
-            };
-        }
-        if kind == "story" && is_fired {
-            return Ok(vec![at_start()]);
-        }
-        if kind == "unread" {
-            return Err("waits for an event of the ego whose condition is not read".to_owned());
-        }
-        let key = (kind.to_owned(), name.to_owned());
-        let Some(events) = self.by_name.get(&key) else {
-            return Err(format!("there is no {kind} {name:?}"));
-        };
-        let is_one = matches!(kind, "event" | "action");
-        if is_one && events.windows(2).any(|pair| pair[0] != pair[1]) {
-            return Err(format!("{kind} {name:?} is there several times; rename them"));
-        }
-        if is_fired && !is_one {
-            return Err(format!("waits for the start of a {kind}; name its act or an event"));
-        }
-        let mut parts = Vec::new();
-        for event in events.iter().map(|index| &self.events[*index]) {
-            let triggers = event.triggers.iter();
-            let triggers = triggers.filter(|(_, action)| kind != "action" || action == name);
-            parts.extend(triggers.map(|(trigger, _)| after(trigger, phase, delay_s)));
-            let has_own = kind == "action" && !parts.is_empty();
-            let Some((mark, duration_s)) = event.mark.as_ref().filter(|_| !has_own) else {
-                continue;
-            };
-            let duration_s = if is_fired { Some(0.0) } else { *duration_s };
-            let Some(duration_s) = duration_s else {
-                let message = format!(
-                    "waits for the end of {kind} {name:?}, whose actions of the ego are left out: the agent drives it"
-                );
-                return Err(message);
-            };
-            parts.push(after(mark, PhaseSection::Fired, delay_s + duration_s));
-        }
-        parts.dedup();
-        match parts.is_empty() {
-            true => Err(format!("{kind} {name:?} has no actions")),
-            false => Ok(parts),
-        }
-    }
-}
-
-/// When a `<StopTrigger>` ends the scenario, in seconds; `None` if it does not by time.
-pub(super) fn stop_time_s(
-    stop: &Element<'_>,
-    context: &Context<'_>,
-) -> Result<Option<f64>, ConvertError> {
-    stop.only(&["ConditionGroup"])?;
-    let mut end_s: Option<f64> = None;
-    for group in stop.children() {
-        let kinds: Vec<&str> = group
-            .children()
-            .filter_map(|condition| Some(condition.only_child().ok()?.only_child().ok()?.name()))
-            .collect();
-        if kinds.is_empty() {
-            return Err(group.wrong("is empty"));
-        }
-        let is_time = |kind: &&str| **kind == *"SimulationTimeCondition";
-        let condition = match kinds.iter().all(is_time) {
-            // A mistake in a time is no other kind of condition.
-            true => Ok(group_of(&group, context, true)?),
-            false if kinds.iter().all(|kind| is_time(kind) || *kind == "ParameterCondition") => {
-                group_of(&group, context, true)
-            }
-            false => Err(group.unread()),
-        };
-        let Ok(condition) = condition else {
-            group.leave_out(Part::Stop)?;
-            continue;
-        };
-        let parts = condition.all.iter().chain([&condition]).filter_map(|part| part.time_s);
-        let time_s = parts.fold(0.0, f64::max);
-        // A parameter that is another never ends it.
-        if time_s < wildcity_sim::limits::END_S {
-            end_s = Some(end_s.map_or(time_s, |before_s| before_s.min(time_s)));
-        }
-    }
-    Ok(end_s)
 }

@@ -62,32 +62,6 @@ pub struct LogSection {
     pub track: String,
 }
 
-/// A line to follow: exactly one of `along`, `points` and `lanes`.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct CourseSection {
-    /// A recorded trajectory of the twin.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
-    /// Place on the line at which the action is done, in metres: for a condition with the `phase` `done`. If absent, it
-    /// is done at once.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub done_m: Option<f64>,
-    /// Place on the line to which the actor is put, in metres. If absent, it continues from the nearest place.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub at_m: Option<f64>,
-}
-
 /// An actor on a course.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
