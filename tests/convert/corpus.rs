@@ -71,6 +71,7 @@ fn most_public_files_import() {
     let mut plain = 0;
     let mut with_parts = 0;
     let mut scenarios = 0;
+    let mut counts: BTreeMap<String, [usize; 3]> = BTreeMap::new();
     let mut refusals: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for path in &paths {
         // Catalogs and distributions of parameters are no scenarios.
@@ -79,9 +80,18 @@ fn most_public_files_import() {
             continue;
         }
         scenarios += 1;
-        plain += usize::from(import(path, &[]).is_ok());
+        let below = path.strip_prefix(&root).unwrap();
+        let corpus = below.iter().next().unwrap().to_string_lossy().into_owned();
+        let [all_of, plain_of, with_of] = counts.entry(corpus).or_default();
+        *all_of += 1;
+        let is_plain = import(path, &[]).is_ok();
+        plain += usize::from(is_plain);
+        *plain_of += usize::from(is_plain);
         match import(path, &all) {
-            Ok(()) => with_parts += 1,
+            Ok(()) => {
+                with_parts += 1;
+                *with_of += 1;
+            }
             Err(error) => {
                 let kind: String =
                     error.chars().filter(|c| !c.is_ascii_digit()).take(120).collect();
@@ -92,6 +102,7 @@ fn most_public_files_import() {
     }
     let mut lines =
         vec![format!("{scenarios} scenarios, {plain} import, {with_parts} with parts left out")];
+    lines.extend(counts.iter().map(|(corpus, counts)| format!("{corpus}: {counts:?}")));
     let mut kinds: Vec<_> = refusals.into_values().collect();
     kinds.sort_by_key(|kind| std::cmp::Reverse(kind.len()));
     lines.extend(kinds.iter().map(|kind| format!("{:4}  {}", kind.len(), kind[0])));

@@ -134,6 +134,11 @@ impl<'a> Element<'a> {
         Ok(())
     }
 
+    /// Whether a part is left out.
+    pub(super) fn leaves_out(&self, part: Part) -> bool {
+        self.ledger.leave_out.contains(&part)
+    }
+
     /// Does not require that this element is read.
     pub(super) fn mark_left_out(&self) {
         self.ledger.leave_out(self.source.index, self.node);

@@ -14,22 +14,23 @@ pub(super) fn stop_time_s(
     stop.only(&["ConditionGroup"])?;
     let mut end_s: Option<f64> = None;
     for group in stop.children() {
-        let kinds: Vec<&str> = group
-            .children()
-            .filter_map(|condition| Some(condition.only_child().ok()?.only_child().ok()?.name()))
-            .collect();
+        let kinds: Result<Vec<&str>, ConvertError> =
+            group.children().map(|condition| kind_of(&condition)).collect();
+        let kinds = kinds?;
         if kinds.is_empty() {
             return Err(group.wrong("is empty"));
         }
-        let is_time = |kind: &&str| **kind == *"SimulationTimeCondition";
-        let condition = match kinds.iter().all(is_time) {
-            // A mistake in a time is no other kind of condition.
-            true => Ok(group_of(&group, context, true)?),
-            false if kinds.iter().all(|kind| is_time(kind) || *kind == "ParameterCondition") => {
-                group_of(&group, context, true)
-            }
+        let is_timed = kinds.iter().all(|kind| *kind == "SimulationTimeCondition");
+        let is_known =
+            |kind: &&str| matches!(*kind, "SimulationTimeCondition" | "ParameterCondition");
+        let condition = match kinds.iter().all(is_known) {
+            true => group_of(&group, context, true),
             false => Err(group.unread()),
         };
+        // The mistake itself says more than that the group may be left out.
+        if is_timed && !group.leaves_out(Part::Stop) {
+            condition.clone()?;
+        }
         let Ok(condition) = condition else {
             group.leave_out(Part::Stop)?;
             continue;
@@ -42,4 +43,13 @@ pub(super) fn stop_time_s(
         }
     }
     Ok(end_s)
+}
+
+/// The kind of a condition.
+fn kind_of<'a>(condition: &Element<'a>) -> Result<&'a str, ConvertError> {
+    let by = condition.only_child()?;
+    match by.name() {
+        "ByValueCondition" => Ok(by.only_child()?.name()),
+        other => Ok(other),
+    }
 }
