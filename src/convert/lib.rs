@@ -4,13 +4,14 @@
 //! |---|---|
 //! | `opendrive` | lanes of OpenDRIVE, by the crate xodr |
 //! | `geojson` | lanes and areas of GeoJSON, with nuPlan's layers |
-//! | `openscenario` | a subset of OpenSCENARIO XML 1.0 to 1.3 |
+//! | `openscenario` | OpenSCENARIO XML 1.0 to 1.3 with its catalogs and roads |
 //!
 //! A reader refuses elements that it does not support, with their name and line.
 
 pub mod geojson;
 pub mod opendrive;
 pub mod openscenario;
+mod xml;
 
 /// Largest text that is read, in bytes.
 pub const TEXT_BYTES: usize = 256 << 20;

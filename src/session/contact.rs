@@ -34,6 +34,11 @@ const BESIDE_M: f64 = 4.0;
 /// Largest distance between two places at which the area is measured along a recorded drive, in metres.
 const MEASURED_M: f64 = 0.5;
 
+/// An ego is tested again when it has moved by this, in metres, or turned by this, in radians. What it meets stays in its box
+/// for longer.
+const TESTED_M: f64 = 0.25;
+const TESTED_RAD: f64 = 0.05;
+
 /// Whether a session looks for contact with the twin, and what it does at a contact. With a scenario, `Off` switches it
 /// off, and the scenario says what a contact does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -63,6 +68,14 @@ pub(crate) struct TwinSolids {
     blocks: Arc<SolidBlocks>,
     ego_box: EgoBox,
     limits: Arc<Mutex<HashMap<Block, StaticLimit>>>,
+}
+
+/// Where a contact begins.
+struct Met {
+    /// Time since the start of the step, in microseconds.
+    since_us: i64,
+    state: EgoState,
+    area_m2: f64,
 }
 
 /// Sections that a computation has looked up, so that it does not look them up for each pose.
@@ -102,33 +115,65 @@ impl TwinSolids {
             let mut events = Vec::new();
             // An ego that stands does not begin to touch anything.
             if motion.from != motion.to {
-                let is_jump = motion.mean_speed_mps(dt_us) > MAX_SWEPT_SPEED_MPS;
-                let mut touched = match touches {
-                    _ if is_jump => false,
+                let touched = match touches {
                     Some(touches) => touches,
                     None => self.contact_m2(&mut near, &motion.from.world_from_rig)?.is_some(),
                 };
-                for (since_us, state) in motion.sub_steps(dt_us) {
-                    // Of a jump only the end is tested.
-                    if is_jump && since_us < dt_us {
-                        continue;
-                    }
-                    let area_m2 = self.contact_m2(&mut near, &state.world_from_rig)?;
-                    if let (Some(area_m2), false) = (area_m2, touched) {
-                        let impact_mps = state.velocity_mps.length();
-                        events.push(Event {
-                            time_us: begin_us + step * dt_us + since_us,
-                            kind: EventKind::StaticContact { area_m2, impact_mps },
-                        });
-                    }
-                    touched = area_m2.is_some();
-                }
+                let step_us = begin_us + step * dt_us;
+                let touched = self.step_contacts(&mut near, &motion, dt_us, touched, |met| {
+                    let impact_mps = met.state.velocity_mps.length();
+                    let kind = EventKind::StaticContact { area_m2: met.area_m2, impact_mps };
+                    events.push(Event { time_us: step_us + met.since_us, kind });
+                })?;
                 touches = Some(touched);
             }
             steps.push(events);
             from = motion.to;
         }
         Ok(steps)
+    }
+
+    /// Shows `visit` the contacts that begin in a step, in which the ego `touched` the twin at its start. Returns whether it
+    /// does at its end.
+    fn step_contacts(
+        &self,
+        near: &mut Near,
+        motion: &EgoMotion,
+        dt_us: i64,
+        mut touched: bool,
+        mut visit: impl FnMut(Met),
+    ) -> Result<bool, StoreError> {
+        if motion.mean_speed_mps(dt_us) > MAX_SWEPT_SPEED_MPS {
+            // Of a jump only the end is tested, and whatever is met there is new.
+            let state = motion.to;
+            let area_m2 = self.contact_m2(near, &state.world_from_rig)?;
+            if let Some(area_m2) = area_m2 {
+                visit(Met { since_us: dt_us, state, area_m2 });
+            }
+            return Ok(area_m2.is_some());
+        }
+        let mut tested = motion.from;
+        let mut skipped: Vec<(i64, EgoState)> = Vec::new();
+        for (since_us, state) in motion.sub_steps(dt_us) {
+            skipped.push((since_us, state));
+            if since_us < dt_us && is_beside(&tested, &state) {
+                continue;
+            }
+            let touches = self.contact_m2(near, &state.world_from_rig)?.is_some();
+            if touches && !touched {
+                // The first of the sub-steps since the last test.
+                for (since_us, state) in skipped.drain(..) {
+                    if let Some(area_m2) = self.contact_m2(near, &state.world_from_rig)? {
+                        visit(Met { since_us, state, area_m2 });
+                        break;
+                    }
+                }
+            }
+            skipped.clear();
+            tested = state;
+            touched = touches;
+        }
+        Ok(touched)
     }
 
     /// Reads what an ego at a pose needs. Blocks.
@@ -211,6 +256,13 @@ impl TwinSolids {
         near.0.insert(id, solids.clone());
         Ok(solids)
     }
+}
+
+/// Whether an ego has moved so little that it is not tested again.
+fn is_beside(tested: &EgoState, now: &EgoState) -> bool {
+    let [from, to] = [&tested.world_from_rig, &now.world_from_rig];
+    from.position_m.distance(to.position_m) < TESTED_M
+        && from.rotation.angle_between(to.rotation) < TESTED_RAD
 }
 
 /// The south-west corner of a block.

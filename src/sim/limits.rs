@@ -115,3 +115,11 @@ pub const POSITIONS: usize = 4096;
 
 /// Most actions of one trigger.
 pub const ACTIONS: usize = 16;
+
+/// Most conditions within the condition of one trigger, and their deepest nesting.
+pub const CONDITIONS: usize = 64;
+/// Deepest nesting of conditions: see [`CONDITIONS`].
+pub const CONDITION_DEPTH: usize = 6;
+
+/// Largest delay of a condition, in seconds: in sub-steps of 10 ms its values change at most 6000 times.
+pub const LATER_S: f64 = 60.0;

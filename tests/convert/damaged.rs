@@ -199,7 +199,7 @@ fn damaged_maps_are_refused() {
 #[test]
 fn damaged_files_of_others_are_refused() {
     refusals("opendrive", crate::opendrive::ROADS.as_bytes(), |text| {
-        let map = opendrive::read(text);
+        let map = opendrive::read(text, None);
         map.map(|_| ()).map_err(|error| told(&error.place, &error.message))
     });
     refusals("openscenario", crate::openscenario::CUT_IN.as_bytes(), |text| {

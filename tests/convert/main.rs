@@ -3,8 +3,17 @@
 #[path = "../support/root.rs"]
 mod root;
 
+#[path = "../support/data.rs"]
+mod data;
+
+mod corpus;
 mod damaged;
 mod geojson;
 mod opendrive;
 mod openscenario;
 mod schema;
+
+/// A file of the small inputs with expected values.
+fn case(name: &str) -> Option<Vec<u8>> {
+    data::real(&format!("cases/{name}")).map(|path| std::fs::read(path).unwrap())
+}

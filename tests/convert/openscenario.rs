@@ -1,9 +1,25 @@
 //! OpenSCENARIO files.
 
-use wildcity_convert::openscenario::{Settings, read};
+use glam::DVec3;
+use wildcity_convert::openscenario::{Imported, Part, Settings, read};
+use wildcity_scene::geometry::Pose;
 use wildcity_sim::scenario::{
-    ActionSection, Document, EgoStart, NoAssets, Scenario, ScenarioFile, Surroundings,
+    ActionSection, ActorSection, Document, EgoStart, NoAssets, ProfileSection, QuantitySection,
+    Scenario, ScenarioFile, ShapeSection, Surroundings,
 };
+use wildcity_sim::traffic::{EgoMotion, EgoState, World};
+
+/// A linear change within a time.
+fn linear(to: f64, over_s: f64) -> ProfileSection {
+    ProfileSection {
+        to,
+        shape: ShapeSection::Linear,
+        over_s: Some(over_s),
+        over_m: None,
+        rate: None,
+        acceleration: None,
+    }
+}
 
 /// An ego, a car that cuts in, and a pedestrian that crosses: every element that is read.
 pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
@@ -90,7 +106,7 @@ pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
       <ManeuverGroup name="w" maximumExecutionCount="1">
         <Actors selectTriggeringEntities="false"><EntityRef entityRef="Walker"/></Actors>
         <Maneuver name="m2">
-          <Event name="Walk" priority="skip">
+          <Event name="Walk" priority="parallel">
             <Action name="go"><PrivateAction><LongitudinalAction><SpeedAction>
               <SpeedActionDynamics dynamicsShape="linear" value="1.5" dynamicsDimension="rate"/>
               <SpeedActionTarget><AbsoluteTargetSpeed value="1.34"/></SpeedActionTarget>
@@ -99,7 +115,7 @@ pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
               <ByValueCondition><SimulationTimeCondition value="2" rule="greaterThan"/></ByValueCondition>
             </Condition></ConditionGroup></StartTrigger>
           </Event>
-          <Event name="Leave" priority="skip">
+          <Event name="Leave" priority="parallel">
             <Action name="gone"><GlobalAction><EntityAction entityRef="Walker"><DeleteEntityAction/></EntityAction></GlobalAction></Action>
             <StartTrigger><ConditionGroup><Condition name="t" delay="0" conditionEdge="rising">
               <ByEntityCondition>
@@ -121,7 +137,12 @@ pub(crate) const CUT_IN: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
 "#;
 
 pub(crate) fn settings() -> Settings {
-    Settings { name: "cut-in".into(), twin: "street".into(), ego: "Ego".into() }
+    Settings {
+        name: "cut-in".into(),
+        twin: "street".into(),
+        ego: "Ego".into(),
+        ..Settings::default()
+    }
 }
 
 fn resolved(file: ScenarioFile) -> Scenario {
@@ -131,14 +152,19 @@ fn resolved(file: ScenarioFile) -> Scenario {
 
 #[test]
 fn a_scenario_is_read_and_runs() {
-    let file = read(CUT_IN.as_bytes(), &settings()).unwrap();
+    let Imported { file, notes } = read(CUT_IN.as_bytes(), &settings()).unwrap();
+    assert!(notes.len() == 1 && notes[0].contains("stays on the line"), "{notes:?}");
     assert_eq!(file.ego.dynamics.unwrap().speed, 10.0);
     assert_eq!(file.end.time_s, Some(20.0));
     let van = file.actors.iter().find(|actor| actor.name == "cut-in").unwrap();
-    assert_eq!(van.script[0].when.within_m, Some(15.0));
+    let near = van.script[0].when.measure.as_ref().unwrap();
+    assert_eq!((near.quantity, near.below), (QuantitySection::Distance, Some(15.0)));
+    // From the box's middle back to the reference point.
+    assert_eq!((near.ahead_m, near.to_ahead_m), (Some(-1.4), Some(-1.5)));
     assert_eq!(van.script[1].when.after.as_deref(), Some("cut-in/swerve"));
-    // From 8 to 2 m/s in 2 s.
-    assert_eq!(van.script[1].then, [ActionSection::Speed { to: 2.0, rate: 3.0 }]);
+    // From 8 to 2 m/s in 2 s. By its priority, it ends the event before it.
+    let halt = ActionSection::Halt { trigger: "swerve".into() };
+    assert_eq!(van.script[1].then, [halt, ActionSection::SpeedProfile(linear(2.0, 2.0))]);
     // It is written as our JSON, and read again.
     let text = serde_json::to_vec_pretty(&file).unwrap();
     let again = Document::parse(&text).unwrap().with(&Default::default()).unwrap();
@@ -156,11 +182,6 @@ fn what_is_not_read_is_refused_by_name_and_line() {
         read(text.as_bytes(), &settings()).unwrap_err().to_string()
     };
     for (from, to, expected) in [
-        (
-            "<CatalogLocations/>",
-            "<CatalogLocations><VehicleCatalog/></CatalogLocations>",
-            "line 8, <VehicleCatalog>",
-        ),
         ("revMinor=\"2\"", "revMinor=\"4\"", "line 3, <FileHeader>"),
         (
             "<WorldPosition x=\"60\"",
@@ -168,18 +189,18 @@ fn what_is_not_read_is_refused_by_name_and_line() {
             "line 46, <LanePosition>",
         ),
         ("$Gap", "$Gab", "\"Gab\""),
-        ("${$EgoKmh / 3.6}", "${pow($EgoKmh, 2)}", "line 33, <AbsoluteTargetSpeed>"),
-        (
-            "dynamicsShape=\"linear\"",
-            "dynamicsShape=\"sinusoidal\"",
-            "line 72, <SpeedActionDynamics>",
-        ),
+        ("${$EgoKmh / 3.6}", "${log($EgoKmh)}", "line 33, <AbsoluteTargetSpeed>"),
+        ("dynamicsShape=\"linear\"", "dynamicsShape=\"quintic\"", "line 72, <SpeedActionDynamics>"),
         (
             "<TraveledDistanceCondition value=\"12\"/>",
             "<CollisionCondition/>",
             "<CollisionCondition>",
         ),
-        ("priority=\"skip\"", "priority=\"parallel\"", "<Event>"),
+        ("priority=\"parallel\"", "priority=\"skip\"", "<Event>"),
+        ("priority=\"parallel\"", "priority=\"first\"", "<Event>"),
+        // Attributes too.
+        ("<None/>", "<None scale=\"2\"/>", "scale=\"2\" is not read"),
+        ("delay=\"0\"", "delay=\"-1\"", "delay=-1"),
         ("maximumExecutionCount=\"1\"", "maximumExecutionCount=\"3\"", "<ManeuverGroup>"),
         ("entityRef=\"Walker\"", "entityRef=\"Other\"", "\"Other\""),
         ("value=\"20\" rule", "value=\"NaN\" rule", "finite"),
@@ -202,4 +223,270 @@ fn deep_nesting_and_entities_are_refused() {
     assert!(read(deep.as_bytes(), &settings()).is_err());
     let bomb = "<!DOCTYPE a [<!ENTITY b \"bbbb\">]><OpenSCENARIO>&b;</OpenSCENARIO>";
     assert!(read(bomb.as_bytes(), &settings()).is_err());
+}
+
+/// Reads a file of the small inputs beside its catalogs.
+fn imported(name: &str) -> Option<ScenarioFile> {
+    let path = crate::data::real(&format!("cases/{name}"))?;
+    let settings = Settings {
+        directory: path.parent().map(std::path::Path::to_owned),
+        ego: "Ego".into(),
+        ..settings()
+    };
+    Some(read(&std::fs::read(&path).unwrap(), &settings).unwrap().file)
+}
+
+fn actor<'f>(file: &'f ScenarioFile, name: &str) -> &'f ActorSection {
+    file.actors.iter().find(|actor| actor.name == name).unwrap()
+}
+
+/// The ways of the actors of a scenario after these seconds, while the ego stands.
+fn ways_m<const N: usize>(file: &ScenarioFile, name: &str, seconds: [f64; N]) -> [f64; N] {
+    let scenario = resolved(file.clone());
+    let index = file.actors.iter().position(|actor| actor.name == name).unwrap();
+    let mut world = World::new(scenario.traffic.clone());
+    let ego = EgoMotion::standing(EgoState {
+        world_from_rig: Pose::IDENTITY,
+        velocity_mps: DVec3::ZERO,
+        yaw_rate_radps: 0.0,
+    });
+    let start_m = world.states()[index].world_from_actor.position_m;
+    let mut time_us = 0;
+    seconds.map(|second| {
+        let next_us = (second * 1e6) as i64;
+        if next_us > time_us {
+            world.step(next_us - time_us, &ego, &mut |_| {});
+        }
+        time_us = next_us;
+        world.states()[index].world_from_actor.position_m.distance(start_m)
+    })
+}
+
+#[test]
+fn entries_of_catalogs_have_their_boxes() {
+    let Some(file) = imported("osc_catalog/catalog/scenario.xosc") else { return };
+    assert_eq!(actor(&file, "lead").size, Some([4.5, 1.8, 1.5]));
+    let [unused, plain] = ["o_catalog_unused", "o_plain"]
+        .map(|name| imported(&format!("osc_catalog/{name}.xosc")).unwrap());
+    assert_eq!(unused, plain);
+    // Without its directory, a reference is refused.
+    let path = crate::data::real("cases/osc_catalog/catalog/scenario.xosc").unwrap();
+    let error = read(&std::fs::read(path).unwrap(), &settings()).unwrap_err();
+    assert!(error.place.ends_with("<Directory>"), "{error}");
+}
+
+#[test]
+fn parameters_use_earlier_ones() {
+    for (name, speed) in [("o_chain", 10.0), ("o_chain2", 36.0), ("o_dollar", 10.0)] {
+        let Some(file) = imported(&format!("osc_parameters/{name}.xosc")) else { return };
+        assert_eq!(actor(&file, "lead").path.as_ref().unwrap().speed, speed, "{name}");
+    }
+    let path = crate::data::real("cases/osc_parameters/o_chain.xosc").unwrap();
+    let bytes = std::fs::read(path).unwrap();
+    let given = |name: &str| Settings {
+        parameters: [(name.to_owned(), "72".to_owned())].into(),
+        ..settings()
+    };
+    let file = read(&bytes, &given("kmh")).unwrap().file;
+    assert_eq!(actor(&file, "lead").path.as_ref().unwrap().speed, 20.0, "another value");
+    assert!(read(&bytes, &given("mph")).unwrap_err().message.contains("mph"));
+}
+
+#[test]
+fn ramps_of_init_and_delays_of_the_stop_trigger_count() {
+    let Some(file) = imported("osc_silently_other/o_initramp.xosc") else { return };
+    assert_eq!(actor(&file, "lead").path.as_ref().unwrap().speed, 0.0);
+    let [at_5_m, at_6_m] = ways_m(&file, "lead", [5.0, 6.0]);
+    assert!((at_5_m - 25.0).abs() < 0.05 && (at_6_m - 35.0).abs() < 0.05, "{at_5_m} {at_6_m}");
+    let file = imported("osc_silently_other/o_stopdelay.xosc").unwrap();
+    assert_eq!(file.end.time_s, Some(15.0));
+}
+
+/// A straight road of 300 m with two lanes for each direction.
+const ROADS: &str = r#"<OpenDRIVE><header revMajor="1" revMinor="6"/>
+<road name="a" length="300" id="1" junction="-1"><link/>
+<planView><geometry s="0" x="0" y="0" hdg="0" length="300"><line/></geometry></planView>
+<lanes><laneSection s="0">
+<left><lane id="2" type="driving" level="false"><width sOffset="0" a="3" b="0" c="0" d="0"/></lane>
+<lane id="1" type="driving" level="false"><width sOffset="0" a="3" b="0" c="0" d="0"/></lane></left>
+<center><lane id="0" type="none" level="false"/></center>
+<right><lane id="-1" type="driving" level="false"><width sOffset="0" a="3" b="0" c="0" d="0"/></lane>
+<lane id="-2" type="driving" level="false"><width sOffset="0" a="3" b="0" c="0" d="0"/></lane></right>
+</laneSection></lanes></road></OpenDRIVE>"#;
+
+/// Reads a file on the roads.
+fn on_roads(text: &str, leave_out: &[Part]) -> Result<Imported, String> {
+    let dir = tempfile::tempdir().unwrap();
+    let roads = dir.path().join("roads.xodr");
+    std::fs::write(&roads, ROADS).unwrap();
+    let settings = Settings {
+        roads: Some(roads),
+        leave_out: leave_out.iter().copied().collect(),
+        ..settings()
+    };
+    read(text.as_bytes(), &settings).map_err(|error| error.to_string())
+}
+
+const EGO_AT: &str = "<WorldPosition x=\"0\" y=\"0\" z=\"0\" h=\"0\"/>";
+
+#[test]
+fn places_on_lanes_have_their_points_and_headings() {
+    let place = |position: &str| {
+        let file = on_roads(&CUT_IN.replacen(EGO_AT, position, 1), &[])?.file;
+        let pose = file.ego.start.unwrap().pose.unwrap();
+        Ok::<_, String>((pose.xyz, pose.yaw_rad.unwrap()))
+    };
+    let near = |position: &str, xyz: [f64; 3], yaw_rad: f64| {
+        let (found, heading) = place(position).unwrap();
+        let is_near = found.iter().zip(xyz).all(|(found, wanted)| (found - wanted).abs() < 1e-3);
+        let turned = (heading - yaw_rad).sin();
+        assert!(is_near && turned.abs() < 1e-6, "{position}: {found:?} {heading}");
+    };
+    let pi = std::f64::consts::PI;
+    near(
+        "<LanePosition roadId=\"1\" laneId=\"-2\" s=\"20\" offset=\"0.5\"/>",
+        [20.0, -4.0, 0.0],
+        0.0,
+    );
+    // Oncoming traffic faces the other way.
+    near("<LanePosition roadId=\"1\" laneId=\"1\" s=\"20\"/>", [20.0, 1.5, 0.0], pi);
+    near(
+        "<LanePosition roadId=\"1\" laneId=\"1\" s=\"20\"><Orientation type=\"absolute\" h=\"0.3\"/></LanePosition>",
+        [20.0, 1.5, 0.0],
+        0.3,
+    );
+    near("<RoadPosition roadId=\"1\" s=\"20\" t=\"-2\"/>", [20.0, -2.0, 0.0], 0.0);
+    for (wrong, expected) in [
+        ("<LanePosition roadId=\"7\" laneId=\"-1\" s=\"20\"/>", "no road \"7\""),
+        ("<LanePosition roadId=\"1\" laneId=\"-3\" s=\"20\"/>", "no lane -3"),
+        ("<LanePosition roadId=\"1\" laneId=\"-1\" s=\"301\"/>", "300"),
+    ] {
+        let error = place(wrong).unwrap_err();
+        assert!(error.contains(expected), "{error}");
+    }
+}
+
+/// A car on lane -2 of the roads that changes to another lane within 4 s, from time 2 on.
+const LANES: &str = r#"<OpenSCENARIO>
+<FileHeader revMajor="1" revMinor="3" date="" description="" author=""/>
+<CatalogLocations/><RoadNetwork/>
+<Entities>
+ <ScenarioObject name="Ego"><Vehicle name="car" vehicleCategory="car"><BoundingBox><Center x="1.4" y="0" z="0.75"/>
+  <Dimensions width="2" length="5" height="1.5"/></BoundingBox></Vehicle></ScenarioObject>
+ <ScenarioObject name="Van"><Vehicle name="van" vehicleCategory="van"><BoundingBox><Center x="1.4" y="0" z="0.75"/>
+  <Dimensions width="2" length="5" height="1.5"/></BoundingBox></Vehicle></ScenarioObject>
+</Entities>
+<Storyboard><Init><Actions>
+ <Private entityRef="Ego"><PrivateAction><TeleportAction><Position>
+  <LanePosition roadId="1" laneId="-1" s="0"/></Position></TeleportAction></PrivateAction></Private>
+ <Private entityRef="Van"><PrivateAction><TeleportAction><Position>
+  <RelativeLanePosition entityRef="Ego" dLane="-1" ds="20"/></Position></TeleportAction></PrivateAction>
+  <PrivateAction><LongitudinalAction><SpeedAction>
+   <SpeedActionDynamics dynamicsShape="step" dynamicsDimension="time" value="0"/>
+   <SpeedActionTarget><AbsoluteTargetSpeed value="10"/></SpeedActionTarget></SpeedAction></LongitudinalAction></PrivateAction>
+ </Private></Actions></Init>
+<Story name="s"><Act name="act"><ManeuverGroup name="g" maximumExecutionCount="1">
+ <Actors selectTriggeringEntities="false"><EntityRef entityRef="Van"/></Actors><Maneuver name="m">
+  <Event name="change" priority="override"><Action name="c"><PrivateAction><LateralAction><LaneChangeAction>
+   <LaneChangeActionDynamics dynamicsShape="sinusoidal" value="4" dynamicsDimension="time"/>
+   <LaneChangeTarget><RelativeTargetLane entityRef="Van" value="1"/></LaneChangeTarget>
+   </LaneChangeAction></LateralAction></PrivateAction></Action>
+   <StartTrigger><ConditionGroup><Condition name="t" delay="0" conditionEdge="rising"><ByValueCondition>
+    <SimulationTimeCondition value="2" rule="greaterThan"/></ByValueCondition></Condition></ConditionGroup></StartTrigger>
+  </Event>
+  <Event name="brake" priority="parallel"><Action name="b"><PrivateAction><LongitudinalAction><SpeedAction>
+   <SpeedActionDynamics dynamicsShape="linear" dynamicsDimension="rate" value="5"/>
+   <SpeedActionTarget><AbsoluteTargetSpeed value="0"/></SpeedActionTarget></SpeedAction></LongitudinalAction></PrivateAction></Action>
+   <StartTrigger><ConditionGroup><Condition name="t" delay="1" conditionEdge="none"><ByValueCondition>
+    <StoryboardElementStateCondition storyboardElementType="event" storyboardElementRef="change" state="endTransition"/>
+    </ByValueCondition></Condition></ConditionGroup></StartTrigger>
+  </Event></Maneuver></ManeuverGroup></Act></Story>
+<StopTrigger/></Storyboard></OpenSCENARIO>"#;
+
+/// The position of the only actor after these seconds, while the ego stands at the origin.
+fn positions(text: &str, seconds: &[f64]) -> Result<Vec<DVec3>, String> {
+    let file = on_roads(text, &[]).map(|imported| imported.file)?;
+    let mut world = World::new(resolved(file).traffic.clone());
+    let ego = EgoMotion::standing(EgoState {
+        world_from_rig: Pose::IDENTITY,
+        velocity_mps: DVec3::ZERO,
+        yaw_rate_radps: 0.0,
+    });
+    let mut positions = Vec::new();
+    for second in seconds {
+        let way_us = (second * 1e6) as i64 - world.time_us();
+        world.step(way_us.max(1), &ego, &mut |_| {});
+        positions.push(world.states()[0].world_from_actor.position_m);
+    }
+    Ok(positions)
+}
+
+#[test]
+fn a_change_of_lane_takes_its_time_and_others_wait_for_its_end() {
+    let at = positions(LANES, &[2.0, 4.0, 6.1, 7.0, 12.0]).unwrap();
+    // The middle of the box is 1.4 m ahead of the place.
+    assert!((at[0] - DVec3::new(41.4, -4.5, 0.0)).length() < 0.05, "{}", at[0]);
+    // Half of the way after half of the time, and then the other lane.
+    assert!((at[1].y + 3.0).abs() < 0.05, "{}", at[1]);
+    assert!((at[2].y + 1.5).abs() < 1e-6, "{}", at[2]);
+    // 1 s after the end it brakes within 2 s, 10 m.
+    assert!((at[3].x - 91.4).abs() < 0.3 && (at[4].x - at[3].x - 10.0).abs() < 0.4, "{at:?}");
+}
+
+#[test]
+fn an_edge_needs_a_value_before_it() {
+    let near = "<ByEntityCondition><TriggeringEntities triggeringEntitiesRule=\"any\"><EntityRef \
+                entityRef=\"Ego\"/></TriggeringEntities><EntityCondition><RelativeDistanceCondition \
+                entityRef=\"Van\" relativeDistanceType=\"longitudinal\" value=\"30\" freespace=\"false\" \
+                rule=\"RULE\"/></EntityCondition></ByEntityCondition>";
+    let from = LANES.find("<ByValueCondition>").unwrap();
+    let to =
+        from + LANES[from..].find("</ByValueCondition>").unwrap() + "</ByValueCondition>".len();
+    let with = |rule: &str| {
+        let condition = near.replace("RULE", rule);
+        positions(&format!("{}{condition}{}", &LANES[..from], &LANES[to..]), &[10.0]).unwrap()[0]
+    };
+    // The van starts 20 m ahead and is 30 m ahead after 1 s.
+    assert!((with("greaterThan").y + 1.5).abs() < 1e-6);
+    // It is nearer than 30 m from the start on: that is no edge.
+    assert!((with("lessThan").y + 4.5).abs() < 1e-6);
+}
+
+#[test]
+fn a_priority_ends_what_its_maneuver_does() {
+    let brake = LANES.replace("priority=\"parallel\"", "priority=\"override\"");
+    let brake =
+        brake.replace("delay=\"1\"", "delay=\"2\"").replace("endTransition", "startTransition");
+    let at = positions(&brake, &[4.1, 9.0]).unwrap();
+    assert!((at[1].y + 3.0).abs() < 0.05, "half of the way: {at:?}");
+    let skipped = LANES.replace("priority=\"parallel\"", "priority=\"skip\"");
+    assert!(on_roads(&skipped, &[]).unwrap_err().contains("<Event>"));
+}
+
+#[test]
+fn speeds_follow_those_of_others() {
+    let speed = "<RelativeTargetSpeed entityRef=\"Ego\" value=\"3\" speedTargetValueType=\"delta\" continuous=\"true\"/>";
+    let text = LANES.replace("<AbsoluteTargetSpeed value=\"10\"/>", speed);
+    let at = positions(&text, &[1.0]).unwrap();
+    assert!((at[0].x - 24.4).abs() < 0.05, "{at:?}");
+    let never = text.replace("entityRef=\"Ego\" value=\"3\"", "entityRef=\"Van\" value=\"3\"");
+    assert!(on_roads(&never, &[]).is_err());
+}
+
+#[test]
+fn parts_are_left_out_on_request_only_and_told() {
+    let controller = "<PrivateAction><ControllerAction><ActivateControllerAction lateral=\"true\" \
+                      longitudinal=\"true\"/></ControllerAction></PrivateAction></Private></Actions>";
+    let text = LANES.replace("</Private></Actions>", controller);
+    let error = on_roads(&text, &[]).unwrap_err();
+    assert!(
+        error.contains("<ControllerAction>") && error.contains("--leave-out controllers"),
+        "{error}"
+    );
+    let notes = on_roads(&text, &[Part::Controllers]).unwrap().notes;
+    assert!(notes.len() == 1 && notes[0].contains("<ControllerAction>"), "{notes:?}");
+    // What nothing knows is never left out.
+    let text = LANES.replace("<StopTrigger/>", "<StopTrigger/><Extra/>");
+    let all: Vec<Part> = Part::ALL.iter().map(|(part, _)| *part).collect();
+    assert!(on_roads(&text, &all).unwrap_err().contains("<Extra>"));
 }

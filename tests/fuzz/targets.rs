@@ -115,7 +115,7 @@ pub(crate) fn scenario(data: &[u8]) {
 
 /// A map, of any format.
 pub(crate) fn map(data: &[u8]) {
-    let of_opendrive = opendrive::read(data).ok().map(|imported| imported.map);
+    let of_opendrive = opendrive::read(data, None).ok().map(|imported| imported.map);
     let files = [MapFile::parse(data).ok(), geojson::read(data, None).ok(), of_opendrive];
     for file in files.into_iter().flatten() {
         Map::new(file).expect("a file that was read makes a map");
@@ -125,7 +125,7 @@ pub(crate) fn map(data: &[u8]) {
 /// A scenario of OpenSCENARIO.
 pub(crate) fn openscenario(data: &[u8]) {
     let [name, twin, ego] = ["drive", "city", "Ego"].map(str::to_owned);
-    let settings = xosc::Settings { name, twin, ego };
+    let settings = xosc::Settings { name, twin, ego, ..xosc::Settings::default() };
     let _ = xosc::read(data, &settings);
 }
 

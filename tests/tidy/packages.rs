@@ -37,7 +37,7 @@ const CRATES: &[(&str, &[&str])] = &[
 ];
 
 /// Files that may open files: those of a twin only `store/local`; the others scenes and settings of the
-/// user, training data, episodes, uploads, scenarios, pictures, and how much memory there is.
+/// user, training data, episodes, uploads, scenarios, their catalogs and roads, pictures, and how much memory there is.
 const FILES: &[&str] = &[
     "src/twin/store/local",
     "src/twin/residency/budget.rs",
@@ -55,6 +55,7 @@ const FILES: &[&str] = &[
     "clients/rust/src/memory.rs",
     "clients/rust/src/upload.rs",
     "src/repair/files.rs",
+    "src/convert/openscenario/files.rs",
     "src/cli",
 ];
 

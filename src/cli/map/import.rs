@@ -7,25 +7,29 @@ use anyhow::Context;
 
 use crate::cli::output;
 use wildcity_convert::{geojson, opendrive};
+use wildcity_scene::geo::{GeoAnchor, GeoPoint, ProjectedOrigin};
 use wildcity_twin::ingest;
 
 /// Read a map from OpenDRIVE or GeoJSON.
 ///
-/// OpenDRIVE: coordinates are those of the twin, at most 16 km from its origin. GeoJSON: features with the property
-/// layer, which is `lane`, `drivable`, `intersection`, `crosswalk`, `stop_line` or a layer of nuPlan; coordinates are
-/// metres of the twin, or degrees with --origin.
+/// OpenDRIVE: coordinates are those of the twin, at most 16 km from its origin, or with --origin those of a map projection
+/// such as UTM; the offset of the header counts. GeoJSON: features with the property layer, which is `lane`, `drivable`,
+/// `intersection`, `crosswalk`, `stop_line` or a layer of nuPlan; coordinates are metres of the twin, or degrees with
+/// --origin.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
   wildcity map import town.xodr --out town.map.json
+  wildcity map import utm.xodr --origin 691000,5334000 --out town.map.json
   wildcity map import town.geojson --origin 11.58,48.14 --out town.map.json")]
 pub(in crate::cli) struct Import {
     /// The file; its format is detected from its content.
     #[arg(value_name = "FILE")]
     file: PathBuf,
 
-    /// Longitude and latitude of the twin's origin in degrees, for GeoJSON in degrees.
-    #[arg(long, value_name = "LON,LAT", value_parser = origin, allow_hyphen_values = true)]
+    /// The twin's origin: for OpenDRIVE its easting and northing in the file's projection, in metres; for GeoJSON in
+    /// degrees its longitude and latitude.
+    #[arg(long, value_name = "EAST,NORTH", value_parser = origin, allow_hyphen_values = true)]
     origin: Option<[f64; 2]>,
 
     /// Map file to write.
@@ -39,16 +43,11 @@ impl Import {
         let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64);
         let bytes = bytes.with_context(context)?;
         let is_json = bytes.trim_ascii_start().first() == Some(&b'{');
-        let (map, warnings) = match is_json {
-            true => (geojson::read(&bytes, self.origin).with_context(context)?, Vec::new()),
+        let (map, geo, warnings) = match is_json {
+            true => (geojson::read(&bytes, self.origin).with_context(context)?, None, Vec::new()),
             false => {
-                anyhow::ensure!(
-                    self.origin.is_none(),
-                    "--origin is for GeoJSON; {} is not GeoJSON",
-                    self.file.display()
-                );
-                let imported = opendrive::read(&bytes).with_context(context)?;
-                (imported.map, imported.warnings)
+                let imported = opendrive::read(&bytes, self.origin).with_context(context)?;
+                (imported.map, imported.geo, imported.warnings)
             }
         };
         output::write(&self.out, map.to_json().as_bytes())?;
@@ -63,13 +62,35 @@ impl Import {
             map.lanes.len(),
             map.areas.len()
         )?;
+        if let Some(geo) = geo {
+            writeln!(out, "next: wildcity twin geo TWIN {}", anchor_text(&geo))?;
+        }
         Ok(())
     }
 }
 
-fn origin(text: &str) -> Result<[f64; 2], String> {
-    let expected = || "expected longitude and latitude, for example 11.58,48.14".to_owned();
-    let (longitude, latitude) = text.split_once(',').ok_or_else(expected)?;
-    let degrees = |text: &str| text.trim().parse().map_err(|_| expected());
-    Ok([degrees(longitude)?, degrees(latitude)?])
+/// An anchor as `wildcity twin geo` reads it.
+fn anchor_text(geo: &GeoAnchor) -> String {
+    match geo {
+        GeoAnchor::Origin(GeoPoint { latitude_deg, longitude_deg, altitude_m }) => {
+            format!("{latitude_deg},{longitude_deg},{altitude_m}")
+        }
+        GeoAnchor::Projected(ProjectedOrigin { projection, easting_m, northing_m, altitude_m }) => {
+            format!("{projection},{easting_m},{northing_m},{altitude_m}")
+        }
+    }
+}
+
+/// EAST,NORTH.
+pub(in crate::cli) fn origin(text: &str) -> Result<[f64; 2], String> {
+    let expected = || {
+        "expected two numbers, for example 691000,5334000 in metres or 11.58,48.14 in degrees"
+            .to_owned()
+    };
+    let (east, north) = text.split_once(',').ok_or_else(expected)?;
+    let number = |text: &str| {
+        let number: Option<f64> = text.trim().parse().ok();
+        number.filter(|number| number.is_finite()).ok_or_else(expected)
+    };
+    Ok([number(east)?, number(north)?])
 }

@@ -4,6 +4,8 @@ mod check;
 mod import;
 mod strips;
 
+pub(in crate::cli) use import::origin;
+
 /// Make and check maps: lanes and areas of a twin.
 ///
 /// A twin needs no map. With one, actors can follow lanes, and scores can detect that an ego is off the road.

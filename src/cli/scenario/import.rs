@@ -1,7 +1,7 @@
 //! `wildcity scenario import`.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
@@ -11,14 +11,16 @@ use wildcity_twin::ingest;
 
 /// Read a scenario of OpenSCENARIO XML 1.0 to 1.3.
 ///
-/// The import supports parameters with formulas, vehicles, pedestrians and objects, positions, speeds, trajectories,
-/// and events with conditions on time, speed, distance, driven distance and started events. It refuses any other part,
-/// with its name and line, because the scenario would be different without it.
+/// The import supports catalogs, parameters with formulas, positions on roads, changes of speed, lane and offset,
+/// trajectories, and events with conditions, edges and delays. It refuses any other part, with its name and line,
+/// because the scenario would be different without it. Some parts can be left out on request; each is then listed.
 #[derive(Debug, clap::Args)]
 #[command(after_long_help = "\
 Examples:
   wildcity scenario import cut-in.xosc --twin street --out cut-in.json
-  wildcity scenario import cut-in.xosc --twin street --ego Hero --out cut-in.json")]
+  wildcity scenario import cut-in.xosc --twin street --ego Hero --out cut-in.json
+  wildcity scenario import cut-in.xosc --twin street --leave-out controllers,stop --out cut-in.json
+  wildcity scenario import cut-in.xosc --twin street --parameter Speed=12 --out cut-in-12.json")]
 pub(in crate::cli) struct Import {
     /// The OpenSCENARIO file.
     #[arg(value_name = "FILE")]
@@ -31,6 +33,28 @@ pub(in crate::cli) struct Import {
     /// Name of the entity that the agent drives.
     #[arg(long, value_name = "NAME", default_value = "Ego")]
     ego: String,
+
+    /// The OpenDRIVE file of the roads, in place of the one that the scenario names.
+    #[arg(long, value_name = "FILE")]
+    roads: Option<PathBuf>,
+
+    /// Another directory of catalogs; once for each.
+    #[arg(long, value_name = "DIR")]
+    catalogs: Vec<PathBuf>,
+
+    /// Easting and northing of the twin's origin, as in `wildcity map import --origin` of these roads.
+    #[arg(long, value_name = "EAST,NORTH", value_parser = crate::cli::map::origin, allow_hyphen_values = true)]
+    origin: Option<[f64; 2]>,
+
+    /// Another value of a parameter that the file declares; once for each.
+    #[arg(long = "parameter", value_name = "NAME=VALUE", value_parser = parameter)]
+    parameters: Vec<(String, String)>,
+
+    /// Parts to leave out: controllers, ego (actions of the entity that the agent drives), environment, appearance,
+    /// signals, stop (conditions of the end that are no time), distances, routes,
+    /// trailers, custom. Each that is left out is listed.
+    #[arg(long, value_name = "PART,...", value_delimiter = ',', value_parser = part)]
+    leave_out: Vec<openscenario::Part>,
 
     /// Scenario file to write.
     #[arg(long, value_name = "FILE")]
@@ -46,13 +70,27 @@ impl Import {
             name: name.to_owned(),
             twin: self.twin.clone(),
             ego: self.ego.clone(),
+            directory: Some(self.file.parent().unwrap_or(Path::new("")).to_owned()),
+            catalogs: self.catalogs.clone(),
+            roads: self.roads.clone(),
+            origin: self.origin,
+            parameters: self.parameters.iter().cloned().collect(),
+            leave_out: self.leave_out.iter().copied().collect(),
         };
-        let scenario = openscenario::read(&bytes, &settings).with_context(context)?;
+        let imported = openscenario::read(&bytes, &settings).with_context(context)?;
+        let scenario = imported.file;
         let mut text = serde_json::to_vec_pretty(&scenario)?;
+        if text.len() > wildcity_sim::limits::SCENARIO_BYTES {
+            text = serde_json::to_vec(&scenario)?;
+        }
         text.push(b'\n');
         output::write(&self.out, &text)?;
+        let mut out = io::stdout().lock();
+        for note in &imported.notes {
+            writeln!(out, "note: {note}")?;
+        }
         writeln!(
-            io::stdout().lock(),
+            out,
             "{}: {} actors; next: wildcity scenario check {}",
             self.out.display(),
             scenario.actors.len(),
@@ -64,4 +102,17 @@ impl Import {
 
 fn openscenario_bytes() -> u64 {
     wildcity_convert::TEXT_BYTES as u64
+}
+
+/// NAME=VALUE.
+fn parameter(text: &str) -> Result<(String, String), String> {
+    let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE, for example Speed=12")?;
+    Ok((name.to_owned(), value.to_owned()))
+}
+
+fn part(text: &str) -> Result<openscenario::Part, String> {
+    let parts = openscenario::Part::ALL;
+    let found = parts.iter().find(|(_, name)| *name == text);
+    let known = || parts.map(|(_, name)| name).join(", ");
+    found.map(|(part, _)| *part).ok_or_else(|| format!("expected one of {}", known()))
 }

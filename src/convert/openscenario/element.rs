@@ -1,22 +1,63 @@
 //! Elements of an OpenSCENARIO file: attributes with parameters, and children that are all known.
 
 use std::collections::BTreeMap;
+use std::rc::Rc;
 
 use roxmltree::Node;
 
 use super::expression;
+use super::ledger::{Ledger, Part};
 use crate::ConvertError;
 
-/// An element, with the parameters of its file.
-#[derive(Clone, Copy)]
+/// The parameters that are known at a place.
+pub(super) type Parameters = Rc<BTreeMap<String, String>>;
+
+/// A file, for messages and for what has been read of it.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Source<'a> {
+    /// Its index among the files.
+    pub(super) index: usize,
+    /// In front of a line: empty for the scenario, else the name of the catalog's file.
+    pub(super) label: &'a str,
+}
+
+/// An element, with the parameters of its place.
+#[derive(Clone)]
 pub(super) struct Element<'a> {
     node: Node<'a, 'a>,
-    parameters: &'a BTreeMap<String, String>,
+    parameters: Parameters,
+    ledger: &'a Ledger,
+    source: Source<'a>,
 }
 
 impl<'a> Element<'a> {
-    pub(super) fn new(node: Node<'a, 'a>, parameters: &'a BTreeMap<String, String>) -> Self {
-        Self { node, parameters }
+    pub(super) fn new(
+        node: Node<'a, 'a>,
+        parameters: Parameters,
+        ledger: &'a Ledger,
+        source: Source<'a>,
+    ) -> Self {
+        ledger.element(source.index, node);
+        Self { node, parameters, ledger, source }
+    }
+
+    fn with_node(&self, node: Node<'a, 'a>) -> Self {
+        Self::new(node, self.parameters.clone(), self.ledger, self.source)
+    }
+
+    /// The same element where other parameters are known.
+    pub(super) fn with_parameters(&self, parameters: Parameters) -> Self {
+        Self { parameters, ..self.clone() }
+    }
+
+    /// The parameters that are known here.
+    pub(super) fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// Refuses whatever has not been read of this element and below it.
+    pub(super) fn check_read(&self) -> Result<(), ConvertError> {
+        self.ledger.check((self.source.index, self.source.label), self.node)
     }
 
     /// Its name.
@@ -26,13 +67,17 @@ impl<'a> Element<'a> {
 
     /// The child elements.
     pub(super) fn children(&self) -> impl Iterator<Item = Self> + use<'a> {
-        let parameters = self.parameters;
-        self.node.children().filter(Node::is_element).map(move |node| Self { node, parameters })
+        let own = self.clone();
+        self.node.children().filter(Node::is_element).map(move |node| own.with_node(node))
     }
 
     /// The children of a name.
     pub(super) fn all(&self, name: &str) -> impl Iterator<Item = Self> {
-        self.children().filter(move |child| child.name() == name)
+        let own = self.clone();
+        let nodes = self.node.children().filter(Node::is_element);
+        nodes
+            .filter(move |node| node.tag_name().name() == name)
+            .map(move |node| own.with_node(node))
     }
 
     /// The only child with a name; `None` without one.
@@ -73,28 +118,66 @@ impl<'a> Element<'a> {
         self.wrong("is not read; remove it, or write this part in the scenario file by hand")
     }
 
+    /// Leaves this element out with all below it, if that was asked for.
+    ///
+    /// # Errors
+    /// It was not: names the option.
+    pub(super) fn leave_out(&self, part: Part) -> Result<(), ConvertError> {
+        let name = part.name();
+        if !self.ledger.leave_out.contains(&part) {
+            return Err(self.wrong(&format!(
+                "is not read; remove it, or leave such parts out with --leave-out {name}"
+            )));
+        }
+        self.mark_left_out();
+        self.note(&format!("is left out ({name})"));
+        Ok(())
+    }
+
+    /// Whether a part is left out.
+    pub(super) fn leaves_out(&self, part: Part) -> bool {
+        self.ledger.leave_out.contains(&part)
+    }
+
+    /// Does not require that this element is read.
+    pub(super) fn mark_left_out(&self) {
+        self.ledger.leave_out(self.source.index, self.node);
+    }
+
+    /// Tells something about this element.
+    pub(super) fn note(&self, message: &str) {
+        self.ledger.note(self.wrong(message).to_string());
+    }
+
+    /// The line on which it begins.
+    pub(super) fn line(&self) -> u32 {
+        self.node.document().text_pos_at(self.node.range().start).row
+    }
+
     /// A mistake in this element.
     pub(super) fn wrong(&self, message: &str) -> ConvertError {
-        let line = self.node.document().text_pos_at(self.node.range().start).row;
-        ConvertError::new(format!("line {line}, <{}>", self.name()), message)
+        let place = format!("{}line {}, <{}>", self.source.label, self.line(), self.name());
+        ConvertError::new(place, message)
     }
 
     /// An attribute with its parameters put in; `None` without it.
     pub(super) fn find_text(&self, name: &str) -> Result<Option<String>, ConvertError> {
-        let Some(text) = self.node.attribute(name) else { return Ok(None) };
-        let text = text.trim();
-        let value = match text.strip_prefix('$') {
-            None => return Ok(Some(text.to_owned())),
-            Some(rest) => match rest.strip_prefix('{').and_then(|rest| rest.strip_suffix('}')) {
-                Some(formula) => expression::value(formula, self.parameters).map(|v| v.to_string()),
-                None => self
-                    .parameters
-                    .get(rest)
-                    .cloned()
-                    .ok_or_else(|| format!("there is no parameter {rest:?}; declare it")),
-            },
-        };
+        let found = self.node.attributes().enumerate().find(|(_, one)| one.name() == name);
+        let Some((index, attribute)) = found else { return Ok(None) };
+        self.ledger.attribute(self.source.index, self.node, index);
+        let text = attribute.value().trim();
+        let value = expression::text(text, &self.parameters);
         value.map(Some).map_err(|message| self.wrong(&format!("{name}={text:?}: {message}")))
+    }
+
+    /// An attribute as it is written.
+    pub(super) fn raw(&self, name: &str) -> Result<String, ConvertError> {
+        let found = self.node.attributes().enumerate().find(|(_, one)| one.name() == name);
+        let Some((index, attribute)) = found else {
+            return Err(self.wrong(&format!("the attribute {name} is missing")));
+        };
+        self.ledger.attribute(self.source.index, self.node, index);
+        Ok(attribute.value().trim().to_owned())
     }
 
     /// An attribute.
@@ -115,6 +198,35 @@ impl<'a> Element<'a> {
     pub(super) fn number(&self, name: &str) -> Result<f64, ConvertError> {
         self.find_number(name)?
             .ok_or_else(|| self.wrong(&format!("the attribute {name} is missing")))
+    }
+
+    /// An attribute that is a finite number; 0 without it.
+    pub(super) fn number_or_0(&self, name: &str) -> Result<f64, ConvertError> {
+        Ok(self.find_number(name)?.unwrap_or(0.0))
+    }
+
+    /// An attribute that is a whole number.
+    pub(super) fn whole(&self, name: &str) -> Result<i32, ConvertError> {
+        let value = self.number(name)?;
+        match value.fract() == 0.0 && value.abs() < 1e9 {
+            true => Ok(value as i32),
+            false => Err(self.wrong(&format!("{name}={value:?}; write a whole number"))),
+        }
+    }
+
+    /// An attribute that is true or false; `None` without it.
+    pub(super) fn find_flag(&self, name: &str) -> Result<Option<bool>, ConvertError> {
+        match self.find_text(name)?.as_deref() {
+            None => Ok(None),
+            Some("true" | "1") => Ok(Some(true)),
+            Some("false" | "0") => Ok(Some(false)),
+            Some(other) => Err(self.wrong(&format!("{name}={other:?}; write true or false"))),
+        }
+    }
+
+    /// Takes note of attributes that do not matter in this place.
+    pub(super) fn ignore(&self, names: &[&str]) -> Result<(), ConvertError> {
+        names.iter().try_for_each(|name| self.find_text(name).map(|_| ()))
     }
 
     /// Refuses an attribute of another value.

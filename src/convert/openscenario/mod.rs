@@ -1,37 +1,56 @@
 //! Scenarios from OpenSCENARIO XML 1.0 to 1.3.
 //!
-//! Read are: parameters with formulas; vehicles, pedestrians and objects with their boxes; in `Init`, positions,
-//! speeds and trajectories; in the story, events that change a speed, follow a trajectory, add or delete an entity;
-//! conditions on time, speed, distance, driven distance and started events; a stop at a time. Positions are in the
-//! world or relative to an entity. Everything else is refused with its name and line: a scenario with a part missing
-//! would be another scenario.
+//! | module | what it reads |
+//! |---|---|
+//! | `element`, `expression` | elements, attributes, and formulas of parameters |
+//! | `ledger` | what was read: anything else is refused, or left out on request with a note |
+//! | `files`, `catalogs`, `entities` | files beside it, catalogs and parameters; vehicles, pedestrians and objects |
+//! | `position`, `roads`, `route`, `trajectory` | places in the world and on roads, lines along lanes, trajectories |
+//! | `init`, `story`, `elements`, `actions`, `conditions`, `stop` | the storyboard |
+//! | `model`, `build` | what is known of the scenario, and its actors |
+//!
+//! Everything else is refused with its name and line: a scenario with a part missing would be another scenario.
 
+mod actions;
+mod build;
+mod catalogs;
+mod conditions;
 mod element;
+mod elements;
+mod entities;
 mod expression;
+mod files;
+mod init;
+mod ledger;
+mod model;
 mod position;
+mod roads;
+mod route;
+mod stop;
 mod story;
+mod trajectory;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
-use wildcity_scene::ActorClass;
-use wildcity_sim::scenario::{
-    ActorSection, CollideSection, DynamicsSection, EgoBoxSection, EgoSection, EndSection,
-    ModelSection, PathSection, PoseSection, ScenarioFile, StartSection, TimedPosition,
-    TriggerSection, TwinPin, VerdictSection,
-};
+use wildcity_sim::scenario::{EndSection, ScenarioFile, TwinPin, VerdictSection};
 
-use crate::{ConvertError, text_of};
-use element::Element;
-use position::Place;
+pub use ledger::Part;
 
-/// Deepest nesting of elements, so that no stack overflows.
+use crate::{ConvertError, opendrive, text_of, xml};
+use build::Builder;
+use catalogs::Catalogs;
+use element::{Element, Source};
+use ledger::Ledger;
+use model::Context;
+use roads::RoadMap;
+
+/// Most elements and texts of a file.
 const NODES: u32 = 1_000_000;
 
-/// An actor that has no trajectory drives straight on for this distance, in metres.
-const STRAIGHT_M: f64 = 1000.0;
-
 /// Values that the file does not have.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
     /// Name of the scenario.
     pub name: String,
@@ -39,47 +58,78 @@ pub struct Settings {
     pub twin: String,
     /// Name of the entity that the agent drives.
     pub ego: String,
+    /// Directory of the file, from which it names catalogs and roads.
+    pub directory: Option<PathBuf>,
+    /// More directories of catalogs.
+    pub catalogs: Vec<PathBuf>,
+    /// The OpenDRIVE file of the roads, in place of the one that the file names.
+    pub roads: Option<PathBuf>,
+    /// Easting and northing of the twin's origin, as for the map of these roads.
+    pub origin: Option<[f64; 2]>,
+    /// Parameters with other values than those of the file.
+    pub parameters: BTreeMap<String, String>,
+    /// Parts that are left out, with a note.
+    pub leave_out: BTreeSet<Part>,
 }
 
-/// An entity while the file is read.
-#[derive(Clone, Debug)]
-struct Entity {
-    /// Name in the scenario file.
-    name: String,
-    class: ActorClass,
-    size: [f64; 3],
-    /// From the reference point, the middle of the rear axle, forward to the box's centre, in metres.
-    center_x_m: f64,
-    place: Option<Place>,
-    /// The speed after the actions that were read so far, in m/s.
-    speed_mps: f64,
-    begin_mps: f64,
-    /// Points of a trajectory, and their times if they count.
-    line: Option<Vec<[f64; 3]>>,
-    times_s: Option<Vec<f64>>,
-    script: Vec<TriggerSection>,
-    present: bool,
+/// A scenario, and what a person should know about it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    /// The scenario.
+    pub file: ScenarioFile,
+    /// What was left out or assumed, with lines.
+    pub notes: Vec<String>,
 }
 
 /// Reads a scenario.
 ///
 /// # Errors
 /// Names the element and the line of the first part that is not read.
-pub fn read(bytes: &[u8], settings: &Settings) -> Result<ScenarioFile, ConvertError> {
-    let text = text_of(bytes)?;
-    let options =
-        roxmltree::ParsingOptions { allow_dtd: false, nodes_limit: NODES, ..Default::default() };
-    let document = roxmltree::Document::parse_with_options(text, options)
-        .map_err(|error| ConvertError::new("XML", error.to_string()))?;
-    let none = BTreeMap::new();
-    let parameters = parameters_of(Element::new(document.root_element(), &none))?;
-    let root = Element::new(document.root_element(), &parameters);
+pub fn read(bytes: &[u8], settings: &Settings) -> Result<Imported, ConvertError> {
+    // Some editors mark UTF-8 in front.
+    let text = text_of(bytes)?.trim_start_matches('\u{feff}');
+    let document = xml::parse(text, NODES)?;
+    let ledger = Ledger::new(settings.leave_out.clone());
+    let source = Source { index: 0, label: "" };
+    let root = Element::new(document.root_element(), Rc::default(), &ledger, source);
     if root.name() != "OpenSCENARIO" {
         return Err(root.wrong("is no <OpenSCENARIO>"));
     }
+    if root.find("ParameterValueDistribution")?.is_some() {
+        let message = "is a distribution of parameters: import the scenario that it names, with --parameter NAME=VALUE";
+        return Err(root.wrong(message));
+    }
+    let root = catalogs::declared(&root)?;
+    let root = with_parameters(&root, &settings.parameters)?;
+    check_header(&root)?;
+    let texts = catalogs::texts_of(&root, document.root_element(), settings)?;
+    let documents = catalogs::documents_of(&texts);
+    let catalogs = Catalogs::new(&documents, &ledger);
+    let file = file_of((&root, document.root_element()), catalogs, settings, &ledger)?;
+    root.check_read()?;
+    Ok(Imported { file, notes: ledger.notes() })
+}
+
+/// The parameters of the file with other values.
+fn with_parameters<'a>(
+    root: &Element<'a>,
+    given: &BTreeMap<String, String>,
+) -> Result<Element<'a>, ConvertError> {
+    if let Some(unknown) = given.keys().find(|name| !root.parameters().contains_key(*name)) {
+        return Err(root.wrong(&format!("declares no parameter {unknown:?}")));
+    }
+    if given.is_empty() {
+        return Ok(root.clone());
+    }
+    // Declared again, because others may use them.
+    catalogs::declared_with(root, given)
+}
+
+fn check_header(root: &Element<'_>) -> Result<(), ConvertError> {
     root.only(&[
         "FileHeader",
         "ParameterDeclarations",
+        "VariableDeclarations",
         "CatalogLocations",
         "RoadNetwork",
         "Entities",
@@ -91,137 +141,136 @@ pub fn read(bytes: &[u8], settings: &Settings) -> Result<ScenarioFile, ConvertEr
         let message = format!("version {}.{} is not read; 1.0 to 1.3 are", version.0, version.1);
         return Err(header.wrong(&message));
     }
-    if let Some(catalogs) = root.find("CatalogLocations")? {
-        catalogs.only(&[])?;
+    root.find("VariableDeclarations")?;
+    Ok(())
+}
+
+/// The values that actions set: the name, the value, and the event; without an event, an empty text.
+fn sets_of(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
+    let actions = node.descendants().filter_map(|node| {
+        let name = match node.tag_name().name() {
+            "ParameterAction" => node.attribute("parameterRef"),
+            "VariableAction" => node.attribute("variableRef"),
+            _ => None,
+        };
+        let set = node.children().find(|child| child.has_tag_name("SetAction"));
+        let value = set.and_then(|set| set.attribute("value")).unwrap_or_default();
+        let event = node.ancestors().find(|node| node.has_tag_name("Event"));
+        let event = event.and_then(|event| event.attribute("name")).unwrap_or_default();
+        name.map(|name| (catalogs::plain_parameter(name), value.to_owned(), event.to_owned()))
+    });
+    actions.collect()
+}
+
+/// The values of variables at the start.
+fn variables_of(root: &Element<'_>) -> Result<BTreeMap<String, String>, ConvertError> {
+    let mut variables = BTreeMap::new();
+    if let Some(section) = root.find("VariableDeclarations")? {
+        section.only(&["VariableDeclaration"])?;
+        for declaration in section.children() {
+            variables.insert(declaration.raw("name")?, declaration.text("value")?);
+        }
     }
-    if let Some(roads) = root.find("RoadNetwork")? {
-        roads.only(&["LogicFile", "SceneGraphFile"])?;
+    Ok(variables)
+}
+
+fn file_of<'a>(
+    (root, node): (&Element<'a>, roxmltree::Node<'_, '_>),
+    catalogs: Catalogs<'a>,
+    settings: &Settings,
+    ledger: &'a Ledger,
+) -> Result<ScenarioFile, ConvertError> {
+    let (roads, missing_roads) = roads_of(root, settings)?;
+    let mut context = Context {
+        entities: BTreeMap::new(),
+        roads,
+        catalogs,
+        ego: settings.ego.clone(),
+        is_in_story: false,
+        waiting: Vec::new(),
+        placed_by_others: Vec::new(),
+        variables: variables_of(root)?,
+        sets: sets_of(node),
+        missing_roads,
+    };
+    entities::read_entities(&root.need("Entities")?, &mut context)?;
+    if !context.entities.contains_key(&settings.ego) {
+        let message = format!("has no entity {:?}; name the ego with --ego", settings.ego);
+        return Err(root.wrong(&message));
     }
-    let mut entities = entities_of(root.need("Entities")?)?;
     let storyboard = root.need("Storyboard")?;
     storyboard.only(&["Init", "Story", "StopTrigger"])?;
-    story::read_init(storyboard.need("Init")?, &mut entities)?;
+    init::read_init(&storyboard.need("Init")?, &mut context)?;
+    context.is_in_story = true;
+    let mut states = elements::Elements::default();
     for story in storyboard.all("Story") {
-        story::read_story(story, &mut entities, &settings.ego)?;
+        story::read_story(&story, &mut context, &mut states)?;
     }
-    name_owners(&mut entities)?;
-    let end = match storyboard.find("StopTrigger")? {
-        None => EndSection::default(),
-        Some(stop) => EndSection { time_s: story::stop_time_s(stop)?, ..EndSection::default() },
-    };
-    let ego = entities.remove(&settings.ego).ok_or_else(|| {
-        let message = format!("has no entity {:?}; name the ego with --ego", settings.ego);
-        root.wrong(&message)
-    })?;
+    elements::resolve(states, &mut context)?;
+    let stop = storyboard.find("StopTrigger")?;
+    let end_s = stop.map(|stop| stop::stop_time_s(&stop, &context)).transpose()?.flatten();
+    let builder = Builder { context: &context, ledger, end_s };
     let mut actors = Vec::new();
-    for (name, entity) in &entities {
-        actors.push(
-            actor_of(entity)
-                .map_err(|message| ConvertError::new(format!("entity {name:?}"), message))?,
-        );
-    }
-    if !ego.script.is_empty() {
-        let message = "has events, but the agent drives it: name another ego, or remove them";
-        return Err(ConvertError::new(format!("entity {:?}", settings.ego), message));
+    for (name, entity) in context.entities.iter().filter(|(name, _)| **name != settings.ego) {
+        let by = context.placed_by_others.iter().find(|(other, _)| other == name);
+        if let Some((_, part)) = by.filter(|_| entity.place.is_none()) {
+            ledger.note(format!("entity {name:?}: is left out ({})", part.name()));
+            continue;
+        }
+        let actor = builder.actor_of(entity);
+        actors
+            .push(actor.map_err(|message| ConvertError::new(format!("entity {name:?}"), message))?);
     }
     Ok(ScenarioFile {
         format: ScenarioFile::FORMAT.to_owned(),
         name: settings.name.clone(),
         twin: TwinPin { name: settings.twin.clone(), version_hash: None },
         map: None,
-        ego: ego_of(&ego),
+        ego: build::ego_of(&context.entities[&settings.ego], ledger),
         route: None,
         tracks: None,
         actors,
         sweep: None,
-        end,
+        end: EndSection { time_s: end_s, ..EndSection::default() },
         verdict: VerdictSection::default(),
         seed: None,
     })
 }
 
-/// The parameters, whose values may use earlier parameters.
-fn parameters_of(root: Element<'_>) -> Result<BTreeMap<String, String>, ConvertError> {
-    let mut parameters = BTreeMap::new();
-    let Some(section) = root.find("ParameterDeclarations")? else { return Ok(parameters) };
-    section.only(&["ParameterDeclaration"])?;
-    for declaration in section.children() {
-        declaration.only(&[])?;
-        let name = declaration.text("name")?;
-        let value = declaration.text("value")?;
-        parameters.insert(name.trim_start_matches('$').to_owned(), value);
-    }
-    Ok(parameters)
-}
-
-fn entities_of(section: Element<'_>) -> Result<BTreeMap<String, Entity>, ConvertError> {
-    section.only(&["ScenarioObject"])?;
-    let mut entities: BTreeMap<String, Entity> = BTreeMap::new();
-    for object in section.children() {
-        object.only(&["Vehicle", "Pedestrian", "MiscObject", "ObjectController"])?;
-        if let Some(controller) = object.find("ObjectController")? {
-            controller.only(&[])?;
+/// The roads that the file or the settings name, or why they were not read.
+fn roads_of(
+    root: &Element<'_>,
+    settings: &Settings,
+) -> Result<(Option<RoadMap>, Option<String>), ConvertError> {
+    let section = root.find("RoadNetwork")?;
+    let mut named = None;
+    if let Some(section) = &section {
+        section.only(&["LogicFile", "SceneGraphFile", "TrafficSignals"])?;
+        if let Some(signals) = section.find("TrafficSignals")? {
+            signals.leave_out(Part::Signals)?;
         }
-        let mut described = object.children().filter(|child| child.name() != "ObjectController");
-        let what = described.next().ok_or_else(|| object.wrong("has no vehicle or pedestrian"))?;
-        let category = what.find_text("vehicleCategory")?;
-        let class = match (what.name(), category.as_deref()) {
-            ("Vehicle", Some("bicycle")) => ActorClass::Bicycle,
-            ("Vehicle", _) => ActorClass::Vehicle,
-            ("Pedestrian", _) => ActorClass::Pedestrian,
-            _ => ActorClass::Object,
-        };
-        let bounds = what.need("BoundingBox")?;
-        bounds.only(&["Center", "Dimensions"])?;
-        let dimensions = bounds.need("Dimensions")?;
-        let size = [
-            dimensions.number("length")?,
-            dimensions.number("width")?,
-            dimensions.number("height")?,
-        ];
-        let center_x_m = bounds.need("Center")?.number("x")?;
-        let name = object.text("name")?;
-        let plain = plain_name(&name);
-        if entities.values().any(|other| other.name == plain) {
-            return Err(object.wrong(&format!("{name:?} is too like another name; rename it")));
-        }
-        let entity = Entity {
-            name: plain,
-            class,
-            size,
-            center_x_m,
-            place: None,
-            speed_mps: 0.0,
-            begin_mps: 0.0,
-            line: None,
-            times_s: None,
-            script: Vec::new(),
-            present: true,
-        };
-        entities.insert(name, entity);
-    }
-    Ok(entities)
-}
-
-/// Puts the actor in front of each trigger that a condition names, because OpenSCENARIO names only events.
-fn name_owners(entities: &mut BTreeMap<String, Entity>) -> Result<(), ConvertError> {
-    let mut owners: BTreeMap<String, String> = BTreeMap::new();
-    for entity in entities.values() {
-        for trigger in entity.script.iter().filter_map(|trigger| trigger.name.clone()) {
-            owners.insert(trigger, entity.name.clone());
+        if let Some(file) = section.find("LogicFile")? {
+            named = Some(file.text("filepath")?).filter(|path| !path.is_empty());
         }
     }
-    for (name, entity) in entities {
-        for trigger in &mut entity.script {
-            let Some(after) = &mut trigger.when.after else { continue };
-            let Some(owner) = owners.get(after) else {
-                let message = format!("an event waits for {after:?}, which there is not");
-                return Err(ConvertError::new(format!("entity {name:?}"), message));
-            };
-            *after = format!("{owner}/{after}");
+    let path = match (&settings.roads, named) {
+        (Some(path), _) => path.clone(),
+        (None, None) => return Ok((None, None)),
+        (None, Some(named)) => {
+            let path = Path::new(&named.replace('\\', "/")).to_owned();
+            let path = settings.directory.as_ref().map(|dir| dir.join(&path)).unwrap_or(path);
+            if !path.is_file() {
+                let reason = format!("there is no file {}; name it with --roads", path.display());
+                return Ok((None, Some(reason)));
+            }
+            path
         }
-    }
-    Ok(())
+    };
+    let bytes = files::read_bytes(&path)?;
+    let roads = opendrive::roads_of(&bytes, settings.origin).map_err(|error| {
+        ConvertError::new(format!("{}, {}", path.display(), error.place), error.message)
+    })?;
+    Ok((Some(RoadMap::new(roads.network)), None))
 }
 
 /// A name of `[a-z0-9._-]+`.
@@ -232,72 +281,4 @@ fn plain_name(name: &str) -> String {
     };
     let plain: String = name.chars().map(plain).collect();
     plain.trim_start_matches('.').chars().take(64).collect()
-}
-
-fn ego_of(ego: &Entity) -> EgoSection {
-    let pose = ego.place.map(|place| section_of(&place));
-    let start =
-        pose.map(|pose| StartSection { trajectory: None, station_m: None, pose: Some(pose) });
-    let dynamics =
-        DynamicsSection { model: ModelSection::Dynamic, speed: ego.begin_mps, reverse: false };
-    EgoSection {
-        start,
-        dynamics: Some(dynamics),
-        box_: Some(EgoBoxSection { size: ego.size, center_x: ego.center_x_m }),
-        ..EgoSection::default()
-    }
-}
-
-fn section_of(place: &Place) -> PoseSection {
-    PoseSection { xyz: place.xyz_m, yaw_rad: Some(place.yaw_rad), q: None }
-}
-
-/// An actor: on its trajectory, through timed positions, standing, or straight on.
-fn actor_of(entity: &Entity) -> Result<ActorSection, String> {
-    let place = entity.place.ok_or("has no position in <Init>; add a <TeleportAction>")?;
-    let mut actor = ActorSection {
-        name: entity.name.clone(),
-        class: Some(entity.class),
-        size: Some(entity.size),
-        present: (!entity.present).then_some(false),
-        script: entity.script.clone(),
-        ..ActorSection::default()
-    };
-    let center = place.ahead(entity.center_x_m);
-    let moves = entity.script.iter().any(|trigger| story::is_motion(&trigger.then));
-    match (&entity.line, &entity.times_s) {
-        (Some(line), Some(times_s)) => {
-            if moves {
-                return Err("has timed positions and events that move it; keep one of them".into());
-            }
-            let positions = line.iter().zip(times_s);
-            let positions =
-                positions.map(|(xyz, time_s)| TimedPosition { time_s: *time_s, xyz: *xyz });
-            actor.collide = Some(CollideSection {
-                positions: Some(positions.collect()),
-                yaw_rad: Some(place.yaw_rad),
-                ..CollideSection::default()
-            });
-        }
-        (Some(line), None) => {
-            actor.path = Some(PathSection {
-                points: Some(line.clone()),
-                // The reference point follows the line; the box's centre is ahead of it.
-                station_m: entity.center_x_m.max(0.0),
-                speed: entity.begin_mps,
-                ..PathSection::default()
-            });
-        }
-        (None, _) if entity.begin_mps == 0.0 && !moves => {
-            actor.stand = Some(section_of(&center));
-        }
-        (None, _) => {
-            actor.path = Some(PathSection {
-                points: Some(vec![center.xyz_m, center.ahead(STRAIGHT_M).xyz_m]),
-                speed: entity.begin_mps,
-                ..PathSection::default()
-            });
-        }
-    }
-    Ok(actor)
 }

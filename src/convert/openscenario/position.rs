@@ -1,81 +1,153 @@
-//! Positions: in the world, or relative to an entity.
+//! Positions: in the world, on roads, and relative to an entity.
 
-use std::collections::BTreeMap;
-
-use super::Entity;
 use super::element::Element;
+use super::model::{Context, Place};
+use super::roads::RoadMap;
+use super::route::place_on_route;
 use crate::ConvertError;
-
-/// A place with a heading.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Place {
-    /// Position, in metres.
-    pub(super) xyz_m: [f64; 3],
-    /// Heading, in radians.
-    pub(super) yaw_rad: f64,
-}
-
-impl Place {
-    /// The place straight ahead.
-    pub(super) fn ahead(&self, way_m: f64) -> Self {
-        let (sin, cos) = self.yaw_rad.sin_cos();
-        let [x, y, z] = self.xyz_m;
-        Self { xyz_m: [x + way_m * cos, y + way_m * sin, z], ..*self }
-    }
-}
 
 /// The place of a `<Position>`.
 pub(super) fn place_of(
-    position: Element<'_>,
-    entities: &BTreeMap<String, Entity>,
+    position: &Element<'_>,
+    context: &Context<'_>,
 ) -> Result<Place, ConvertError> {
     let kind = position.only_child()?;
-    let of_entity = |kind: &Element<'_>| -> Result<Place, ConvertError> {
-        let name = kind.text("entityRef")?;
-        let place = entities.get(&name).and_then(|entity| entity.place);
-        place.ok_or_else(|| {
-            kind.wrong(&format!("{name:?} has no position before this one; place it first"))
-        })
-    };
-    let offset = |kind: &Element<'_>, axis: &str| Ok(kind.find_number(axis)?.unwrap_or(0.0));
-    match kind.name() {
+    let place = match kind.name() {
         "WorldPosition" => {
             kind.only(&[])?;
-            // Pitch and roll are those of the ground.
-            Ok(Place {
-                xyz_m: [kind.number("x")?, kind.number("y")?, offset(&kind, "z")?],
-                yaw_rad: offset(&kind, "h")?,
-            })
+            note_tilt(&kind)?;
+            let xyz_m = [kind.number("x")?, kind.number("y")?, kind.number_or_0("z")?];
+            on_roads(xyz_m, kind.number_or_0("h")?, context)
         }
-        "RelativeWorldPosition" => {
-            let base = of_entity(&kind)?;
-            let [x, y, z] = base.xyz_m;
-            let xyz_m =
-                [x + offset(&kind, "dx")?, y + offset(&kind, "dy")?, z + offset(&kind, "dz")?];
-            Ok(Place { xyz_m, yaw_rad: heading_rad(&kind, base.yaw_rad)? })
+        "RelativeWorldPosition" | "RelativeObjectPosition" => relative_place(&kind, context)?,
+        "LanePosition" => lane_place(&kind, context)?,
+        "RoadPosition" => {
+            let roads = roads(&kind, context)?;
+            let [s, t] = ["s", "t"].map(|name| kind.number(name));
+            let found = roads.road_place(&kind.text("roadId")?, s?, t?);
+            let (xyz_m, yaw_rad, _) = found.map_err(|message| kind.wrong(&message))?;
+            on_roads(xyz_m, heading_rad(&kind, yaw_rad)?, context)
         }
-        "RelativeObjectPosition" => {
-            let base = of_entity(&kind)?;
-            let (sin, cos) = base.yaw_rad.sin_cos();
-            let [dx, dy] = [offset(&kind, "dx")?, offset(&kind, "dy")?];
-            let [x, y, z] = base.xyz_m;
-            let xyz_m =
-                [x + cos * dx - sin * dy, y + sin * dx + cos * dy, z + offset(&kind, "dz")?];
-            Ok(Place { xyz_m, yaw_rad: heading_rad(&kind, base.yaw_rad)? })
+        "RoutePosition" => {
+            let roads = roads(&kind, context)?;
+            let at = place_on_route(&kind, context, roads, place_of)?;
+            lane_facing(&kind, at, roads)?
         }
-        _ => Err(kind.unread()),
+        "RelativeLanePosition" => relative_lane_place(&kind, context)?,
+        "RelativeRoadPosition" => {
+            let (name, base) = base_of(&kind, context)?;
+            let roads = roads(&kind, context)?;
+            let wrong = |message: String| kind.wrong(&message);
+            let Some(spot) = base.spot else {
+                return Err(kind.wrong(&format!("{name:?} is on no road")));
+            };
+            let [ds, dt] = ["ds", "dt"].map(|name| kind.number(name));
+            let mut at = roads.moved(spot.at, ds?, false).map_err(wrong)?;
+            at.offset += dt?;
+            let road_rad = roads.heading_rad(at);
+            on_roads(roads.point(at), heading_rad(&kind, road_rad)?, context)
+        }
+        _ => return Err(kind.unread()),
+    };
+    Ok(place)
+}
+
+/// A place with its spot on the roads, if it is on one.
+fn on_roads(xyz_m: [f64; 3], yaw_rad: f64, context: &Context<'_>) -> Place {
+    let roads = context.roads.as_ref();
+    let spot = roads.and_then(|roads| roads.spot(roads.lane_near(xyz_m)?, yaw_rad));
+    Place { xyz_m, yaw_rad, spot }
+}
+
+fn roads<'c>(kind: &Element<'_>, context: &'c Context<'_>) -> Result<&'c RoadMap, ConvertError> {
+    context.roads.as_ref().ok_or_else(|| {
+        kind.wrong("needs the roads: name the OpenDRIVE file in <LogicFile>, or with --roads")
+    })
+}
+
+/// The entity of `entityRef`, and its place.
+fn base_of(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Place), ConvertError> {
+    let name = kind.text("entityRef")?;
+    let place = context.entities.get(&name).and_then(|entity| entity.place);
+    let place = place.ok_or_else(|| {
+        kind.wrong(&format!("{name:?} has no position before this one; place it first"))
+    })?;
+    Ok((name, place))
+}
+
+fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
+    let (_, base) = base_of(kind, context)?;
+    let [dx, dy, dz] = ["dx", "dy", "dz"].map(|axis| kind.number_or_0(axis));
+    let (dx, dy, dz) = (dx?, dy?, dz?);
+    let mut xyz_m = match kind.name() {
+        "RelativeObjectPosition" => base.shifted(dx, dy).xyz_m,
+        _ => [base.xyz_m[0] + dx, base.xyz_m[1] + dy, base.xyz_m[2]],
+    };
+    xyz_m[2] += dz;
+    Ok(on_roads(xyz_m, heading_rad(kind, base.yaw_rad)?, context))
+}
+
+fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
+    let roads = roads(kind, context)?;
+    let [s, offset] = [kind.number("s")?, kind.number_or_0("offset")?];
+    let lane = kind.whole("laneId")?;
+    let at = roads.place(&kind.text("roadId")?, lane, s, offset);
+    let at = at.map_err(|message| kind.wrong(&message))?;
+    lane_facing(kind, at, roads)
+}
+
+/// A place on a lane with the heading of an `<Orientation>`; without one it faces as its traffic does.
+fn lane_facing(
+    kind: &Element<'_>,
+    at: xodr::LanePosition,
+    roads: &RoadMap,
+) -> Result<Place, ConvertError> {
+    let half_turn = if roads.drives_up(at.lane) { 0.0 } else { std::f64::consts::PI };
+    let traffic_rad = roads.heading_rad(at) + half_turn;
+    let yaw_rad = heading_rad(kind, traffic_rad)?;
+    Ok(Place { xyz_m: roads.point(at), yaw_rad, spot: roads.spot(at, yaw_rad) })
+}
+
+fn relative_lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
+    let (name, base) = base_of(kind, context)?;
+    let roads = roads(kind, context)?;
+    let Some(spot) = base.spot else {
+        return Err(kind.wrong(&format!("{name:?} is on no lane")));
+    };
+    let wrong = |message: String| kind.wrong(&message);
+    let count = kind.whole("dLane")?;
+    let offset_m = kind.number_or_0("offset")?;
+    let (way_m, is_along_lane) = match (kind.find_number("ds")?, kind.find_number("dsLane")?) {
+        (Some(ds), None) => (ds, false),
+        (None, Some(ds)) => (ds, true),
+        _ => return Err(kind.wrong("write exactly one of ds and dsLane")),
+    };
+    // Along a lane, left is that of its traffic; along a road, that of the road.
+    let sign = if is_along_lane && !roads.drives_up(spot.at.lane) { -1 } else { 1 };
+    let from = xodr::LanePosition { offset: 0.0, ..spot.at };
+    let moved = roads.moved(from, way_m, is_along_lane).map_err(wrong)?;
+    let mut at = roads.beside(moved, sign * count).map_err(wrong)?;
+    at.offset = f64::from(sign) * offset_m;
+    lane_facing(kind, at, roads)
+}
+
+/// The heading of an `<Orientation>`: absolute, or relative to a heading, which is returned without an `<Orientation>`.
+fn heading_rad(kind: &Element<'_>, base_rad: f64) -> Result<f64, ConvertError> {
+    kind.only(&["Orientation", "RouteRef", "InRoutePosition"])?;
+    let Some(orientation) = kind.find("Orientation")? else { return Ok(base_rad) };
+    note_tilt(&orientation)?;
+    let heading_rad = orientation.find_number("h")?;
+    match orientation.find_text("type")?.as_deref() {
+        None | Some("relative") => Ok(base_rad + heading_rad.unwrap_or(0.0)),
+        Some("absolute") => Ok(heading_rad.unwrap_or(0.0)),
+        Some(other) => Err(orientation.wrong(&format!("type={other:?}; relative or absolute"))),
     }
 }
 
-/// The heading of an `<Orientation>`: absolute, or relative to an entity, whose heading is returned without an
-/// `<Orientation>`.
-fn heading_rad(kind: &Element<'_>, base_rad: f64) -> Result<f64, ConvertError> {
-    kind.only(&["Orientation"])?;
-    let Some(orientation) = kind.find("Orientation")? else { return Ok(base_rad) };
-    let heading_rad = orientation.find_number("h")?.unwrap_or(0.0);
-    match orientation.find_text("type")?.as_deref() {
-        None | Some("relative") => Ok(base_rad + heading_rad),
-        Some("absolute") => Ok(heading_rad),
-        Some(other) => Err(orientation.wrong(&format!("type={other:?}; relative or absolute"))),
+/// Tells that pitch and roll are those of the ground.
+fn note_tilt(element: &Element<'_>) -> Result<(), ConvertError> {
+    if element.number_or_0("p")? != 0.0 || element.number_or_0("r")? != 0.0 {
+        element.note("pitch and roll are those of the ground");
     }
+    Ok(())
 }

@@ -1,417 +1,395 @@
-//! Reads the storyboard: `Init`, the events of the stories, and the stop trigger.
+//! Reads the stories: their events, with the actions of entities.
 
-use std::collections::BTreeMap;
+use wildcity_sim::scenario::ConditionSection;
 
-use wildcity_sim::scenario::{ActionSection, ConditionSection, CourseSection, TriggerSection};
-
-use super::Entity;
+use super::actions::{private_act, profile_entry};
+use super::catalogs::declared;
+use super::conditions::trigger_of;
 use super::element::Element;
+use super::elements::{Elements, Event, unknown};
+use super::init::set_place;
+use super::ledger::Part;
+use super::model::{Act, Context, Draft};
 use super::position::place_of;
 use crate::ConvertError;
 
-/// The rate of a step of speed, in m/s²: the largest of an actor.
-const STEP_MPS2: f64 = wildcity_sim::limits::ACTOR_ACCELERATION_M_S2;
-
-/// Least rate of a change of speed, in m/s².
-const LEAST_MPS2: f64 = 0.01;
-
-type Entities = BTreeMap<String, Entity>;
-
-/// Reads the actions of `Init`.
-pub(super) fn read_init(init: Element<'_>, entities: &mut Entities) -> Result<(), ConvertError> {
-    init.only(&["Actions"])?;
-    let actions = init.need("Actions")?;
-    actions.only(&["Private"])?;
-    for private in actions.children() {
-        let name = private.text("entityRef")?;
-        if !entities.contains_key(&name) {
-            return Err(private.wrong(&format!("there is no entity {name:?}")));
-        }
-        for action in private.children() {
-            if action.name() != "PrivateAction" {
-                return Err(action.unread());
-            }
-            read_init_action(action.only_child()?, &name, entities)?;
-        }
-    }
-    Ok(())
-}
-
-fn read_init_action(
-    action: Element<'_>,
-    name: &str,
-    entities: &mut Entities,
-) -> Result<(), ConvertError> {
-    match action.name() {
-        "TeleportAction" => {
-            let place = place_of(action.need("Position")?, entities)?;
-            if let Some(entity) = entities.get_mut(name) {
-                entity.place = Some(place);
-            }
-        }
-        "LongitudinalAction" => {
-            let (to_mps, _) = speed_of(action, 0.0)?;
-            if let Some(entity) = entities.get_mut(name) {
-                entity.speed_mps = to_mps;
-                entity.begin_mps = to_mps;
-            }
-        }
-        "RoutingAction" => {
-            let (line, times_s) = trajectory_of(action, entities)?;
-            if let Some(entity) = entities.get_mut(name) {
-                entity.line = Some(line);
-                entity.times_s = times_s;
-            }
-        }
-        _ => return Err(action.unread()),
-    }
-    Ok(())
+/// The place of an event in the storyboard.
+struct Scope<'e, 'a> {
+    /// The types and names of the elements around it.
+    names: Vec<(String, String)>,
+    actors: Vec<String>,
+    /// The trigger that fires when the act starts.
+    gate: Option<String>,
+    maneuver: &'e Element<'a>,
 }
 
 /// Reads the events of a story.
-pub(super) fn read_story(
-    story: Element<'_>,
-    entities: &mut Entities,
-    ego: &str,
+pub(super) fn read_story<'a>(
+    story: &Element<'a>,
+    context: &mut Context<'a>,
+    elements: &mut Elements,
 ) -> Result<(), ConvertError> {
-    story.only(&["Act"])?;
-    for act in story.children() {
+    let story = declared(story)?;
+    story.only(&["ParameterDeclarations", "Act"])?;
+    let story_name = story.find_text("name")?.unwrap_or_default();
+    for act in story.all("Act") {
         act.only(&["ManeuverGroup", "StartTrigger", "StopTrigger"])?;
-        if let Some(stop) = act.find("StopTrigger")? {
-            stop.only(&[])?;
+        if let Some(stop) = act.find("StopTrigger")?
+            && stop.children().next().is_some()
+        {
+            stop.leave_out(Part::Stop)?;
         }
-        let act_start = act.find("StartTrigger")?;
+        let act_name = act.find_text("name")?.unwrap_or_default();
+        let gate = gate_of(&act, &act_name, context, elements)?;
         for group in act.all("ManeuverGroup") {
-            group.expect("maximumExecutionCount", &["1"])?;
-            group.only(&["Actors", "Maneuver"])?;
+            group.only(&["Actors", "Maneuver", "CatalogReference"])?;
+            group.ignore(&["maximumExecutionCount"])?;
             let actors = group.need("Actors")?;
             actors.only(&["EntityRef"])?;
-            actors.expect("selectTriggeringEntities", &["false"])?;
+            actors.expect("selectTriggeringEntities", &["false", "0"])?;
             let names: Result<Vec<String>, _> =
                 actors.children().map(|actor| actor.text("entityRef")).collect();
-            for maneuver in group.all("Maneuver") {
-                maneuver.only(&["Event"])?;
-                for event in maneuver.children() {
-                    read_event(event, act_start, &names.clone()?, entities, ego)?;
+            let names = names?;
+            let group_name = group.find_text("name")?.unwrap_or_default();
+            for maneuver in group.children().filter(|child| child.name() != "Actors") {
+                let maneuver = match maneuver.name() {
+                    "CatalogReference" => context.catalogs.entry(&maneuver)?,
+                    _ => declared(&maneuver)?,
+                };
+                maneuver.only(&["ParameterDeclarations", "Event"])?;
+                let maneuver_name = maneuver.find_text("name")?.unwrap_or_default();
+                let around = [
+                    ("story", &story_name),
+                    ("act", &act_name),
+                    ("maneuverGroup", &group_name),
+                    ("maneuver", &maneuver_name),
+                ];
+                // Whatever the agent's entity does is not carried out at all.
+                if names.iter().any(|name| *name != context.ego) {
+                    group.expect("maximumExecutionCount", &["1"])?;
                 }
+                let scope = Scope {
+                    names: around.map(|(kind, name)| (kind.to_owned(), name.clone())).to_vec(),
+                    actors: names.clone(),
+                    gate: gate.clone(),
+                    maneuver: &maneuver,
+                };
+                for event in maneuver.all("Event") {
+                    read_event(&event, &scope, context, elements)?;
+                }
+                maneuver.check_read()?;
             }
         }
     }
     Ok(())
 }
 
-fn read_event(
-    event: Element<'_>,
-    act_start: Option<Element<'_>>,
-    actors: &[String],
-    entities: &mut Entities,
-    ego: &str,
+/// The trigger that fires when an act starts; `None` if it starts with the scenario.
+fn gate_of(
+    act: &Element<'_>,
+    name: &str,
+    context: &mut Context<'_>,
+    elements: &mut Elements,
+) -> Result<Option<String>, ConvertError> {
+    let start = act.find("StartTrigger")?;
+    let start = start.map(|start| trigger_of(&start, context, true)).transpose()?;
+    let start = start.unwrap_or_default();
+    let at_once = ConditionSection { time_s: Some(0.0), ..ConditionSection::default() };
+    let gate = match start == ConditionSection::default() || start == at_once {
+        true => None,
+        false => Some(elements.mark(&format!("act-{name}"), start, context, act)?),
+    };
+    elements.acts.insert(name.to_owned(), gate.clone());
+    Ok(gate)
+}
+
+fn read_event<'a>(
+    event: &Element<'a>,
+    scope: &Scope<'_, 'a>,
+    context: &mut Context<'a>,
+    elements: &mut Elements,
 ) -> Result<(), ConvertError> {
     event.only(&["Action", "StartTrigger"])?;
-    event.expect("priority", &["override", "overwrite", "skip"])?;
-    event.expect("maximumExecutionCount", &["1"])?;
-    let event_name = super::plain_name(&event.text("name")?);
+    let priority = event.find_text("priority")?.unwrap_or_else(|| "override".to_owned());
+    let is_overriding = match priority.as_str() {
+        "override" | "overwrite" => true,
+        "parallel" => false,
+        "skip" if scope.maneuver.all("Event").count() == 1 => false,
+        _ => {
+            let message = format!(
+                "priority={priority:?} is not read; override or parallel is, or skip alone"
+            );
+            return Err(event.wrong(&message));
+        }
+    };
+    let is_of_ego = scope.actors.iter().all(|name| *name == context.ego);
+    let is_global = event.all("Action").any(|action| action.all("PrivateAction").count() == 0);
+    let is_of_ego = is_of_ego && !is_global;
+    if !is_of_ego {
+        event.expect("maximumExecutionCount", &["1"])?;
+    }
+    event.ignore(&["maximumExecutionCount"])?;
+    // A name that is no formula is a text.
+    let name = event.text("name").or_else(|_| event.raw("name"))?;
+    let start = event.find("StartTrigger")?;
+    let read = start.as_ref().map(|start| trigger_of(start, context, scope.gate.is_none()));
+    let start = match (read.transpose(), &start) {
+        // When the agent's entity would act does not matter, if nothing waits for it.
+        (Err(_), Some(start)) if is_of_ego => {
+            start.leave_out(Part::Ego)?;
+            unknown()
+        }
+        (start, _) => start?.unwrap_or_default(),
+    };
+    let when = match &scope.gate {
+        None => start,
+        Some(gate) => {
+            let gate = Some(gate.clone());
+            ConditionSection { after: gate, all: vec![start], ..ConditionSection::default() }
+        }
+    };
+    let index = elements.events.len();
+    elements.events.push(Event::default());
+    let own = ("event".to_owned(), name.clone());
+    for key in scope.names.iter().chain([&own]) {
+        elements.by_name.entry(key.clone()).or_default().push(index);
+    }
+    let mut read = EventRead { index, name: &name, when: &when, is_overriding, scope };
     for action in event.all("Action") {
+        read.action(&action, context, elements)?;
+    }
+    Ok(())
+}
+
+/// An event while its actions are read.
+struct EventRead<'e, 'a> {
+    index: usize,
+    name: &'e str,
+    when: &'e ConditionSection,
+    is_overriding: bool,
+    scope: &'e Scope<'e, 'a>,
+}
+
+impl<'a> EventRead<'_, 'a> {
+    fn action(
+        &mut self,
+        action: &Element<'a>,
+        context: &mut Context<'a>,
+        elements: &mut Elements,
+    ) -> Result<(), ConvertError> {
+        let action_name = action.text("name").or_else(|_| action.raw("name")).unwrap_or_default();
+        let key = ("action".to_owned(), action_name.clone());
+        elements.by_name.entry(key).or_default().push(self.index);
         let kind = action.only_child()?;
-        // Global actions name their entity themselves.
-        let (targets, kind) = match kind.name() {
-            "PrivateAction" => (actors.to_vec(), kind.only_child()?),
-            "GlobalAction" => {
-                let entity = kind.only_child()?;
-                if entity.name() != "EntityAction" {
-                    return Err(entity.unread());
-                }
-                (vec![entity.text("entityRef")?], entity.only_child()?)
-            }
-            _ => return Err(kind.unread()),
-        };
-        for target in targets {
-            let mut when = ConditionSection::default();
-            for start in act_start.into_iter().chain(event.find("StartTrigger")?) {
-                add_conditions(start, &target, ego, entities, &mut when)?;
-            }
-            let Some(entity) = entities.get(&target) else {
-                return Err(action.wrong(&format!("there is no entity {target:?}")));
-            };
-            let then = action_of(kind, entity, entities)?;
-            let Some(entity) = entities.get_mut(&target) else { continue };
-            match &then {
-                ActionSection::Speed { to, .. } => entity.speed_mps = *to,
-                ActionSection::Spawn {} if entity.script.is_empty() => entity.present = false,
-                _ => {}
-            }
-            let same = entity
-                .script
-                .iter_mut()
-                .find(|trigger| trigger.name.as_deref() == Some(event_name.as_str()));
-            match same {
-                Some(trigger) => trigger.then.push(then),
-                None => entity.script.push(TriggerSection {
-                    name: Some(event_name.clone()),
-                    when,
-                    then: vec![then],
-                }),
-            }
-        }
-    }
-    Ok(())
-}
-
-fn action_of(
-    kind: Element<'_>,
-    entity: &Entity,
-    entities: &Entities,
-) -> Result<ActionSection, ConvertError> {
-    match kind.name() {
-        "LongitudinalAction" => {
-            let (to, rate) = speed_of(kind, entity.speed_mps)?;
-            Ok(ActionSection::Speed { to, rate })
-        }
-        "RoutingAction" => {
-            let (points, times_s) = trajectory_of(kind, entities)?;
-            if times_s.is_some() {
-                let message = "has times, which an event cannot keep; use <None> as time reference";
-                return Err(kind.wrong(message));
-            }
-            Ok(ActionSection::Path(CourseSection {
-                points: Some(points),
-                ..CourseSection::default()
-            }))
-        }
-        "AddEntityAction" => Ok(ActionSection::Spawn {}),
-        "DeleteEntityAction" => Ok(ActionSection::Remove {}),
-        _ => Err(kind.unread()),
-    }
-}
-
-/// Whether actions move an actor along its course.
-pub(super) fn is_motion(then: &[ActionSection]) -> bool {
-    let is_presence = |action: &ActionSection| {
-        matches!(action, ActionSection::Spawn {} | ActionSection::Remove {})
-    };
-    !then.iter().all(is_presence)
-}
-
-/// The speed and the rate of a `<LongitudinalAction>`, from a speed in m/s.
-fn speed_of(action: Element<'_>, from_mps: f64) -> Result<(f64, f64), ConvertError> {
-    let speed = action.only_child()?;
-    if speed.name() != "SpeedAction" {
-        return Err(speed.unread());
-    }
-    speed.only(&["SpeedActionDynamics", "SpeedActionTarget"])?;
-    let target = speed.need("SpeedActionTarget")?.only_child()?;
-    if target.name() != "AbsoluteTargetSpeed" {
-        return Err(target.unread());
-    }
-    let to_mps = target.number("value")?;
-    if to_mps < 0.0 {
-        return Err(target.wrong("is below 0; actors do not drive backwards"));
-    }
-    let dynamics = speed.need("SpeedActionDynamics")?;
-    dynamics.expect("dynamicsShape", &["step", "linear"])?;
-    if dynamics.text("dynamicsShape")? == "step" {
-        return Ok((to_mps, STEP_MPS2));
-    }
-    let value = dynamics.number("value")?;
-    let change_mps = (to_mps - from_mps).abs();
-    let rate = match dynamics.text("dynamicsDimension")?.as_str() {
-        "rate" => value.abs(),
-        "time" if value > 0.0 => change_mps / value,
-        "time" => STEP_MPS2,
-        // v² - v0² = 2 a s.
-        "distance" if value > 0.0 => change_mps * (to_mps + from_mps) / (2.0 * value),
-        other => {
-            let message = format!("dynamicsDimension={other:?}; rate, time or distance is read");
-            return Err(dynamics.wrong(&message));
-        }
-    };
-    Ok((to_mps, rate.clamp(LEAST_MPS2, STEP_MPS2)))
-}
-
-/// Points in metres, with their times in seconds if they count.
-type TimedPoints = (Vec<[f64; 3]>, Option<Vec<f64>>);
-
-/// The points of a `<FollowTrajectoryAction>`.
-fn trajectory_of(action: Element<'_>, entities: &Entities) -> Result<TimedPoints, ConvertError> {
-    let follow = action.only_child()?;
-    if follow.name() != "FollowTrajectoryAction" {
-        return Err(follow.unread());
-    }
-    follow.only(&["Trajectory", "TrajectoryRef", "TimeReference", "TrajectoryFollowingMode"])?;
-    let trajectory = match follow.find("TrajectoryRef")? {
-        Some(reference) => reference.need("Trajectory")?,
-        None => follow.need("Trajectory")?,
-    };
-    trajectory.expect("closed", &["false", "0"])?;
-    trajectory.only(&["ParameterDeclarations", "Shape"])?;
-    if let Some(parameters) = trajectory.find("ParameterDeclarations")? {
-        parameters.only(&[])?;
-    }
-    let shape = trajectory.need("Shape")?.only_child()?;
-    if shape.name() != "Polyline" {
-        return Err(shape.unread());
-    }
-    shape.only(&["Vertex"])?;
-    let mut points = Vec::new();
-    let mut times_s = Vec::new();
-    for vertex in shape.children() {
-        points.push(place_of(vertex.need("Position")?, entities)?.xyz_m);
-        times_s.push(vertex.find_number("time")?);
-    }
-    let reference = follow.find("TimeReference")?.map(|reference| reference.only_child());
-    let Some(reference) = reference.transpose()? else { return Ok((points, None)) };
-    match reference.name() {
-        "None" => Ok((points, None)),
-        "Timing" => {
-            reference.expect("domainAbsoluteRelative", &["absolute", "relative"])?;
-            reference.expect("scale", &["1", "1.0"])?;
-            let offset_s = reference.find_number("offset")?.unwrap_or(0.0);
-            let times_s: Option<Vec<f64>> =
-                times_s.into_iter().map(|time_s| Some(time_s? + offset_s)).collect();
-            let missing = || reference.wrong("a <Vertex> has no time; give all of them one");
-            Ok((points, Some(times_s.ok_or_else(missing)?)))
-        }
-        _ => Err(reference.unread()),
-    }
-}
-
-/// Adds the conditions of a trigger, all of which must be true.
-fn add_conditions(
-    start: Element<'_>,
-    own: &str,
-    ego: &str,
-    entities: &Entities,
-    when: &mut ConditionSection,
-) -> Result<(), ConvertError> {
-    start.only(&["ConditionGroup"])?;
-    let Some(group) = start.find("ConditionGroup")? else { return Ok(()) };
-    for condition in group.children() {
-        if condition.name() != "Condition" {
-            return Err(condition.unread());
-        }
-        condition.expect("conditionEdge", &["rising", "none"])?;
-        let delay_s = condition.find_number("delay")?.unwrap_or(0.0);
-        let kind = condition.only_child()?;
         match kind.name() {
-            "ByValueCondition" => add_by_value(kind.only_child()?, delay_s, when)?,
-            "ByEntityCondition" => {
-                if delay_s != 0.0 {
-                    return Err(condition.wrong("delay is read for times and events only"));
+            "PrivateAction" => {
+                let kind = kind.only_child()?;
+                for target in &self.scope.actors {
+                    self.act_of(&kind, target, &action_name, context, elements)?;
                 }
-                add_by_entity(kind, own, ego, entities, when)?;
+                Ok(())
             }
-            _ => return Err(kind.unread()),
-        }
-    }
-    Ok(())
-}
-
-fn add_by_value(
-    kind: Element<'_>,
-    delay_s: f64,
-    when: &mut ConditionSection,
-) -> Result<(), ConvertError> {
-    match kind.name() {
-        "SimulationTimeCondition" => {
-            kind.expect("rule", &["greaterThan", "greaterOrEqual"])?;
-            let time_s = (kind.number("value")? + delay_s).max(0.0);
-            // Both the act's and the event's must be over.
-            when.time_s = Some(when.time_s.map_or(time_s, |other| other.max(time_s)));
-        }
-        "StoryboardElementStateCondition" => {
-            kind.expect("storyboardElementType", &["event"])?;
-            kind.expect("state", &["startTransition", "runningState"])?;
-            let event = super::plain_name(&kind.text("storyboardElementRef")?);
-            set(&kind, &mut when.after, event)?;
-            when.delay_s = (delay_s > 0.0).then_some(delay_s);
-        }
-        _ => return Err(kind.unread()),
-    }
-    Ok(())
-}
-
-fn add_by_entity(
-    by: Element<'_>,
-    own: &str,
-    ego: &str,
-    entities: &Entities,
-    when: &mut ConditionSection,
-) -> Result<(), ConvertError> {
-    by.only(&["TriggeringEntities", "EntityCondition"])?;
-    let triggering = by.need("TriggeringEntities")?;
-    let subject = triggering.only_child()?.text("entityRef")?;
-    let kind = by.need("EntityCondition")?.only_child()?;
-    let is_own = subject == own;
-    let is_ego = subject == ego;
-    match kind.name() {
-        "SpeedCondition" => {
-            let value = kind.number("value")?;
-            let rule = kind.text("rule")?;
-            match (rule.as_str(), is_own, is_ego) {
-                ("greaterThan" | "greaterOrEqual", true, _) => {
-                    set(&kind, &mut when.speed_above, value)?;
-                }
-                ("lessThan" | "lessOrEqual", true, _) => {
-                    set(&kind, &mut when.speed_below, value)?;
-                }
-                ("greaterThan" | "greaterOrEqual", _, true) => {
-                    set(&kind, &mut when.ego_speed_above, value)?;
-                }
-                _ => {
-                    let message =
-                        "is read for the event's own actor, or the ego's speed above a value";
-                    return Err(kind.wrong(message));
+            "GlobalAction" => {
+                let global = kind.only_child()?;
+                match global.name() {
+                    "EntityAction" => {
+                        let target = global.text("entityRef")?;
+                        self.act_of(&global.only_child()?, &target, &action_name, context, elements)
+                    }
+                    "ParameterAction" | "VariableAction" => {
+                        let is_parameter = global.name() == "ParameterAction";
+                        let attribute = if is_parameter { "parameterRef" } else { "variableRef" };
+                        global.raw(attribute)?;
+                        let set = global.only_child()?;
+                        if set.name() != "SetAction" {
+                            return Err(set.unread());
+                        }
+                        // Conditions that read the value wait for the event.
+                        set.raw("value")?;
+                        self.mark_ego(Some(0.0), &set, context, elements)
+                    }
+                    "EnvironmentAction" => global.leave_out(Part::Environment),
+                    "InfrastructureAction" => global.leave_out(Part::Signals),
+                    _ => Err(global.unread()),
                 }
             }
+            "UserDefinedAction" => kind.leave_out(Part::Custom),
+            _ => Err(kind.unread()),
         }
-        "RelativeDistanceCondition" => {
-            kind.expect("freespace", &["false", "0"])?;
-            kind.expect("rule", &["lessThan", "lessOrEqual"])?;
-            kind.expect("relativeDistanceType", &["cartesianDistance", "euclidianDistance"])?;
-            let reference = kind.text("entityRef")?;
-            let other = match (is_own, reference == own) {
-                (true, _) => reference,
-                (_, true) => subject,
-                _ => return Err(kind.wrong("is read for the event's own actor only")),
-            };
-            set(&kind, &mut when.within_m, kind.number("value")?)?;
-            if other != ego {
-                let name = entities.get(&other).map(|entity| entity.name.clone());
-                when.of = Some(name.ok_or_else(|| kind.wrong("names no entity"))?);
+    }
+
+    /// Adds an action of an entity.
+    fn act_of(
+        &mut self,
+        kind: &Element<'a>,
+        target: &str,
+        action_name: &str,
+        context: &mut Context<'a>,
+        elements: &mut Elements,
+    ) -> Result<(), ConvertError> {
+        if !context.entities.contains_key(target) {
+            return Err(kind.wrong(&format!("there is no entity {target:?}")));
+        }
+        let is_controller = matches!(kind.name(), "ControllerAction" | "ActivateControllerAction");
+        let is_look = matches!(kind.name(), "AppearanceAction" | "VisibilityAction");
+        if target == context.ego && !is_controller && !is_look {
+            let duration_s = duration_s(kind)?;
+            kind.leave_out(Part::Ego)?;
+            return self.mark_ego(duration_s, kind, context, elements);
+        }
+        if kind.name() == "LongitudinalAction" {
+            let profile = kind.only_child()?;
+            if profile.name() == "SpeedProfileAction" {
+                return self.speed_profile(&profile, target, action_name, context, elements);
             }
         }
-        "TraveledDistanceCondition" if is_own => {
-            let begin_m = match entities.get(own) {
-                Some(entity) if entity.line.is_some() => entity.center_x_m.max(0.0),
-                _ => 0.0,
-            };
-            set(&kind, &mut when.station_m, begin_m + kind.number("value")?)?;
-        }
-        "TraveledDistanceCondition" => {
-            return Err(kind.wrong("is read for the event's own actor only"));
-        }
-        _ => return Err(kind.unread()),
+        let act = match kind.name() {
+            "AddEntityAction" => {
+                let place = place_of(&kind.need("Position")?, context)?;
+                set_place(target, place, context);
+                Act::Spawn
+            }
+            "DeleteEntityAction" => Act::Remove,
+            "TeleportAction" => {
+                let place = place_of(&kind.need("Position")?, context)?;
+                let before = context.entities.get(target).and_then(|entity| entity.place);
+                set_place(target, place, context);
+                if let Some(entity) = context.entities.get_mut(target) {
+                    // The lane is the new one; the place stays that of the start.
+                    entity.place = before;
+                }
+                Act::Place(place)
+            }
+            _ => match private_act(kind, target, context)? {
+                Some(act) => act,
+                // Left out: it has no duration.
+                None => {
+                    let is_over = is_controller || is_look;
+                    return self.mark_ego(is_over.then_some(0.0), kind, context, elements);
+                }
+            },
+        };
+        self.add((act, self.when.clone()), target, action_name, context, elements, kind)?;
+        Ok(())
     }
-    Ok(())
+
+    /// Adds a change of speed for each entry of a profile, each when the one before is over.
+    fn speed_profile(
+        &self,
+        profile: &Element<'a>,
+        target: &str,
+        action_name: &str,
+        context: &mut Context<'a>,
+        elements: &mut Elements,
+    ) -> Result<(), ConvertError> {
+        profile.expect("followingMode", &["position"])?;
+        profile.only(&["SpeedProfileEntry"])?;
+        let mut when = self.when.clone();
+        for entry in profile.children() {
+            let (act, over_s) = profile_entry(&entry)?;
+            let trigger = self.add((act, when), target, action_name, context, elements, &entry)?;
+            let delay_s = Some(over_s).filter(|over_s| *over_s > 0.0);
+            when = ConditionSection { after: Some(trigger), delay_s, ..Default::default() };
+        }
+        Ok(())
+    }
+
+    /// Marks the start of an event that has left out actions.
+    fn mark_ego(
+        &self,
+        duration_s: Option<f64>,
+        kind: &Element<'_>,
+        context: &Context<'_>,
+        elements: &mut Elements,
+    ) -> Result<(), ConvertError> {
+        let mark = match elements.events[self.index].mark.take() {
+            Some((mark, before_s)) => {
+                let longest_s = before_s.zip(duration_s).map(|(a, b)| f64::max(a, b));
+                (mark, longest_s)
+            }
+            None => (elements.mark(self.name, self.when.clone(), context, kind)?, duration_s),
+        };
+        elements.events[self.index].mark = Some(mark);
+        Ok(())
+    }
+
+    fn add(
+        &self,
+        (act, when): (Act, ConditionSection),
+        target: &str,
+        action_name: &str,
+        context: &mut Context<'_>,
+        elements: &mut Elements,
+        kind: &Element<'_>,
+    ) -> Result<String, ConvertError> {
+        let Some(entity) = context.entities.get_mut(target) else { return Err(kind.unread()) };
+        match &act {
+            Act::Speed(profile) => entity.fastest_mps = entity.fastest_mps.max(profile.to),
+            Act::Match { .. } => entity.fastest_mps = wildcity_sim::limits::ACTOR_SPEED_M_S,
+            Act::Lane { lane, .. } => entity.lane = Some(*lane),
+            Act::Spawn if entity.script.is_empty() => entity.present = false,
+            _ => {}
+        }
+        let plain = super::plain_name(self.name);
+        let taken = |name: &str| entity.script.iter().any(|draft| draft.name == name);
+        let mut free = (1..1000).map(|index| match index {
+            1 => plain.clone(),
+            _ => format!("{plain}-{index}"),
+        });
+        let name = free.find(|name| !taken(name));
+        let name = name.ok_or_else(|| kind.wrong("is there too often; rename some events"))?;
+        let reference = format!("{}/{name}", entity.name);
+        let mut then = Vec::new();
+        if self.is_overriding && act.is_motion() {
+            // Of the other events of this maneuver, what is under way ends.
+            let key = &self.scope.names[3];
+            let maneuver = elements.by_name.get(key).into_iter().flatten();
+            let others = maneuver.filter(|index| **index != self.index);
+            let others = others.flat_map(|index| &elements.events[*index].triggers);
+            let own = format!("{}/", entity.name);
+            then.extend(others.filter_map(|(trigger, _)| {
+                let name = trigger.strip_prefix(&own)?;
+                let draft = entity.script.iter().find(|draft| draft.name == name)?;
+                // A change of the same kind is replaced anyway.
+                let replaces = draft
+                    .then
+                    .iter()
+                    .any(|other| std::mem::discriminant(other) == std::mem::discriminant(&act));
+                let moves = draft.then.iter().any(Act::is_motion);
+                (moves && !replaces).then(|| Act::Halt(name.to_owned()))
+            }));
+        }
+        let is_line =
+            |draft: &Draft| draft.then.iter().any(|act| matches!(act, Act::Trajectory(_)));
+        let halts_line = then.iter().any(|act| match act {
+            Act::Halt(name) => {
+                entity.script.iter().any(|draft| draft.name == *name && is_line(draft))
+            }
+            _ => false,
+        });
+        if halts_line {
+            kind.note(
+                "ends a trajectory of its maneuver by its priority: the actor stays on the line",
+            );
+        }
+        then.push(act);
+        entity.script.push(Draft { name, when, then });
+        let triggers = &mut elements.events[self.index].triggers;
+        triggers.push((reference.clone(), action_name.to_owned()));
+        Ok(reference)
+    }
 }
 
-/// Sets a part of a condition that is not set yet.
-fn set<T>(kind: &Element<'_>, part: &mut Option<T>, value: T) -> Result<(), ConvertError> {
-    if part.replace(value).is_some() {
-        return Err(kind.wrong("is there twice for one event; keep one"));
+/// How long an action lasts, in seconds, if its dynamics say so.
+fn duration_s(kind: &Element<'_>) -> Result<Option<f64>, ConvertError> {
+    let Some(action) = kind.children().next() else { return Ok(None) };
+    for dynamics in action.children().filter(|child| child.name().ends_with("Dynamics")) {
+        if dynamics.find_text("dynamicsShape")?.as_deref() == Some("step") {
+            return Ok(Some(0.0));
+        }
+        if dynamics.find_text("dynamicsDimension")?.as_deref() == Some("time") {
+            return dynamics.find_number("value");
+        }
     }
-    Ok(())
-}
-
-/// The time of a `<StopTrigger>`, in seconds; `None` if it is empty.
-pub(super) fn stop_time_s(stop: Element<'_>) -> Result<Option<f64>, ConvertError> {
-    stop.only(&["ConditionGroup"])?;
-    let Some(group) = stop.find("ConditionGroup")? else { return Ok(None) };
-    let condition = group.only_child()?;
-    let kind = condition.only_child()?.only_child()?;
-    if kind.name() != "SimulationTimeCondition" {
-        return Err(kind.unread());
-    }
-    kind.expect("rule", &["greaterThan", "greaterOrEqual"])?;
-    Ok(Some(kind.number("value")?))
+    Ok(matches!(kind.name(), "TeleportAction").then_some(0.0))
 }

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use wildcity_scene::ActorClass;
 
 use super::pose::PoseSection;
+use super::script_file::TriggerSection;
 
 /// The name of the asset of an actor that is not drawn.
 pub const NOT_DRAWN: &str = "none";
@@ -63,25 +64,6 @@ pub struct ActorSection {
 pub struct LogSection {
     /// Id of the track.
     pub track: String,
-}
-
-/// A line to follow: exactly one of `along`, `points` and `lanes`.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct CourseSection {
-    /// A recorded trajectory of the twin.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub along: Option<String>,
-    /// Points in the world, in metres, in order. They are placed on the ground where there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub points: Option<Vec<[f64; 3]>>,
-    /// Lanes of the map, in order.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lanes: Option<Vec<String>>,
-    /// Whether to follow it from its end to its start. If absent, false.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reverse: Option<bool>,
 }
 
 /// An actor on a course.
@@ -230,90 +212,6 @@ pub struct AttackSection {
     /// Number of best plans from which one is sampled: 1, 2 or 10 in HUGSIM. If absent, 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub best_k: Option<u32>,
-}
-
-/// A condition and what follows, once.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct TriggerSection {
-    /// A name, for `after` and for events.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub name: Option<String>,
-    /// The condition.
-    pub when: ConditionSection,
-    /// The actions, in order.
-    #[serde(rename = "do")]
-    pub then: Vec<ActionSection>,
-}
-
-/// A condition: every given part must hold. A condition without parts holds at the start.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(deny_unknown_fields, default)]
-pub struct ConditionSection {
-    /// From this time on, in seconds since the episode's start.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub time_s: Option<f64>,
-    /// At most this far from the middle of the ego's box, or from that of `of`, in metres.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub within_m: Option<f64>,
-    /// The actor that `within_m` is measured to. If absent, the ego.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub of: Option<String>,
-    /// The actor has reached this station of its course, in metres.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub station_m: Option<f64>,
-    /// The ego has reached this station of the actor's course, in metres.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ego_station_m: Option<f64>,
-    /// The actor's speed is at least this, in m/s.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub speed_above: Option<f64>,
-    /// The actor's speed is at most this, in m/s.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub speed_below: Option<f64>,
-    /// The ego's speed is at least this, in m/s.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ego_speed_above: Option<f64>,
-    /// A trigger that has fired, by its name: `TRIGGER` of this actor, or `ACTOR/TRIGGER`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub after: Option<String>,
-    /// Least time since `after` fired, in seconds. If absent, 0.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub delay_s: Option<f64>,
-}
-
-/// One action.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "schema", derive(schemars::JsonSchema))]
-#[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum ActionSection {
-    /// Changes the speed to `to` m/s by `rate` m/s².
-    Speed {
-        /// The new speed, in m/s.
-        to: f64,
-        /// Acceleration or braking, in m/s².
-        rate: f64,
-    },
-    /// Brakes to standstill by `rate` m/s².
-    Stop {
-        /// Braking, in m/s².
-        rate: f64,
-    },
-    /// Moves to another offset from the course.
-    Offset {
-        /// The new offset, in metres to the left.
-        to_m: f64,
-        /// Within this time, in seconds.
-        over_s: f64,
-    },
-    /// Continues on another course, from its nearest place.
-    Path(CourseSection),
-    /// Appears.
-    Spawn {},
-    /// Disappears.
-    Remove {},
 }
 
 /// Random displacement: each value is drawn uniformly within plus and minus the given one.

@@ -2,7 +2,7 @@
 //!
 //! | module | what it does |
 //! |---|---|
-//! | `file`, `actor_file`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
+//! | `file`, `actor_file`, `script_file`, `tracks` | the formats `wildcity.scenario/1` and `wildcity.tracks/1` |
 //! | `document` | reads a scenario, and puts in the values of its sweep |
 //! | `resolve`, `around` | checks a scenario against its twin |
 //! | `actors`, `courses`, `collide`, `script`, `jitter`, `pose` | checks its actors, and sets them up |
@@ -22,6 +22,7 @@ mod jitter;
 mod pose;
 mod resolve;
 mod script;
+mod script_file;
 mod tracks;
 
 pub use actor_file::*;
@@ -32,4 +33,5 @@ pub use error::{FileError, check_format};
 pub use file::*;
 pub use pose::PoseSection;
 pub use resolve::Scenario;
+pub use script_file::*;
 pub use tracks::{KeyframeSection, TrackSection, TracksFile};

@@ -11,7 +11,7 @@ use super::course::{Course, turned_rad};
 use super::idm::{Idm, rolled};
 use super::lateral::Lateral;
 use super::lead::{Corridor, Lead, LeadCandidate, lead_ahead};
-use super::script::Action;
+use super::script::{Action, Over, Shape};
 use super::state::ActorState;
 use crate::limits;
 
@@ -43,6 +43,32 @@ pub(super) struct CourseFollowerState {
     /// The change of speed that a script has commanded and that is not complete.
     speed_command: Option<SpeedCommand>,
     lateral: Lateral,
+    /// The triggers whose changes are under way.
+    pub(super) by: Owners,
+    /// Station at which the action that chose the course is done, in metres.
+    course_done_m: f64,
+}
+
+/// The triggers whose changes of speed, offset and course are under way, by their indices in the script.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Owners {
+    pub(super) speed: Option<usize>,
+    pub(super) offset: Option<usize>,
+    pub(super) course: Option<usize>,
+}
+
+impl Owners {
+    /// Whether a trigger has a change that is under way.
+    pub(super) fn has(&self, trigger: usize) -> bool {
+        [self.speed, self.offset, self.course].contains(&Some(trigger))
+    }
+
+    /// Whether a trigger has a change here that it has no longer there.
+    pub(super) fn loses(&self, after: &Self, trigger: usize) -> bool {
+        let pairs =
+            [(self.speed, after.speed), (self.offset, after.offset), (self.course, after.course)];
+        pairs.iter().any(|(before, after)| *before == Some(trigger) && before != after)
+    }
 }
 
 /// A change of speed that a script commands.
@@ -50,6 +76,69 @@ pub(super) struct CourseFollowerState {
 struct SpeedCommand {
     to_mps: f64,
     rate_mps2: f64,
+    profile: Option<SpeedProfile>,
+    matched: Option<SpeedMatch>,
+}
+
+/// The speed of another body that an actor drives with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct SpeedMatch {
+    of: Option<usize>,
+    factor: f64,
+    delta_mps: f64,
+}
+
+impl SpeedMatch {
+    /// The speed now, in m/s; `None` if the other is absent.
+    fn speed_mps(&self, bodies: &[LeadCandidate]) -> Option<f64> {
+        let body = bodies.iter().find(|body| body.actor.map(usize::from) == self.of)?;
+        let speed_mps = self.factor * body.velocity_mps.length() + self.delta_mps;
+        Some(speed_mps.clamp(0.0, limits::ACTOR_SPEED_M_S))
+    }
+}
+
+/// A change of speed by a shape.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct SpeedProfile {
+    from_mps: f64,
+    shape: Shape,
+    over_s: f64,
+    elapsed_s: f64,
+}
+
+impl SpeedCommand {
+    /// The acceleration for the next sub-step, in m/s².
+    fn acceleration(&self, speed_mps: f64, duration_s: f64, bodies: &[LeadCandidate]) -> f64 {
+        if let Some(matched) = self.matched {
+            return (matched.speed_mps(bodies).unwrap_or(speed_mps) - speed_mps) / duration_s;
+        }
+        let Some(profile) = self.profile else {
+            let needed = (self.to_mps - speed_mps) / duration_s;
+            return needed.clamp(-self.rate_mps2, self.rate_mps2);
+        };
+        let share = match profile.over_s > 0.0 {
+            true => profile.shape.at((profile.elapsed_s + duration_s) / profile.over_s),
+            false => 1.0,
+        };
+        let next_mps = profile.from_mps + share * (self.to_mps - profile.from_mps);
+        // Exact at the end, so that the change is known to be complete.
+        (next_mps - speed_mps) / duration_s
+    }
+
+    fn after(mut self, duration_s: f64) -> Self {
+        if let Some(profile) = &mut self.profile {
+            profile.elapsed_s += duration_s;
+        }
+        self
+    }
+
+    fn is_over(&self, speed_mps: f64) -> bool {
+        match self.profile {
+            _ if self.matched.is_some() => false,
+            Some(profile) => profile.elapsed_s >= profile.over_s,
+            None => speed_mps == self.to_mps,
+        }
+    }
 }
 
 impl CourseFollower {
@@ -62,6 +151,8 @@ impl CourseFollower {
             free_flow_speed_mps: self.idm.map_or(self.speed_mps, |idm| idm.free_speed_mps),
             speed_command: None,
             lateral: Lateral::at(self.offset_m),
+            by: Owners::default(),
+            course_done_m: 0.0,
         }
     }
 
@@ -70,34 +161,58 @@ impl CourseFollower {
         &self.courses[now.course]
     }
 
-    /// The state after an action of the actor's script.
+    /// The state after an action of a trigger of the actor's script.
     pub(super) fn with_action(
         &self,
         now: &CourseFollowerState,
         action: Action,
+        trigger: usize,
     ) -> CourseFollowerState {
+        let mut next = *now;
+        let profile = |over: Over, shape: Shape, to_mps: f64| SpeedProfile {
+            from_mps: now.speed_mps,
+            shape,
+            over_s: seconds(over, shape, [now.speed_mps, to_mps]),
+            elapsed_s: 0.0,
+        };
         match action {
             Action::Speed { to_mps, rate_mps2 } => {
-                let free_flow_speed_mps =
-                    if to_mps > 0.0 { to_mps } else { now.free_flow_speed_mps };
-                CourseFollowerState {
-                    speed_command: Some(SpeedCommand { to_mps, rate_mps2 }),
-                    free_flow_speed_mps,
-                    ..*now
-                }
+                let command = SpeedCommand { to_mps, rate_mps2, profile: None, matched: None };
+                next.command(command, trigger);
             }
-            Action::Offset { to_m, over_s } => CourseFollowerState {
-                lateral: now.lateral.moving_to(to_m, over_s, now.speed_mps),
-                ..*now
-            },
-            Action::Course { course } => {
+            Action::SpeedProfile { to_mps, over, shape } => {
+                let profile = Some(profile(over, shape, to_mps));
+                let command = SpeedCommand { to_mps, rate_mps2: 0.0, profile, matched: None };
+                next.command(command, trigger);
+            }
+            Action::SpeedMatch { of, factor, delta_mps } => {
+                let matched = Some(SpeedMatch { of, factor, delta_mps });
+                let to_mps = now.speed_mps;
+                let command = SpeedCommand { to_mps, rate_mps2: 0.0, profile: None, matched };
+                next.command(command, trigger);
+            }
+            Action::Offset { to_m, over_s } => {
+                next.lateral = now.lateral.moving_to(to_m, over_s, now.speed_mps);
+                next.by.offset = Some(trigger);
+            }
+            Action::OffsetProfile { to_m, over, shape } => {
+                next.lateral = now.lateral.by_profile(to_m, over, shape);
+                next.by.offset = Some(trigger);
+            }
+            Action::Course { course, done_m, at_m } => {
                 let place_m = self.pose(now).position_m;
                 let beside = self.courses[course].nearest(place_m);
-                let lateral = Lateral::at(beside.left_m);
-                CourseFollowerState { course, station_m: beside.station_m, lateral, ..*now }
+                next.course = course;
+                next.station_m = at_m.unwrap_or(beside.station_m);
+                next.lateral = Lateral::at(if at_m.is_some() { 0.0 } else { beside.left_m });
+                next.by.offset = None;
+                next.by.course = done_m.map(|_| trigger);
+                next.course_done_m = done_m.unwrap_or(0.0);
             }
-            Action::Spawn | Action::Remove => *now,
+            Action::Halt { trigger: halted } => next.halt(halted),
+            Action::Spawn | Action::Remove => {}
         }
+        next
     }
 
     /// The state after a sub-step. `None` if the actor has left.
@@ -111,17 +226,24 @@ impl CourseFollower {
     ) -> Option<CourseFollowerState> {
         let course = self.course(now);
         let lead = self.idm.and_then(|idm| self.lead(now, &idm, box_, own, bodies));
-        let acceleration = self.acceleration(now, lead, duration_s);
+        let acceleration = self.acceleration(now, lead, bodies, duration_s);
         let [way_m, speed_mps] = rolled(now.speed_mps, acceleration, duration_s);
 
         // A line that lies d to the left of one with curvature k is (1 - k d) as long.
         let stretch = 1.0 - course.curvature_1_m(now.station_m) * now.lateral.offset_m();
         let station_m = now.station_m + way_m / stretch.max(0.1);
         let lateral = now.lateral.after(duration_s, 0.5 * (now.speed_mps + speed_mps));
-        let is_pending =
-            |command: &SpeedCommand| command.to_mps == 0.0 || speed_mps != command.to_mps;
-        let speed_command = now.speed_command.filter(is_pending);
-        let next = CourseFollowerState { station_m, speed_mps, lateral, speed_command, ..*now };
+        let speed_command = now.speed_command.map(|command| command.after(duration_s));
+        let is_over = speed_command.is_none_or(|command| command.is_over(speed_mps));
+        // A command to stop holds the actor until the next one.
+        let is_kept = |command: &SpeedCommand| command.to_mps == 0.0 || !is_over;
+        let speed_command = speed_command.filter(is_kept);
+        let by = Owners {
+            speed: now.by.speed.filter(|_| !is_over),
+            offset: now.by.offset.filter(|_| lateral.is_moving()),
+            course: now.by.course.filter(|_| station_m < now.course_done_m),
+        };
+        let next = CourseFollowerState { station_m, speed_mps, lateral, speed_command, by, ..*now };
         let length_m = course.length_m();
         match (station_m >= length_m, self.leaves) {
             (false, _) => Some(next),
@@ -133,11 +255,16 @@ impl CourseFollower {
     }
 
     /// Acceleration in m/s²: that of the model, that of a speed command, or the lesser of both.
-    fn acceleration(&self, now: &CourseFollowerState, lead: Option<Lead>, duration_s: f64) -> f64 {
-        let commanded = now.speed_command.map(|command| {
-            let needed = (command.to_mps - now.speed_mps) / duration_s;
-            needed.clamp(-command.rate_mps2, command.rate_mps2)
-        });
+    fn acceleration(
+        &self,
+        now: &CourseFollowerState,
+        lead: Option<Lead>,
+        bodies: &[LeadCandidate],
+        duration_s: f64,
+    ) -> f64 {
+        let commanded = now
+            .speed_command
+            .map(|command| command.acceleration(now.speed_mps, duration_s, bodies));
         let Some(idm) = self.idm else { return commanded.unwrap_or(0.0) };
         let lead = lead.unwrap_or(Lead { gap_m: f64::INFINITY, speed_mps: now.speed_mps });
         // During a commanded change to a lower speed, the free-road term would brake at its own rate.
@@ -212,5 +339,41 @@ impl CourseFollower {
             yaw_rate_radps,
             present: true,
         }
+    }
+}
+
+impl CourseFollowerState {
+    fn command(&mut self, command: SpeedCommand, trigger: usize) {
+        if command.to_mps > 0.0 {
+            self.free_flow_speed_mps = command.to_mps;
+        }
+        self.speed_command = Some(command);
+        self.by.speed = Some(trigger);
+    }
+
+    /// Ends the changes of a trigger.
+    fn halt(&mut self, trigger: usize) {
+        if self.by.speed == Some(trigger) {
+            self.speed_command = None;
+            self.free_flow_speed_mps = self.speed_mps.max(0.1);
+            self.by.speed = None;
+        }
+        if self.by.offset == Some(trigger) {
+            self.lateral = Lateral::at(self.lateral.offset_m());
+            self.by.offset = None;
+        }
+        if self.by.course == Some(trigger) {
+            self.by.course = None;
+        }
+    }
+}
+
+/// The time of a change of speed, in seconds.
+fn seconds(over: Over, shape: Shape, [from_mps, to_mps]: [f64; 2]) -> f64 {
+    let extent = shape.extent(to_mps - from_mps, over);
+    match over {
+        // Every shape here is symmetric, so that its mean speed is that of its ends.
+        Over::Distance(_) => 2.0 * extent / (from_mps + to_mps).max(1e-3),
+        _ => extent,
     }
 }

@@ -1,4 +1,6 @@
-//! Lateral manoeuvres of an actor on its course: from one offset to another by a quintic.
+//! Lateral manoeuvres of an actor on its course: from one offset to another by a quintic, or by a given shape.
+
+use super::script::{Over, Shape};
 
 /// The offset from the course, to the left, in metres.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -11,9 +13,42 @@ pub(super) struct Lateral {
     duration_s: f64,
     /// Offset at which the manoeuvre ends, in metres.
     target_m: f64,
+    pace: Pace,
+    /// The profile, if it is no polynomial.
+    profile: Option<Profile>,
+}
+
+/// How fast a manoeuvre runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Pace {
     /// Reference speed, in m/s: the actor's speed at the start of the manoeuvre, at least 1. At this speed or above the
     /// manoeuvre runs in real time; below it, in proportion to the speed.
-    speed_mps: f64,
+    Speed(f64),
+    /// In real time, while the actor moves.
+    Time,
+    /// Its time is the actor's way, in metres.
+    Distance,
+}
+
+/// A change of the offset by a shape.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Profile {
+    from_m: f64,
+    shape: Shape,
+}
+
+/// Slower than this, an actor does not move aside, in m/s.
+const STANDS_MPS: f64 = 1e-3;
+
+impl Pace {
+    /// Time of the manoeuvre by real time, at a speed.
+    fn rate(self, speed_mps: f64) -> f64 {
+        match self {
+            Self::Speed(reference_mps) => (speed_mps / reference_mps).min(1.0),
+            Self::Time => f64::from(u8::from(speed_mps > STANDS_MPS)),
+            Self::Distance => speed_mps,
+        }
+    }
 }
 
 impl Lateral {
@@ -24,8 +59,26 @@ impl Lateral {
             elapsed_s: 0.0,
             duration_s: 0.0,
             target_m: offset_m,
-            speed_mps: 1.0,
+            pace: Pace::Speed(1.0),
+            profile: None,
         }
+    }
+
+    /// A manoeuvre to `target_m` by a shape.
+    pub(super) fn by_profile(&self, target_m: f64, over: Over, shape: Shape) -> Self {
+        let from_m = self.offset_m();
+        let extent = shape.extent(target_m - from_m, over);
+        if extent <= 0.0 {
+            return Self::at(target_m);
+        }
+        let pace = if matches!(over, Over::Distance(_)) { Pace::Distance } else { Pace::Time };
+        let profile = Some(Profile { from_m, shape });
+        Self { duration_s: extent, target_m, pace, profile, ..Self::at(from_m) }
+    }
+
+    /// Whether a manoeuvre is under way.
+    pub(super) fn is_moving(&self) -> bool {
+        self.duration_s > 0.0
     }
 
     /// A manoeuvre to `target_m` within `duration_s` from the present offset, rate and acceleration. At its end, rate
@@ -43,15 +96,15 @@ impl Lateral {
             elapsed_s: 0.0,
             duration_s,
             target_m,
-            speed_mps: speed_mps.max(1.0),
+            pace: Pace::Speed(speed_mps.max(1.0)),
+            profile: None,
         }
     }
 
     /// The offset after `duration_s` at a mean speed. The manoeuvre slows down with the actor, so that the actor never
     /// slides sideways.
     pub(super) fn after(&self, duration_s: f64, speed_mps: f64) -> Self {
-        let pace = (speed_mps / self.speed_mps).min(1.0);
-        let elapsed_s = self.elapsed_s + pace * duration_s;
+        let elapsed_s = self.elapsed_s + self.pace.rate(speed_mps) * duration_s;
         if elapsed_s >= self.duration_s {
             return Self::at(self.target_m);
         }
@@ -65,7 +118,7 @@ impl Lateral {
 
     /// The present rate at a speed, in m/s to the left.
     pub(super) fn rate_mps(&self, speed_mps: f64) -> f64 {
-        self.derivatives()[1] * (speed_mps / self.speed_mps).min(1.0)
+        self.derivatives()[1] * self.pace.rate(speed_mps)
     }
 
     /// The offset at which the manoeuvre ends, in metres.
@@ -77,6 +130,11 @@ impl Lateral {
     fn derivatives(&self) -> [f64; 3] {
         let [a, b, c, d, e, f] = self.coefficients;
         let t = self.elapsed_s;
+        if let Some(Profile { from_m, shape }) = self.profile {
+            let [way_m, x] = [self.target_m - from_m, t / self.duration_s];
+            // A quintic that follows starts with the rate, and without acceleration.
+            return [from_m + way_m * shape.at(x), way_m * shape.slope(x) / self.duration_s, 0.0];
+        }
         [
             a + t * (b + t * (c + t * (d + t * (e + t * f)))),
             b + t * (2.0 * c + t * (3.0 * d + t * (4.0 * e + t * 5.0 * f))),

@@ -62,6 +62,55 @@ impl LeadCandidate {
         }
     }
 
+    /// Horizontal direction of its length.
+    pub(super) fn forward(&self) -> DVec3 {
+        self.forward
+    }
+
+    /// Half of its extent along a horizontal direction, in metres.
+    pub(super) fn half_extent_m(&self, axis: DVec3) -> f64 {
+        let left = DVec3::Z.cross(self.forward);
+        self.half_length_m * self.forward.dot(axis).abs() + self.half_width_m * left.dot(axis).abs()
+    }
+
+    /// The distance between two boxes in the horizontal plane, in metres; 0 if they overlap.
+    pub(super) fn gap_m(&self, other: &Self) -> f64 {
+        let inside = self.overlaps(other);
+        if inside {
+            return 0.0;
+        }
+        let corners = self.corners_m().map(|corner_m| other.distance_m(corner_m));
+        let others = other.corners_m().map(|corner_m| self.distance_m(corner_m));
+        corners.into_iter().chain(others).fold(f64::INFINITY, f64::min)
+    }
+
+    fn corners_m(&self) -> [DVec3; 4] {
+        let left = DVec3::Z.cross(self.forward);
+        [(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)].map(|(along, across)| {
+            self.center_m
+                + along * self.half_length_m * self.forward
+                + across * self.half_width_m * left
+        })
+    }
+
+    /// The distance of a point from the box in the horizontal plane, in metres.
+    fn distance_m(&self, point_m: DVec3) -> f64 {
+        let offset = point_m - self.center_m;
+        let left = DVec3::Z.cross(self.forward);
+        let along_m = (offset.dot(self.forward).abs() - self.half_length_m).max(0.0);
+        let across_m = (offset.dot(left).abs() - self.half_width_m).max(0.0);
+        along_m.hypot(across_m)
+    }
+
+    /// Whether two boxes overlap in the horizontal plane: no axis of either separates them.
+    fn overlaps(&self, other: &Self) -> bool {
+        let between = other.center_m - self.center_m;
+        let axes = [self.forward, other.forward].map(|axis| [axis, DVec3::Z.cross(axis)]);
+        axes.into_iter().flatten().all(|axis| {
+            between.dot(axis).abs() < self.half_extent_m(axis) + other.half_extent_m(axis)
+        })
+    }
+
     pub(super) fn of_ego(ego: &EgoState, ego_box: &EgoBox) -> Self {
         let pose = ego.world_from_rig;
         let ahead_m = pose.rotation * (ego_box.center_x_m * DVec3::X);

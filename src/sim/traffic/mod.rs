@@ -7,10 +7,11 @@
 //! | `follow`, `course`, `lateral` | actors on a course, with changes of offset |
 //! | `idm`, `lead` | the Intelligent Driver Model, and what an actor follows |
 //! | `attack` | actors that plan their way towards the ego |
-//! | `script` | conditions and actions |
+//! | `script`, `condition` | conditions and actions, and the values of conditions |
 //! | `state` | the states of actors and ego, as contacts and renderer read them |
 
 pub mod attack;
+mod condition;
 mod course;
 mod follow;
 mod idm;
@@ -25,7 +26,10 @@ pub use attack::Attack;
 pub use course::{Course, CourseFootPoint};
 pub use follow::CourseFollower;
 pub use idm::{Idm, rolled};
-pub use script::{Action, After, Condition, Near, Trigger};
+pub use script::{
+    Action, After, Body, Condition, Edge, Measure, Near, Other, Over, Phase, Quantity, Shape,
+    Trigger,
+};
 pub use state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 pub use track::{Track, TrackError, TrackKeyframe, Tracked};
 pub use world::{Actor, Behaviour, EgoMotion, Traffic, World};

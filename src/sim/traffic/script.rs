@@ -10,7 +10,7 @@ pub struct Trigger {
 }
 
 /// Parts of a condition; one without parts holds at once.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Condition {
     /// At this time or later, in microseconds since the episode's start.
     pub time_us: Option<i64>,
@@ -26,8 +26,31 @@ pub struct Condition {
     pub speed_below_mps: Option<f64>,
     /// The ego is at least this fast, in m/s.
     pub ego_speed_above_mps: Option<f64>,
-    /// Another trigger fired at least [`After::delay_us`] ago.
+    /// Another trigger fired at least [`After::delay_us`] ago. The parts below are evaluated only from then on.
     pub after: Option<After>,
+    /// A measured value is within bounds.
+    pub measure: Option<Measure>,
+    /// All of these hold.
+    pub all: Vec<Condition>,
+    /// One of these holds, if there are any.
+    pub any: Vec<Condition>,
+    /// The parts have held for this time without a break, in microseconds.
+    pub held_us: i64,
+    /// The condition holds only at the instant at which the parts begin to hold, or cease to hold.
+    pub edge: Option<Edge>,
+    /// The condition holds this much later than its parts and its edge, in microseconds.
+    pub later_us: i64,
+}
+
+/// An instant at which the value of a condition changes. The first evaluation is no change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Edge {
+    /// From false to true.
+    Rising,
+    /// From true to false.
+    Falling,
+    /// Either.
+    Both,
 }
 
 /// A distance to something.
@@ -46,8 +69,22 @@ pub struct After {
     pub actor: usize,
     /// Index within the actor's script.
     pub trigger: usize,
+    /// What has happened.
+    pub phase: Phase,
     /// Time since then, in microseconds.
     pub delay_us: i64,
+}
+
+/// What has happened to a trigger.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Phase {
+    /// It fired.
+    #[default]
+    Fired,
+    /// Its actions have reached their aims.
+    Done,
+    /// Its actions have reached their aims, or others have replaced them.
+    Ended,
 }
 
 /// An action of an actor.
@@ -60,6 +97,24 @@ pub enum Action {
         /// By at most this much per second, in m/s².
         rate_mps2: f64,
     },
+    /// Changes its speed by a profile, whatever the acceleration.
+    SpeedProfile {
+        /// To this speed, in m/s.
+        to_mps: f64,
+        /// Within this time or distance, or at this rate.
+        over: Over,
+        /// The course of the speed over time.
+        shape: Shape,
+    },
+    /// Drives as fast as another body, until another action changes the speed.
+    SpeedMatch {
+        /// Index of the actor; `None` for the ego.
+        of: Option<usize>,
+        /// Share of its speed.
+        factor: f64,
+        /// Added to it, in m/s.
+        delta_mps: f64,
+    },
     /// Changes its offset from the course.
     Offset {
         /// To this offset, in metres to the left.
@@ -67,13 +122,154 @@ pub enum Action {
         /// Within this time at its present speed, in seconds.
         over_s: f64,
     },
+    /// Changes its offset from the course by a profile.
+    OffsetProfile {
+        /// To this offset, in metres to the left.
+        to_m: f64,
+        /// Within this time or distance, or at this rate.
+        over: Over,
+        /// The course of the offset.
+        shape: Shape,
+    },
     /// Continues on another course, at the place nearest to where it is.
     Course {
         /// Index of the course among those of the actor.
         course: usize,
+        /// Station of the course at which the action is done, in metres; at once without it.
+        done_m: Option<f64>,
+        /// Station to which the actor is put, in metres; without it, it stays where it is.
+        at_m: Option<f64>,
+    },
+    /// Ends the changes of speed and offset of a trigger of this actor: both keep their present values.
+    Halt {
+        /// Index within the actor's script.
+        trigger: usize,
     },
     /// Appears.
     Spawn,
     /// Disappears.
     Remove,
+}
+
+/// The extent of a change.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Over {
+    /// Within this time, in seconds.
+    Time(f64),
+    /// Within this distance along the course, in metres.
+    Distance(f64),
+    /// With this largest rate: m/s² for a speed, m/s for an offset.
+    Rate(f64),
+    /// With this largest second derivative: m/s² for an offset.
+    Acceleration(f64),
+}
+
+/// The course of a value from its start to its aim, over an extent of 1.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Shape {
+    /// At once.
+    Step,
+    /// At a constant rate.
+    Linear,
+    /// A half wave: `(1 - cos πx) / 2`.
+    Sinusoidal,
+    /// `3x² - 2x³`.
+    Cubic,
+}
+
+impl Shape {
+    /// The share of the change at a share of the extent.
+    pub(super) fn at(self, x: f64) -> f64 {
+        let x = x.clamp(0.0, 1.0);
+        match self {
+            Self::Step => 1.0,
+            Self::Linear => x,
+            Self::Sinusoidal => 0.5 - 0.5 * (std::f64::consts::PI * x).cos(),
+            Self::Cubic => x * x * (3.0 - 2.0 * x),
+        }
+    }
+
+    /// The derivative of [`Self::at`].
+    pub(super) fn slope(self, x: f64) -> f64 {
+        use std::f64::consts::PI;
+        match self {
+            _ if !(0.0..=1.0).contains(&x) => 0.0,
+            Self::Step => 0.0,
+            Self::Linear => 1.0,
+            Self::Sinusoidal => 0.5 * PI * (PI * x).sin(),
+            Self::Cubic => 6.0 * x * (1.0 - x),
+        }
+    }
+
+    /// The extent of a change: in metres for [`Over::Distance`], otherwise in seconds.
+    pub(super) fn extent(self, change: f64, over: Over) -> f64 {
+        use std::f64::consts::PI;
+        let change = change.abs();
+        match (over, self) {
+            (_, Self::Step) => 0.0,
+            (Over::Time(extent) | Over::Distance(extent), _) => extent,
+            (Over::Rate(rate), Self::Linear) => change / rate,
+            (Over::Rate(rate), Self::Sinusoidal) => 0.5 * PI * change / rate,
+            (Over::Rate(rate), Self::Cubic) => 1.5 * change / rate,
+            // A linear change has no bounded acceleration: as long as a cubic one.
+            (Over::Acceleration(most), Self::Linear | Self::Cubic) => (6.0 * change / most).sqrt(),
+            (Over::Acceleration(most), Self::Sinusoidal) => PI * (change / (2.0 * most)).sqrt(),
+        }
+    }
+}
+
+/// A value of the traffic, with its bounds.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Measure {
+    /// What is measured.
+    pub quantity: Quantity,
+    /// Whose.
+    pub of: Body,
+    /// At least this.
+    pub above: Option<f64>,
+    /// At most this.
+    pub below: Option<f64>,
+}
+
+/// What is measured.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Quantity {
+    /// The speed, in m/s.
+    Speed,
+    /// The distance driven since the episode's start, in metres.
+    Travelled,
+    /// The distance from a point in the world, in metres.
+    Point(glam::DVec3),
+    /// The distance from another body, in metres.
+    Distance(Other),
+    /// The distance along the heading, in metres, without a sign.
+    Longitudinal(Other),
+    /// The distance across the heading, in metres, without a sign.
+    Lateral(Other),
+    /// The distance along the heading by the speed, in seconds.
+    Headway(Other),
+    /// The distance by the rate at which it becomes less, in seconds; endless if it does not.
+    TimeToCollision(Other),
+}
+
+/// The other body of a distance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Other {
+    /// Whose.
+    pub to: Body,
+    /// Whether the distance is between the boxes; otherwise it is between the reference points.
+    pub is_free: bool,
+    /// Whether the distance along is that of the own course; otherwise it is along the heading of the first body.
+    pub is_on_course: bool,
+    /// Whether a headway is by the straight distance.
+    pub is_straight: bool,
+}
+
+/// An actor or the ego, with its reference point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Body {
+    /// Index of the actor; `None` for the ego.
+    pub actor: Option<usize>,
+    /// From the middle of the box forward to the reference point, in metres.
+    pub ahead_m: f64,
 }

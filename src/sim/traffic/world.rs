@@ -12,10 +12,11 @@ use wildcity_scene::geometry::Pose;
 use wildcity_scene::random::Random;
 
 use super::attack::{self, Attack, Spline};
+use super::condition::{ConditionState, Measures};
 use super::course::turned_rad;
 use super::follow::{CourseFollower, CourseFollowerState};
 use super::lead::LeadCandidate;
-use super::script::{Action, After, Condition, Near, Trigger};
+use super::script::{Action, After, Condition, Near, Phase, Trigger};
 use super::state::{ActorSpec, ActorState, EgoBox, EgoState, SubStep};
 use super::track::Track;
 use crate::limits;
@@ -82,6 +83,8 @@ pub struct World {
     time_us: i64,
     states: Vec<ActorState>,
     progress: Vec<ActorProgress>,
+    /// The distances driven since the start: by the ego, then by each actor, in metres.
+    travelled_m: Vec<f64>,
 }
 
 /// The progress of one actor's behaviour and script.
@@ -90,8 +93,21 @@ struct ActorProgress {
     /// Whether the actor is in the world. Its track may be absent at this time nevertheless.
     spawned: bool,
     behaviour: BehaviourState,
-    /// When each trigger of its script fired, in microseconds.
-    fired_us: Vec<Option<i64>>,
+    /// What has happened to each trigger of its script.
+    fired: Vec<FiredTrigger>,
+}
+
+/// What has happened to a trigger.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct FiredTrigger {
+    /// The values of its condition.
+    condition: ConditionState,
+    /// When it fired, in microseconds.
+    fired_us: Option<i64>,
+    /// When all its actions had ended, in microseconds.
+    ended_us: Option<i64>,
+    /// Whether another trigger replaced one of them.
+    is_replaced: bool,
 }
 
 #[derive(Clone, Debug, PartialEq)]
@@ -121,7 +137,8 @@ impl World {
                 false => absent(index),
             })
             .collect();
-        Self { traffic, time_us: 0, states, progress }
+        let travelled_m = vec![0.0; progress.len() + 1];
+        Self { traffic, time_us: 0, states, progress, travelled_m }
     }
 
     /// The actors as they were set up.
@@ -154,7 +171,18 @@ impl World {
 
     /// When a trigger fired, in microseconds; `None` if it has not.
     pub fn fired_us(&self, actor: usize, trigger: usize) -> Option<i64> {
-        *self.progress.get(actor)?.fired_us.get(trigger)?
+        self.progress.get(actor)?.fired.get(trigger)?.fired_us
+    }
+
+    /// When the actions of a trigger had ended, in microseconds; `None` before. `Phase::Done` leaves out those that
+    /// another trigger replaced.
+    pub fn ended_us(&self, actor: usize, trigger: usize, phase: Phase) -> Option<i64> {
+        let fired = self.progress.get(actor)?.fired.get(trigger)?;
+        match phase {
+            Phase::Fired => fired.fired_us,
+            Phase::Done => fired.ended_us.filter(|_| !fired.is_replaced),
+            Phase::Ended => fired.ended_us,
+        }
     }
 
     /// Advances all actors by `dt_us` microseconds, above 0, in which the ego moves as given. Calls `each` after
@@ -170,6 +198,8 @@ impl World {
             self.fire(&traffic, &ego_now, &bodies);
             let before = std::mem::take(&mut self.states);
             let after = self.advance_actors(&traffic, &before, &bodies, sub_end_us);
+            self.note_ends(sub_end_us);
+            self.travel([&ego_now, &ego_next], &before, &after);
             each(&SubStep {
                 begin_us: sub_begin_us,
                 end_us: sub_end_us,
@@ -197,17 +227,70 @@ impl World {
         let mut firing: Vec<(usize, usize)> = Vec::new();
         for (index, actor) in traffic.actors.iter().enumerate() {
             for (at, trigger) in actor.script.iter().enumerate() {
-                let waits = self.progress[index].fired_us[at].is_none();
-                if waits && self.holds(traffic, index, &trigger.when, ego, bodies) {
+                let waits = self.progress[index].fired[at].fired_us.is_none();
+                if waits && self.is_due(traffic, [index, at], &trigger.when, ego, bodies) {
                     firing.push((index, at));
                 }
             }
         }
         for (index, at) in firing {
             let actor = &traffic.actors[index];
-            self.progress[index].fired_us[at] = Some(self.time_us);
+            self.progress[index].fired[at].fired_us = Some(self.time_us);
             for action in &actor.script[at].then {
-                self.progress[index].apply_action(actor, *action);
+                self.progress[index].apply_action(actor, *action, at);
+            }
+        }
+    }
+
+    /// Whether a trigger that has not fired fires now.
+    fn is_due(
+        &mut self,
+        traffic: &Traffic,
+        [index, at]: [usize; 2],
+        when: &Condition,
+        ego: &EgoState,
+        bodies: &[LeadCandidate],
+    ) -> bool {
+        // Edges and delays count from then on.
+        if !when.after.is_none_or(|after| self.is_after(after)) {
+            return false;
+        }
+        let mut state = std::mem::take(&mut self.progress[index].fired[at].condition);
+        let own = |part: &Condition| self.holds(traffic, index, part, ego, bodies);
+        let value = state.value(when, self.time_us, &own);
+        self.progress[index].fired[at].condition = state;
+        value
+    }
+
+    fn is_after(&self, after: After) -> bool {
+        let since_us = self.ended_us(after.actor, after.trigger, after.phase);
+        since_us.is_some_and(|since_us| self.time_us >= since_us.saturating_add(after.delay_us))
+    }
+
+    /// Notes the triggers all of whose actions have ended.
+    fn note_ends(&mut self, time_us: i64) {
+        for progress in &mut self.progress {
+            let by = match &progress.behaviour {
+                BehaviourState::Follow(now) if progress.spawned => now.by,
+                _ => Default::default(),
+            };
+            for (at, fired) in progress.fired.iter_mut().enumerate() {
+                let is_new = fired.fired_us.is_some() && fired.ended_us.is_none();
+                if is_new && !by.has(at) {
+                    fired.ended_us = Some(time_us);
+                }
+            }
+        }
+    }
+
+    /// Adds the ways of a sub-step.
+    fn travel(&mut self, ego: [&EgoState; 2], before: &[ActorState], after: &[ActorState]) {
+        let [from, to] = ego.map(|ego| ego.world_from_rig.position_m);
+        self.travelled_m[0] += from.distance(to);
+        for (index, (from, to)) in before.iter().zip(after).enumerate() {
+            if from.present && to.present {
+                let [from, to] = [from, to].map(|state| state.world_from_actor.position_m);
+                self.travelled_m[index + 1] += from.distance(to);
             }
         }
     }
@@ -253,15 +336,17 @@ impl World {
             };
             other_m.is_some_and(|other_m| other_m.distance(own_m) <= near.within_m)
         };
-        let after = |after: After| {
-            let fired_us = self.fired_us(after.actor, after.trigger);
-            fired_us.is_some_and(|fired_us| self.time_us >= fired_us.saturating_add(after.delay_us))
+        let course = match (&traffic.actors[index].behaviour, &progress.behaviour) {
+            (Behaviour::Follow(follow), BehaviourState::Follow(now)) => Some(follow.course(now)),
+            _ => None,
         };
+        let measures = Measures { bodies, travelled_m: &self.travelled_m, course };
         when.time_us.is_none_or(|time_us| self.time_us >= time_us)
             && when.speed_above_mps.is_none_or(|least| state.present && speed_mps >= least)
             && when.speed_below_mps.is_none_or(|most| state.present && speed_mps <= most)
             && when.ego_speed_above_mps.is_none_or(|least| ego.velocity_mps.length() >= least)
-            && when.after.is_none_or(after)
+            && when.after.is_none_or(|after| self.is_after(after))
+            && when.measure.is_none_or(|measure| measures.holds(&measure))
             && when.near.is_none_or(near)
             && when.station_m.is_none_or(|least_m| station_m() >= least_m)
             && when.ego_station_m.is_none_or(|least_m| ego_station_m() >= least_m)
@@ -374,16 +459,22 @@ impl ActorProgress {
                 })
             }
         };
-        Self { spawned: actor.present, behaviour, fired_us: vec![None; actor.script.len()] }
+        let fired = vec![FiredTrigger::default(); actor.script.len()];
+        Self { spawned: actor.present, behaviour, fired }
     }
 
-    /// Carries out an action of the actor's script.
-    fn apply_action(&mut self, actor: &Actor, action: Action) {
+    /// Carries out an action of a trigger of the actor's script.
+    fn apply_action(&mut self, actor: &Actor, action: Action, trigger: usize) {
         match (action, &actor.behaviour, &mut self.behaviour) {
             (Action::Spawn, ..) => self.spawned = true,
             (Action::Remove, ..) => self.spawned = false,
             (_, Behaviour::Follow(follow), BehaviourState::Follow(now)) => {
-                *now = follow.with_action(now, action)
+                let before = now.by;
+                *now = follow.with_action(now, action, trigger);
+                let lost = (0..self.fired.len()).filter(|at| before.has(*at) && *at != trigger);
+                for at in lost {
+                    self.fired[at].is_replaced |= before.loses(&now.by, at);
+                }
             }
             // The scenario's check refuses such scripts.
             _ => {}

@@ -11,8 +11,8 @@ use wildcity_scene::{ActorBox, ActorClass};
 use wildcity_sim::Ground;
 use wildcity_sim::traffic::{
     Action, Actor, ActorSpec, ActorState, After, Attack, Behaviour, Condition, Course,
-    CourseFollower, EgoBox, EgoMotion, EgoState, Idm, Near, Track, TrackKeyframe, Traffic, Trigger,
-    World,
+    CourseFollower, EgoBox, EgoMotion, EgoState, Idm, Near, Phase, Track, TrackKeyframe, Traffic,
+    Trigger, World,
 };
 
 use crate::vectors::{assert_near, cases, number};
@@ -167,7 +167,7 @@ fn triggers_fire_once_and_in_turn() {
     };
     let go = Trigger {
         when: Condition {
-            after: Some(After { actor: 0, trigger: 0, delay_us: 3_000_000 }),
+            after: Some(After { actor: 0, trigger: 0, phase: Phase::Fired, delay_us: 3_000_000 }),
             speed_below_mps: Some(0.0),
             ..Condition::default()
         },

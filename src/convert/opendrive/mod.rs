@@ -1,12 +1,16 @@
 //! Maps from OpenDRIVE.
 //!
 //! The crate xodr computes the lanes' centre lines and widths in the file's own axes, in f32: 1 mm at 16 km from the
-//! origin. A map that reaches beyond is refused.
+//! origin. A map that reaches beyond is refused, unless it is moved to an origin of its own first.
+
+mod frame;
 
 use glam::DVec3;
-use xodr::{Direction, LaneType, RoadNetwork, SpeedLimit};
-
+use wildcity_scene::geo::GeoAnchor;
 use wildcity_sim::map::{Area, AreaKind, Lane, LaneKind, MapFile};
+use xodr::{
+    Direction, LanePosition, LaneType, Point, RoadId, RoadNetwork, RoadPosition, SpeedLimit,
+};
 
 use crate::{ConvertError, text_of};
 
@@ -21,19 +25,38 @@ const NARROW_M: f32 = 0.05;
 pub struct Imported {
     /// The map.
     pub map: MapFile,
+    /// The place of the origin on the earth, if the file says it.
+    pub geo: Option<GeoAnchor>,
     /// Messages for people.
     pub warnings: Vec<String>,
 }
 
-/// Reads an OpenDRIVE file.
+/// A road network near the origin, and what is known about it.
+pub(crate) struct Roads {
+    /// The roads and lanes.
+    pub(crate) network: RoadNetwork,
+    geo: Option<GeoAnchor>,
+    warnings: Vec<String>,
+}
+
+/// Reads the roads of an OpenDRIVE file, with the place of `origin` as the origin.
+pub(crate) fn roads_of(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Roads, ConvertError> {
+    let framed = frame::framed(text_of(bytes)?, origin)?;
+    let (network, provenance) = xodr::load_str_with_provenance(&framed.text)
+        .map_err(|error| ConvertError::new("OpenDRIVE", error.to_string()))?;
+    let mut warnings = framed.notes;
+    warnings.extend(provenance.warnings.iter().map(ToString::to_string));
+    Ok(Roads { network, geo: framed.geo, warnings })
+}
+
+/// Reads an OpenDRIVE file. `origin` is the easting and the northing of the map's origin in the projection of the file;
+/// without it, the origin is that of the file, or the offset of the file's header is added where only that brings the
+/// roads near it.
 ///
 /// # Errors
 /// It is not OpenDRIVE, has no lanes, or reaches beyond [`FARTHEST_M`].
-pub fn read(bytes: &[u8]) -> Result<Imported, ConvertError> {
-    let text = text_of(bytes)?;
-    let (network, provenance) = xodr::load_str_with_provenance(text)
-        .map_err(|error| ConvertError::new("OpenDRIVE", error.to_string()))?;
-    let warnings = provenance.warnings.iter().map(ToString::to_string).collect();
+pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Imported, ConvertError> {
+    let Roads { network, geo, warnings } = roads_of(bytes, origin)?;
     let mut lanes = Vec::new();
     for lane in network.lanes() {
         if let Some(lane) = lane_of(&network, lane)? {
@@ -56,7 +79,7 @@ pub fn read(bytes: &[u8]) -> Result<Imported, ConvertError> {
     });
     let map = MapFile::of(lanes, areas.collect());
     map.check().map_err(|error| ConvertError::new(error.path, error.message))?;
-    Ok(Imported { map, warnings })
+    Ok(Imported { map, geo, warnings })
 }
 
 fn lane_of(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, ConvertError> {
@@ -77,23 +100,24 @@ fn lane_of(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, Con
         let is_near = [point.x, point.y, point.z].iter().all(|axis| axis.abs() <= FARTHEST_M);
         if !is_near {
             let message = format!(
-                "reaches ({:?}, {:?}); at most {FARTHEST_M} m from the origin is exact: move the map with its \
-                 header's offset",
+                "reaches ({:?}, {:?}); at most {FARTHEST_M} m from the origin is exact: choose another --origin, or a \
+                 part of the map",
                 point.x, point.y
             );
             return Err(ConvertError::new(format!("lane {id}"), message));
         }
         let middle = DVec3::from_array(array(*point));
-        let tangent = tangents.get(at).map_or(DVec3::X, |tangent| {
-            DVec3::new(f64::from(tangent.x), f64::from(tangent.y), 0.0).normalize_or_zero()
+        let left_m = across_lane(network, lane, *point).unwrap_or_else(|| {
+            let tangent = tangents.get(at).copied().unwrap_or_default();
+            DVec3::new(-f64::from(tangent.y), f64::from(tangent.x), 0.0).normalize_or_zero()
         });
-        let aside_m = DVec3::new(-tangent.y, tangent.x, 0.0) * f64::from(width_m(at)) * 0.5;
-        // The edge that superelevation raises.
-        let raised_m =
-            f64::from(lane.bank.get(at).copied().unwrap_or(0.0)).tan() * aside_m.length();
+        // Half of the width along the bank, across the road.
+        let half_m = 0.5 * f64::from(width_m(at));
+        let bank_rad = f64::from(lane.bank.get(at).or(lane.bank.last()).copied().unwrap_or(0.0));
+        let aside_m = half_m * (bank_rad.cos() * left_m + bank_rad.sin() * DVec3::Z);
         center.push(middle.to_array());
-        left.push((middle + aside_m + raised_m * DVec3::Z).to_array());
-        right.push((middle - aside_m - raised_m * DVec3::Z).to_array());
+        left.push((middle + aside_m).to_array());
+        right.push((middle - aside_m).to_array());
     }
     if lane.direction == Direction::Backward {
         center.reverse();
@@ -109,6 +133,30 @@ fn lane_of(network: &RoadNetwork, lane: &xodr::Lane) -> Result<Option<Lane>, Con
     let intersection = road.is_some_and(|road| road.junction().is_some());
     let next = lane.successors.iter().filter_map(|next| id_of(network, *next)).collect();
     Ok(Some(Lane { id, kind, center, left, right, next, intersection, limit_mps }))
+}
+
+/// The horizontal direction across the road to its left, at a point of the lane's middle: lanes are cut across the road,
+/// also where they become wider and their middle is no parallel to the road.
+fn across_lane(network: &RoadNetwork, lane: &xodr::Lane, point: Point) -> Option<DVec3> {
+    let road = network.road_lane(lane.id)?.road;
+    let at = network.road_position_on(road, point)?;
+    // On a road that crosses itself, the nearest place may be another one.
+    let found = network.lane_point(LanePosition { lane: lane.id, s: at.s, offset: 0.0 })?;
+    if found.distance_to(point) > 0.01 {
+        return None;
+    }
+    across_road(network, road, at.s)
+}
+
+/// The horizontal direction across a road to its left.
+pub(crate) fn across_road(network: &RoadNetwork, road: RoadId, s: f64) -> Option<DVec3> {
+    /// Far enough apart that rounding to f32 does not matter.
+    const ASIDE_M: f64 = 10.0;
+    let [left, right] =
+        [ASIDE_M, -ASIDE_M].map(|t| network.road_point(RoadPosition { road, s, t }));
+    let across = left? - right?;
+    let across = DVec3::new(f64::from(across.x), f64::from(across.y), 0.0);
+    (across.length() > ASIDE_M).then(|| across.normalize())
 }
 
 /// `ROAD/SECTION/LANE`, as the file numbers them.
@@ -133,6 +181,6 @@ fn kind_of(kind: LaneType) -> Option<LaneKind> {
     }
 }
 
-fn array(point: xodr::Point) -> [f64; 3] {
+pub(crate) fn array(point: Point) -> [f64; 3] {
     [point.x, point.y, point.z].map(f64::from)
 }
