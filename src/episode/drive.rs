@@ -30,13 +30,19 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
         Event::Contact(event) => Some(event.contact(line.time_us)),
         _ => None,
     });
-    let with_twin = episode.events.iter().filter_map(|line| match line.event {
-        Event::StaticContact { impact_mps, .. } => {
-            Some(StaticContact { time_us: line.time_us, impact_mps })
-        }
-        _ => None,
-    });
-    let checks_static = scenario.is_some_and(|scenario| scenario.checks_static);
+    let with_twin: Vec<StaticContact> = episode
+        .events
+        .iter()
+        .filter_map(|line| match line.event {
+            Event::StaticContact { impact_mps, .. } => {
+                Some(StaticContact { time_us: line.time_us, impact_mps })
+            }
+            _ => None,
+        })
+        .collect();
+    // A record without a scenario does not say whether contact with the twin was looked for; a contact says it.
+    let checks_static =
+        scenario.is_some_and(|scenario| scenario.checks_static) || !with_twin.is_empty();
     Some(DriveRecord {
         dt_us: episode.header.dt_us,
         shape: scenario.map(|scenario| EgoShape {
@@ -49,7 +55,7 @@ pub fn drive_record(episode: &EpisodeFile) -> Option<DriveRecord> {
         tracks: scenario.map(|scenario| tracks(scenario, &episode.actors, &steps)),
         plans: plans(&frames),
         contacts: contacts.collect(),
-        static_contacts: checks_static.then(|| with_twin.collect()),
+        static_contacts: checks_static.then_some(with_twin),
         reference: scenario.and_then(reference),
         limit_us: scenario.and_then(|scenario| scenario.limit_us),
         map: scenario.and_then(lanes),

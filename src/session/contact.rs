@@ -95,7 +95,8 @@ impl TwinSolids {
     /// The contacts that begin while the ego goes from one state through others, step by step. Each step takes `dt_us`, and
     /// the first begins at `begin_us`. Blocks while it reads what is near.
     ///
-    /// What the ego overlaps already at the beginning is not a new contact.
+    /// What the ego overlaps already at the beginning, as at the start of an episode or after a switch of the version, is
+    /// not a new contact before it has left it.
     ///
     /// # Errors
     /// The twin cannot be read.
@@ -143,7 +144,7 @@ impl TwinSolids {
         mut touched: bool,
         mut visit: impl FnMut(Met),
     ) -> Result<bool, StoreError> {
-        if motion.mean_speed_mps(dt_us) > MAX_SWEPT_SPEED_MPS {
+        if !motion.smooth && motion.mean_speed_mps(dt_us) > MAX_SWEPT_SPEED_MPS {
             // Of a jump only the end is tested, and whatever is met there is new.
             let state = motion.to;
             let area_m2 = self.contact_m2(near, &state.world_from_rig)?;
@@ -243,13 +244,14 @@ impl TwinSolids {
             return Ok(solids.clone());
         }
         let (chunk, section) = self.index.section(id);
-        let solids = match self.blocks.get(&section.hash) {
+        let key = (section.hash, chunk.origin_m.to_array().map(f64::to_bits));
+        let solids = match self.blocks.get(&key) {
             Some(solids) => solids,
             None => {
                 let read = self.catalog.section(self.index.version(), chunk, section)?;
                 let solid = (0..read.len()).filter_map(|index| solid_point(&read, index));
                 let solids = Arc::new(Solids::new(solid));
-                self.blocks.insert(section.hash, solids.clone());
+                self.blocks.insert(key, solids.clone());
                 solids
             }
         };

@@ -350,8 +350,9 @@ impl Episode {
             || matches!(outcome, Outcome::Completed | Outcome::OffModel | Outcome::DrivingFailure);
         // A replay does not evaluate the rules of the scenario. It takes the outcome from the record.
         let failed = self.failed || outcome == Outcome::DrivingFailure;
-        let off_model =
-            self.off_model || least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
+        // An ego that fails first has not left the area, whatever its images show afterwards.
+        let has_low_trust = least_trust.is_some_and(|trust| trust < limits::OFF_MODEL_TRUST);
+        let off_model = self.off_model || (has_low_trust && !failed);
         let outcome = match (completed, off_model, failed) {
             (true, true, _) => Outcome::OffModel,
             (true, false, true) => Outcome::DrivingFailure,
@@ -365,6 +366,11 @@ impl Episode {
             distance_m: self.distance_m,
             least_trust,
         }
+    }
+
+    /// Whether a rule ended it because the ego failed.
+    pub(crate) fn is_failed(&self) -> bool {
+        self.failed
     }
 
     /// Whether the ego has left the area that the twin was trained on.

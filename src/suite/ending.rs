@@ -40,7 +40,10 @@ impl Ending {
         let counts = &result.counts;
         let has_failed = counts.failed > 0;
         let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
-        let is_unjudged = counts.not_judged > 0 || (counts.off_model > 0 && !accepts_off_model);
+        // Without any verdict, nothing was tested, whatever is accepted.
+        let is_unjudged = counts.not_judged > 0
+            || (counts.off_model > 0 && !accepts_off_model)
+            || result.pass_rate.runs == 0;
         let low = result.pass_rate.interval[0];
         let rate_is_low = result.at_least.is_some_and(|least| low < least);
         let is_worse = matches!(against, Some(Ok(comparison)) if comparison.worse);
@@ -82,7 +85,7 @@ fn counted(result: &SuiteResult) -> String {
         return format!("all {} episodes passed", counts.episodes);
     }
     format!(
-        "of {} episodes {} were not judged, {} left the trained area, {} failed, {} were not driven",
+        "of {} episodes: {} not_judged, {} off_model, {} failed, {} technical",
         counts.episodes, counts.not_judged, counts.off_model, counts.failed, counts.technical
     )
 }

@@ -4,15 +4,19 @@ use std::fmt::Write as _;
 
 use crate::ending::Ending;
 use crate::entry::{EpisodeEntry, Status, TechnicalEntry};
+use crate::file::OFF_MODEL;
 use crate::result::SuiteResult;
 
-/// The result as JUnit XML: `failure` is driving, `error` technical, `skipped` off the model or not judged.
+/// The result as JUnit XML: `failure` is driving; `error` technical, or an episode without a verdict, since a skipped test
+/// counts as a good one; `skipped` an episode that left the trained area where the suite accepts this.
 ///
 /// A failed episode is a `failure` even if the run passes. The properties of the suite have the exit code and its
 /// reason.
 pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
     let counts = &result.counts;
-    let skipped = counts.off_model + counts.not_judged;
+    let accepts_off_model = result.accept_unjudged.iter().any(|name| name == OFF_MODEL);
+    let skipped = if accepts_off_model { counts.off_model } else { 0 };
+    let errors = counts.technical + counts.not_judged + counts.off_model - skipped;
     let mut text = String::from("<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n");
     // Writing into a text cannot fail.
     let _ = writeln!(
@@ -21,7 +25,7 @@ pub fn junit(result: &SuiteResult, ending: &Ending) -> String {
         escaped(&result.suite),
         counts.episodes,
         counts.failed,
-        counts.technical,
+        errors,
     );
     text.push_str("  <properties>\n");
     let at_least = result.at_least.map(|least| least.to_string());
@@ -61,11 +65,18 @@ fn case(text: &mut String, result: &SuiteResult, episode: &EpisodeEntry) {
         }
         Status::OffModel => {
             let message = "left the trained area of the twin before any fault";
-            format!("<skipped message=\"{message}\"/>")
+            if result.accept_unjudged.iter().any(|name| name == OFF_MODEL) {
+                format!("<skipped message=\"{message}\"/>")
+            } else {
+                element("error", "off_model", message, message)
+            }
         }
-        Status::NotJudged => {
-            format!("<skipped message=\"{}\"/>", escaped(&episode.not_judged.join("; ")))
-        }
+        Status::NotJudged => element(
+            "error",
+            "not_judged",
+            &episode.not_judged.join("; "),
+            &episode.not_judged.join("\n"),
+        ),
         Status::Technical => {
             let last = episode.errors.last();
             let kind = last.map_or("server_error", |error| &error.kind);

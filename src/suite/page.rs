@@ -39,8 +39,8 @@ fn outcome(result: &SuiteResult, ending: &Ending) -> Markup {
     let counts = &result.counts;
     html! {
         p {
-            (counts.episodes) " episodes: " (counts.not_judged) " not judged, " (counts.off_model)
-            " left the trained area, " (counts.failed) " failed, " (counts.passed) " passed, "
+            (counts.episodes) " episodes: " (counts.not_judged) " not_judged, " (counts.off_model)
+            " off_model, " (counts.failed) " failed, " (counts.passed) " passed, "
             (counts.technical) " not driven for technical reasons."
         }
         p { "Pass rate: " (rate(&result.pass_rate)) "." }
@@ -58,8 +58,7 @@ fn unjudged(result: &SuiteResult) -> Markup {
     html! {
         @if !episodes.is_empty() {
             h2 { "Without a verdict" }
-            p { "These episodes are no passes. A suite that accepts a criterion which cannot be judged names it in "
-                code { "accept_unjudged" } "." }
+            p { "These episodes neither passed nor failed." }
             table {
                 tr { th { "episode" } th { "result" } th { "why" } }
                 @for episode in episodes {

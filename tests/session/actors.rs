@@ -286,8 +286,13 @@ async fn a_default_asset_has_the_class_and_about_the_size_of_its_actor() {
         actor("pedestrian", "pedestrian", [0.6, 0.6, 1.6], 40.0),
         actor("bicycle", "bicycle", [1.7, 0.6, 1.7], 50.0),
         actor("crate", "object", [0.5, 0.5, 0.8], 60.0),
+        json!({"name": "sedan", "stand": {"xyz": [20, 70, 0], "yaw_rad": 0}}),
     ]);
-    let session = open(&bench, "all", options(&all, true)).await;
+    let mut session = open(&bench, "all", options(&all, true)).await;
+    // A reset takes the assets of the first episode. Boxes stay as they are, also that of an actor without a size.
+    let before = session.traffic().unwrap().specs().to_vec();
+    session.reset(1, None).await.unwrap();
+    assert_eq!(session.traffic().unwrap().specs(), before);
     for actor in session.traffic().unwrap().specs() {
         let asset = demo().catalog().find_actor(actor.asset.as_ref().unwrap()).unwrap();
         let wanted = if actor.name == "small" { "hatchback" } else { &actor.name };

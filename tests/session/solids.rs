@@ -9,9 +9,9 @@ use wildcity_scene::manifest::Provenance;
 use wildcity_scene::trajectory::{Keyframe, Trajectory};
 use wildcity_session::{
     ContactMode, Encoding, EpisodeSummary, Event, EventKind, Outcome, Outputs, RigChoice,
-    ScenarioOptions, ScenarioSource, Session, SessionOptions, Start,
+    ScenarioOptions, ScenarioSource, Session, SessionOptions, Start, StepOptions,
 };
-use wildcity_sim::ego::Action;
+use wildcity_sim::ego::{Action, Path, TimedPose};
 use wildcity_sim::scenario::EndReason;
 use wildcity_sim::{Command, Dynamics, EgoModel};
 use wildcity_twin::residency::Cache;
@@ -300,4 +300,34 @@ async fn a_scenario_decides_what_a_contact_does() {
         panic!("two rules")
     };
     assert!(refused.to_string().contains("end.contact"), "{refused}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn events_of_a_plan_are_in_order_and_a_contact_comes_before_what_follows_it() {
+    let (_dir, catalog) = walled();
+    let bench = bench(Cache::new(catalog));
+    // Into the wall and on, far from the drive: a contact, and then off the trained area, in one request.
+    let path = |name: &'static str, aside_m: [f64; 2]| {
+        let bench = &bench;
+        async move {
+            let end = Some(ContactMode::End);
+            let mut session = plain(bench, name, Dynamics::default(), end).await;
+            session.step(at(10.0), false).await.unwrap();
+            let pose = |time_us: i64, y_m: f64| TimedPose {
+                time_us,
+                start_from_rig: Pose { position_m: DVec3::new(15.0, y_m, 0.0), ..Pose::IDENTITY },
+            };
+            let poses = vec![pose(500_000, aside_m[0]), pose(1_000_000, aside_m[1])];
+            let command = Command::Path(Path::checked(poses).unwrap());
+            let options = StepOptions { until_us: Some(1_000_000), ..StepOptions::default() };
+            session.follow(command, options).await.unwrap();
+            let events: Vec<Event> = session.events().to_vec();
+            (events, session.close(Outcome::Completed).await.outcome)
+        }
+    };
+    let (events, outcome) = path("on", [0.0, 30.0]).await;
+    assert_eq!(outcome, Outcome::DrivingFailure, "{events:?}");
+    assert!(events.is_sorted_by_key(|event| event.time_us), "{events:?}");
+    let left = events.iter().filter(|event| matches!(event.kind, EventKind::OffModel { .. }));
+    assert_eq!(left.count(), 0, "it had failed before");
 }

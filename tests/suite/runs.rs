@@ -151,9 +151,7 @@ async fn the_report_shows_the_worst_episodes_with_pictures() {
     assert_eq!(html.matches("<svg").count(), 4);
     assert!(html.contains("progress at 2.000 s: 0.") && !html.contains("http://cdn"), "{html}");
     assert!(
-        html.contains(
-            "Exit code 1: of 4 episodes 0 were not judged, 0 left the trained area, 4 failed"
-        ),
+        html.contains("Exit code 1: of 4 episodes: 0 not_judged, 0 off_model, 4 failed"),
         "{html}"
     );
     assert!(html.contains("Warning: 2 of 4 episodes were driven as another one"), "{html}");
@@ -305,7 +303,7 @@ fn exit_codes_are_technical_before_driving() {
     let ending = Ending::of(&rated, None);
     assert_eq!(ending.code, ExitCode::Passed);
     assert!(
-        ending.why.contains("of 4 episodes 0 were not judged, 0 left the trained area, 1 failed"),
+        ending.why.contains("of 4 episodes: 0 not_judged, 0 off_model, 1 failed"),
         "{}",
         ending.why
     );
@@ -314,7 +312,7 @@ fn exit_codes_are_technical_before_driving() {
     let xml = junit(&rated, &ending);
     assert!(xml.contains("failures=\"1\"") && xml.contains("\"exit_code\" value=\"0\""), "{xml}");
     let html = page(&rated, &ending, &[], &bench.path("log"));
-    assert!(html.contains("Exit code 0: of 4 episodes 0 were not judged"), "{html}");
+    assert!(html.contains("Exit code 0: of 4 episodes: 0 not_judged"), "{html}");
     rated.at_least = Some(0.9);
     assert_eq!(code(&rated), ExitCode::Driving);
 }

@@ -24,7 +24,7 @@ use super::{bad_input, exit};
 /// Drive a suite of scenarios with an agent, judge every episode, and report.
 ///
 /// Writes into --out: result.json, junit.xml, report.html, and the records of the episodes. The exit code is 0 if every
-/// episode passed, and 1 if one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
+/// episode passed (and those that the suite accepts without a verdict), and 1 if one failed by driving. It is 2 if the command line, the suite, a scenario or the run of
 /// --against is wrong, or the agent cannot be started. It is 3 if an episode was not driven for technical reasons. It is 4
 /// if an episode does not repeat (--verify). It is 5 if none failed, but one has no verdict: a criterion could not be
 /// judged, or the ego left the trained area. A suite, or --accept-unjudged, may accept that by name.

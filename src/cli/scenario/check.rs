@@ -67,9 +67,7 @@ fn looks(scenario: &Scenario, assets: &StoredAssets<'_>) -> Vec<String> {
         };
         is_other.then(|| {
             let (drawn, real) = (size(&own), size(box_));
-            format!(
-                "actor {name:?} looks as if it had {drawn}, and has {real}: choose another asset"
-            )
+            format!("actor {name:?} looks as if it had {drawn}, and has {real}: set its asset")
         })
     };
     scenario.traffic.actors.iter().filter_map(told).collect()

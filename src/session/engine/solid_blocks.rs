@@ -7,7 +7,10 @@ use parking_lot::Mutex;
 
 use wildcity_sim::contact::Solids;
 
-/// Solid Gaussians of sections by the hash of the section, so that versions share what they have in common. Drops the
+/// A section by the hash of its bytes and the place of its origin: its bytes are relative to that.
+pub(crate) type SectionKey = ([u8; 32], [u64; 3]);
+
+/// Solid Gaussians of sections, so that versions share what they have in common. Drops the
 /// blocks that were not used for the longest time, and reads them again when an ego comes near.
 #[derive(Debug)]
 pub(crate) struct SolidBlocks {
@@ -17,7 +20,7 @@ pub(crate) struct SolidBlocks {
 
 #[derive(Debug, Default)]
 struct Held {
-    blocks: HashMap<[u8; 32], HeldBlock>,
+    blocks: HashMap<SectionKey, HeldBlock>,
     bytes: usize,
     /// Number of lookups so far.
     uses: u64,
@@ -35,7 +38,7 @@ impl SolidBlocks {
     }
 
     /// The block of a section, if it is in memory.
-    pub(crate) fn get(&self, section: &[u8; 32]) -> Option<Arc<Solids>> {
+    pub(crate) fn get(&self, section: &SectionKey) -> Option<Arc<Solids>> {
         let mut held = self.held.lock();
         held.uses += 1;
         let now = held.uses;
@@ -45,7 +48,7 @@ impl SolidBlocks {
     }
 
     /// Keeps the block of a section.
-    pub(crate) fn insert(&self, section: [u8; 32], solids: Arc<Solids>) {
+    pub(crate) fn insert(&self, section: SectionKey, solids: Arc<Solids>) {
         let mut held = self.held.lock();
         held.uses += 1;
         let block = HeldBlock { last_use: held.uses, solids };
@@ -83,26 +86,32 @@ mod tests {
         Arc::new(Solids::new((0..count).map(point)))
     }
 
+    fn key(section: u8) -> SectionKey {
+        ([section; 32], [0; 3])
+    }
+
     #[test]
     fn the_blocks_that_were_not_used_are_dropped() {
         let one = solids(100);
         let blocks = SolidBlocks::new(3 * (one.bytes() + 128));
         for section in 0..3 {
-            blocks.insert([section; 32], one.clone());
+            blocks.insert(key(section), one.clone());
         }
-        assert!(blocks.get(&[0; 32]).is_some());
-        blocks.insert([3; 32], one.clone());
-        assert!(blocks.get(&[1; 32]).is_none(), "used before all others");
+        assert!(blocks.get(&key(0)).is_some());
+        blocks.insert(key(3), one.clone());
+        assert!(blocks.get(&key(1)).is_none(), "used before all others");
         for section in [0, 2, 3] {
-            assert!(blocks.get(&[section; 32]).is_some(), "{section}");
+            assert!(blocks.get(&key(section)).is_some(), "{section}");
         }
         // The same section again takes no more memory; one that is larger than the limit stays until the next.
-        blocks.insert([3; 32], one.clone());
-        assert!(blocks.get(&[0; 32]).is_some());
-        blocks.insert([4; 32], solids(1000));
-        assert!(blocks.get(&[4; 32]).is_some());
-        blocks.insert([5; 32], one);
-        assert!(blocks.get(&[4; 32]).is_none());
-        assert!(blocks.get(&[5; 32]).is_some());
+        blocks.insert(key(3), one.clone());
+        assert!(blocks.get(&key(0)).is_some());
+        blocks.insert(key(4), solids(1000));
+        assert!(blocks.get(&key(4)).is_some());
+        blocks.insert(key(5), one);
+        assert!(blocks.get(&key(4)).is_none());
+        assert!(blocks.get(&key(5)).is_some());
+        // The same bytes elsewhere are other solids.
+        assert!(blocks.get(&([5; 32], [0, 0, 1])).is_none());
     }
 }

@@ -1,8 +1,8 @@
 //! The assets of an episode's actors, and the parts of them that a frame draws.
 
-use std::cell::{OnceCell, RefCell};
+use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use wildcity_scene::actor::{ActorAsset, ActorViewpoint, ContactShadow, PlacedChunk};
 use wildcity_scene::geometry::Pose;
@@ -29,13 +29,21 @@ pub(crate) struct FrameDetail<'a> {
 pub struct StoredAssets<'a> {
     catalog: &'a Catalog,
     found: RefCell<BTreeMap<String, Result<AssetInfo, String>>>,
-    generated: OnceCell<Result<Vec<StoredActor>, String>>,
+    generated: GeneratedActors,
 }
+
+/// The generated assets of a store, once they are needed; none if they cannot be made, as in a store that is read only.
+pub(crate) type GeneratedActors = Arc<OnceLock<Vec<StoredActor>>>;
 
 impl<'a> StoredAssets<'a> {
     /// The assets of a store. If an actor needs a generated one that is missing, it is made.
     pub fn new(catalog: &'a Catalog) -> Self {
-        Self { catalog, found: RefCell::default(), generated: OnceCell::new() }
+        Self::sharing(catalog, Arc::default())
+    }
+
+    /// As [`Self::new`], with the generated assets that others have found.
+    pub(crate) fn sharing(catalog: &'a Catalog, generated: GeneratedActors) -> Self {
+        Self { catalog, found: RefCell::default(), generated }
     }
 }
 
@@ -51,10 +59,12 @@ impl Assets for StoredAssets<'_> {
     }
 
     fn default_for(&self, class: ActorClass, box_: &ActorBox) -> Result<Option<AssetInfo>, String> {
-        let generated = self.generated.get_or_init(|| generated_actors(self.catalog));
-        let generated = generated.as_ref().map_err(|reason| {
-            format!("the generated one cannot be made: {reason}; write \"asset\": \"none\" for an invisible actor")
-        })?;
+        let generated = self.generated.get_or_init(|| {
+            generated_actors(self.catalog).unwrap_or_else(|reason| {
+                tracing::warn!("actors that name no asset are not drawn: {reason}");
+                Vec::new()
+            })
+        });
         Ok(nearest(generated, class, box_).map(info))
     }
 }

@@ -18,9 +18,10 @@ use wildcity_twin::store::Version;
 pub use assets::StoredAssets;
 pub use default_assets::generated_actors;
 pub use load::{LoadedScenario, ScenarioError, ScenarioSource, Scenarios};
+pub(crate) use traffic::settle;
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
-use self::assets::ActorAssets;
+use self::assets::{ActorAssets, GeneratedActors};
 use crate::error::SessionError;
 use crate::options::Start;
 
@@ -39,6 +40,7 @@ pub(crate) struct SessionScenario {
     file: ScenarioFile,
     /// Whether episodes start where the scenario's ego section says, because the request named no start.
     gives_start: bool,
+    generated: GeneratedActors,
 }
 
 impl SessionScenario {
@@ -54,7 +56,7 @@ impl SessionScenario {
         chosen.extend(values.iter().map(|(name, value)| (name.clone(), value.clone())));
         let wrong = |cause| ScenarioError::File { file: "scenario".to_owned(), cause };
         let file = document.with(&chosen).map_err(wrong)?;
-        Ok(Self { scenarios, file, gives_start })
+        Ok(Self { scenarios, file, gives_start, generated: Arc::default() })
     }
 
     /// The scenario of an episode with a seed, and the assets of its actors, in memory.
@@ -66,7 +68,7 @@ impl SessionScenario {
     ) -> Result<EpisodeScenario, SessionError> {
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
-        let assets = StoredAssets::new(cache.catalog());
+        let assets = StoredAssets::sharing(cache.catalog(), self.generated.clone());
         let loaded = self.scenarios.resolve(file, seed, pinned, false, &assets)?;
         let actors = loaded.scenario.traffic.actors.iter();
         let assets = ActorAssets::load(cache, actors.map(|actor| actor.spec.asset.as_deref()))?;

@@ -174,9 +174,8 @@ impl EpisodeTraffic {
             }),
         );
         next.past.push(next.world.time_us(), next.world.states());
-        next.events.sort_by_key(|event| event.time_us);
-        next.events.truncate(limits::EVENTS);
         next.end(to, has_contact);
+        settle(&mut next.events);
         next
     }
 
@@ -198,7 +197,7 @@ impl EpisodeTraffic {
             events.append(&mut next.events);
             from = ego;
         }
-        events.truncate(limits::EVENTS);
+        settle(&mut events);
         Self { events, ..next }
     }
 
@@ -297,10 +296,8 @@ impl EpisodeTraffic {
 
     /// Adds an event to those of the last step.
     pub(crate) fn add_event(&mut self, event: Event) {
-        if self.events.len() < limits::EVENTS {
-            self.events.push(event);
-            self.events.sort_by_key(|event| event.time_us);
-        }
+        self.events.push(event);
+        settle(&mut self.events);
     }
 
     /// Events of the last step, by time; at most [`limits::EVENTS`].
@@ -330,6 +327,21 @@ impl EpisodeTraffic {
     pub fn ended(&self) -> Option<EndReason> {
         self.ended
     }
+}
+
+/// Puts events in the order of their times, those of one time in the given order. Of more than [`limits::EVENTS`], keeps
+/// those that end or judge an episode before those that only tell.
+pub(crate) fn settle(events: &mut Vec<Event>) {
+    let weight = |event: &Event| match event.kind {
+        EventKind::End(_) | EventKind::OffModel { .. } => 0,
+        EventKind::Contact(_) | EventKind::StaticContact { .. } => 1,
+        EventKind::Trigger { .. } | EventKind::Appeared { .. } | EventKind::Left { .. } => 2,
+    };
+    if events.len() > limits::EVENTS {
+        events.sort_by_key(|event| (weight(event), event.time_us));
+        events.truncate(limits::EVENTS);
+    }
+    events.sort_by_key(|event| (event.time_us, weight(event) < 2));
 }
 
 /// Where the corners of the ego lie in the lanes of a map.

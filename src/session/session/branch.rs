@@ -3,6 +3,8 @@
 
 use std::sync::Arc;
 
+use tokio::time::Instant;
+
 use wildcity_scene::rig::overlay_bytes;
 
 use super::Session;
@@ -66,7 +68,8 @@ impl Session {
         let earlier = state.frame_history.before(episode.time_us());
         let captures = layout.captures(&episode, &earlier);
         let simulation = SimulationState { episode: &episode, traffic: state.traffic.as_ref() };
-        let rendered = self.render(version, simulation, captures, Some(earlier)).await?;
+        let deadline = Instant::now() + self.settings.deadline;
+        let rendered = self.render(version, simulation, captures, Some(earlier), deadline).await?;
         let mut bytes = None;
         if !version.is_version_of(&self.version) {
             let resident = version.resident.clone();
@@ -237,7 +240,8 @@ impl Session {
             let history = Some(self.state.frame_history.clone());
             let captures = frames.iter().map(|frame| frame.capture.clone()).collect();
             let simulation = SimulationState { episode: &episode, traffic: None };
-            let rendered = self.render(&version, simulation, captures, history).await?;
+            let deadline = Instant::now() + self.settings.deadline;
+            let rendered = self.render(&version, simulation, captures, history, deadline).await?;
             for (frame, now) in frames.iter().zip(&rendered.hashes) {
                 if now.to_hex().as_str() != frame.hash {
                     let camera = self.cameras()[frame.camera].name.clone();

@@ -32,7 +32,7 @@ use crate::record::command::RecordedCommand;
 use crate::record::format::{FrameRequest, Line, RecordedOrigin};
 use crate::record::recorder::NewFile;
 use crate::scenario::assets::FrameDetail;
-use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind};
+use crate::scenario::{EpisodeScenario, EpisodeTraffic, Event, EventKind, settle};
 use crate::start::EpisodeStart;
 use crate::state::{EpisodeState, PinnedVersion};
 
@@ -77,9 +77,10 @@ impl Session {
     ) -> Result<Observation, SessionError> {
         let steps = self.plan_steps(&command, options.until_us)?;
         check_notes(options.notes.as_ref())?;
+        let deadline = Instant::now() + self.settings.deadline;
         let now = &self.state.episode;
         let (mut next, egos) = self.moved(&command, steps, options.terminate)?;
-        let met = self.meetings(now, egos.clone()).await?;
+        let met = self.meetings(now, egos.clone(), deadline).await?;
         let traffic = self.state.traffic.as_ref();
         let dt_us = self.settings.dt_us;
         let mut traffic =
@@ -92,7 +93,7 @@ impl Session {
                 }
             }
             None => {
-                events = met.contacts.into_iter().flatten().take(limits::EVENTS).collect();
+                events = met.contacts.into_iter().flatten().collect();
                 if !events.is_empty() && self.contact_mode(&next) == ContactMode::End {
                     next.end(EndReason::Contact);
                     let kind = EventKind::End(EndReason::Contact);
@@ -105,12 +106,15 @@ impl Session {
         let captures = self.settings.layout.captures(&next, &frame_history);
         let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
         let rendered =
-            self.render(&self.version, simulation, captures, Some(frame_history)).await?;
-        let left = left_model(&mut next, met.off_model, &rendered);
+            self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
+        let happened = traffic.as_ref().map_or(events.as_slice(), EpisodeTraffic::events);
+        let failed_us = next.is_failed().then(|| first_failure_us(happened)).flatten();
+        let left = left_model(&mut next, met.off_model, &rendered, failed_us);
         match &mut traffic {
             Some(traffic) => left.into_iter().for_each(|event| traffic.add_event(event)),
             None => events.extend(left),
         }
+        settle(&mut events);
 
         let mut record = self.frame_record(FrameRequest::Step, &next, &rendered);
         record.command = match now.is_delayed() {
@@ -146,7 +150,12 @@ impl Session {
 
     /// What the ego meets of the twin while it goes through `egos`, and whether it leaves the trained area. Off the
     /// threads that answer requests: it may have to read the twin.
-    async fn meetings(&self, now: &Episode, egos: Vec<Ego>) -> Result<Meetings, SessionError> {
+    async fn meetings(
+        &self,
+        now: &Episode,
+        egos: Vec<Ego>,
+        deadline: Instant,
+    ) -> Result<Meetings, SessionError> {
         let solids = self.version.solids.clone();
         let recorded = self.version.index.recorded().filter(|_| !now.is_off_model()).cloned();
         let from = now.ego().clone();
@@ -162,7 +171,6 @@ impl Session {
             let off_model = trusts.into_iter().find(|(_, trust)| *trust < limits::OFF_MODEL_TRUST);
             Ok::<_, SessionError>(Meetings { contacts, off_model })
         };
-        let deadline = Instant::now() + self.settings.deadline;
         let found = timeout_at(deadline, run_blocking(find)).await;
         found.map_err(|_| SessionError::DeadlineExceeded)??
     }
@@ -206,7 +214,8 @@ impl Session {
         let captures = self.settings.layout.captures_at(&episode, poses);
         let simulation =
             SimulationState { episode: &episode, traffic: self.state.traffic.as_ref() };
-        let rendered = self.render(&self.version, simulation, captures, None).await?;
+        let deadline = Instant::now() + self.settings.deadline;
+        let rendered = self.render(&self.version, simulation, captures, None, deadline).await?;
         let record = self.frame_record(FrameRequest::Observe, &episode, &rendered);
         self.record(record, None, &[]).instrument(debug_span!("record")).await?;
         Ok(rendered.observation)
@@ -280,12 +289,13 @@ impl Session {
         let frame_history = FrameHistory::default();
         let captures = self.settings.layout.captures(&next, &frame_history);
         let simulation = SimulationState { episode: &next, traffic: traffic.as_ref() };
+        let deadline = Instant::now() + self.settings.deadline;
         let rendered =
-            self.render(&self.version, simulation, captures, Some(frame_history)).await?;
+            self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
         let trust = self.version.index.recorded().map(|at| at.trust(&next.world_from_rig()));
         let off_model =
             trust.filter(|trust| *trust < limits::OFF_MODEL_TRUST).map(|trust| (0, trust));
-        let left = left_model(&mut next, off_model, &rendered);
+        let left = left_model(&mut next, off_model, &rendered, None);
         let mut events = Vec::new();
         match &mut traffic {
             Some(traffic) => left.into_iter().for_each(|event| traffic.add_event(event)),
@@ -331,10 +341,10 @@ impl Session {
         simulation: SimulationState<'_>,
         captures: Vec<RigCapture>,
         history: Option<FrameHistory>,
+        deadline: Instant,
     ) -> Result<RenderedObservation, SessionError> {
         let SimulationState { episode, traffic } = simulation;
         let layout = &self.settings.layout;
-        let deadline = Instant::now() + self.settings.deadline;
         let mut builder = ObservationBuilder::new(
             layout.clone(),
             self.engine.answer_budget(),
@@ -390,17 +400,29 @@ impl Session {
     }
 }
 
+/// When the first event happened by which an episode may have failed, in microseconds.
+fn first_failure_us(events: &[Event]) -> Option<i64> {
+    let fails = |event: &&Event| {
+        matches!(
+            event.kind,
+            EventKind::Contact(_) | EventKind::StaticContact { .. } | EventKind::End(_)
+        )
+    };
+    events.iter().filter(fails).map(|event| event.time_us).min()
+}
+
 /// The event that an episode leaves the area that the twin was trained on, by a pose or by the images of an observation;
-/// `None` if it does not, or has left it before.
+/// `None` if it does not, or has left it before, or failed before.
 fn left_model(
     next: &mut Episode,
     off_model: Option<(i64, f64)>,
     rendered: &RenderedObservation,
+    failed_us: Option<i64>,
 ) -> Option<Event> {
     let of_images = next.add_trusts(rendered.trusts());
     let is_low = of_images.filter(|trust| *trust < limits::OFF_MODEL_TRUST);
     let (time_us, trust) = off_model.or(is_low.map(|trust| (next.time_us(), trust)))?;
-    if next.is_off_model() {
+    if next.is_off_model() || failed_us.is_some_and(|failed_us| failed_us <= time_us) {
         return None;
     }
     next.leave_model();

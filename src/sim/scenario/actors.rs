@@ -227,8 +227,10 @@ fn actor_of(
         None => default_asset("asset", class, &box_, around)?,
     };
     let asset = asset.map(|asset| asset.hash);
-    // An actor that is not drawn keeps the word for it, so that it is not drawn again either.
+    // An actor that is not drawn keeps the word for it, so that it is not drawn again either. One that gets an asset by its
+    // size keeps that size: the asset's own would be taken the next time.
     if asset.is_some() {
+        section.size.get_or_insert([box_.length_m, box_.width_m, box_.height_m]);
         section.asset.clone_from(&asset);
     }
     let mut actor = Actor {
