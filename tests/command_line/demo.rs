@@ -89,7 +89,8 @@ fn a_demo_with_traffic_makes_its_assets_and_mends_them() {
         pictures.push(fs::read(dir.path().join("out/step_0000.png")).unwrap());
         let list = catalog.actors().unwrap();
         let names: Vec<&str> = list.actors.iter().map(|actor| &*actor.description.name).collect();
-        assert_eq!(names, ["hatchback", "pedestrian", "sedan", "van"], "{scenario}");
+        let all = ["bicycle", "bus", "crate", "hatchback", "pedestrian", "sedan", "truck", "van"];
+        assert_eq!(names, all, "{scenario}");
         assert_eq!(list.damaged, []);
         // The next one finds a damaged asset.
         let hash = &list.actors[0].hash;

@@ -57,7 +57,11 @@ async fn two_laps(steps: u64) {
     let mut agent = Agent::connect(served.address).await;
     agent.hello().await;
     let dynamics = json!({ "model": "dynamic", "speed": 5.0 });
-    agent.open(json!({ "dynamics": dynamics, "outputs": { "encoding": "raw" } })).await;
+    agent
+        .open(
+            json!({ "dynamics": dynamics, "outputs": { "encoding": "raw" }, "contact": "report" }),
+        )
+        .await;
     let (mut laps, mut early_bytes) = (Vec::new(), None);
     for _ in 0..2 {
         agent.look(json!({ "type": "reset" })).await;

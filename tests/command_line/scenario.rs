@@ -144,8 +144,8 @@ fn files_of_others_become_maps_and_scenarios() {
         "{error}"
     );
 
-    let entity = "<ScenarioObject name=\"Ego\"><Vehicle vehicleCategory=\"car\"><BoundingBox><Center x=\"1.4\"/>\
-                  <Dimensions length=\"5\" width=\"2\" height=\"1.5\"/></BoundingBox></Vehicle></ScenarioObject>";
+    let entity = "<ScenarioObject name=\"Ego\"><Vehicle vehicleCategory=\"car\"><BoundingBox>\
+                  <Center x=\"1.4\" y=\"0\" z=\"0.7\"/><Dimensions length=\"5\" width=\"2\" height=\"1.5\"/></BoundingBox></Vehicle></ScenarioObject>";
     let xosc = format!(
         "<OpenSCENARIO>\n<FileHeader revMajor=\"1\" revMinor=\"0\"/>\n<Entities>{entity}</Entities>\n\
          <Storyboard><Init><Actions/></Init></Storyboard>\n</OpenSCENARIO>"

@@ -70,7 +70,10 @@ fn scenario(fields: Value) -> Value {
 }
 
 fn suite(fields: Value) -> Value {
-    let value = json!({ "format": "wildcity.suite/1", "name": "ci", "scenarios": ["short.json"] });
+    let value = json!({
+        "format": "wildcity.suite/1", "name": "ci", "scenarios": ["short.json"],
+        "accept_unjudged": ["off_road"],
+    });
     with(value, fields)
 }
 
@@ -138,13 +141,18 @@ fn a_run_against_another_is_one_command() {
     for file in ["comparison.json", "comparison.html"] {
         assert!(bench.path().join("worse").join(file).is_file(), "{file}");
     }
-    assert!(bench.out("worse/report.html").contains("Exit code 1: of 2 episodes 2 failed"));
+    assert!(
+        bench
+            .out("worse/report.html")
+            .contains("Exit code 1: of 2 episodes: 0 not_judged, 0 off_model, 2 failed")
+    );
 
     // Episodes that failed before may fail again; the content of junit.xml does not change.
     let kept = bench.run("stand", "kept", &["--against", "stand"]);
     let (out, _) = ends(&kept, 0);
     assert!(
-        out.contains("ended       of 2 episodes 2 failed") && out.contains("not worse"),
+        out.contains("ended       of 2 episodes: 0 not_judged, 0 off_model, 2 failed")
+            && out.contains("not worse"),
         "{out}"
     );
     let xml = bench.out("kept/junit.xml");
