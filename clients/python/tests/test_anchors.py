@@ -101,6 +101,7 @@ def driven(quick_reader: dict[str, str], tmp_path_factory: pytest.TempPathFactor
         "scenarios": [f"{name}.json" for name in ACTORS],
         "cameras": ["front"],
         "size": [32, 20],
+        "accept_unjudged": ["off_road"],
     }
     (folder / "suite.json").write_text(json.dumps(suite))
     for agent in AGENTS:
