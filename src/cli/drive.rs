@@ -26,7 +26,7 @@ const LOST_EXIT_CODE: u8 = 69;
 /// The driver is a gRPC server of AlpaSim's service egodriver. In each step of 0.1 s it receives the new images, the
 /// ego's poses and the route, which follows a recorded drive or comes from a scenario. The ego then follows the
 /// driver's plan. Prints one line of JSON for each episode: outcome, steps, distance, and a hash of all frames. The
-/// exit code is 1 if an episode did not complete. For a single episode it is 124 if the driver did not answer in time,
+/// exit code is 1 if an episode did not complete: a contact ends it as driving_failure. For a single episode it is 124 if the driver did not answer in time,
 /// and 69 if the connection to it was lost. For a server with tokens, set $WILDCITY_TOKEN.
 ///
 /// Without TWIN the command is an agent for `wildcity episode run`, which describes the episode in environment
@@ -143,7 +143,16 @@ impl Drive {
             }
             if let Some(ended) = running.join_next().await {
                 let report = ended??;
-                if report.outcome != Outcome::Completed {
+                // `episode run` judges the driving itself.
+                let is_driven = matches!(
+                    report.outcome,
+                    Outcome::Completed | Outcome::DrivingFailure | Outcome::OffModel
+                );
+                let is_good = match self.twin {
+                    Some(_) => report.outcome == Outcome::Completed,
+                    None => is_driven,
+                };
+                if !is_good {
                     failed.push(report.outcome);
                 }
                 writeln!(io::stdout(), "{}", line(&report))?;
@@ -220,6 +229,8 @@ fn number(name: &str) -> anyhow::Result<u64> {
 fn line(report: &EpisodeReport) -> serde_json::Value {
     let outcome = match report.outcome {
         Outcome::Completed => "completed",
+        Outcome::DrivingFailure => "driving_failure",
+        Outcome::OffModel => "off_model",
         Outcome::AgentError => "agent_error",
         Outcome::AgentTimeout => "agent_timeout",
         Outcome::AgentLost => "agent_lost",

@@ -65,8 +65,11 @@ def test_an_episode_ends_off_the_route_at_its_end_and_at_the_horizon(server: Ser
         finally:
             env.close()
 
-    terminated, truncated, _, distance_m = drive(LEFT, off_route_m=1.0)
-    assert (terminated, truncated) == (True, False) and distance_m > 1.0
+    terminated, truncated, _, distance_m = drive(LEFT, off_route_m=0.2)
+    assert (terminated, truncated) == (True, False) and 0.2 < distance_m < 1.0
+    # The wall of the corridor is met before.
+    terminated, truncated, _, distance_m = drive(LEFT, off_route_m=3.0)
+    assert (terminated, truncated) == (True, False) and distance_m < 3.0
     # 9.5 m at 5 m/s.
     terminated, truncated, steps, distance_m = drive(STRAIGHT)
     assert (terminated, truncated) == (False, True) and steps in (19, 20) and distance_m < 1e-3
@@ -83,6 +86,8 @@ def scenario(**changes: Any) -> dict[str, Any]:
         "ego": {"start": {"trajectory": "log", "station_m": 0.0}, "dynamics": {"model": "dynamic", "speed": 5.0}},
         "actors": actors,
         "end": {"time_s": 2.5, "off_route_m": 1.0, "contact": "any"},
+        # The corridor is narrower than the car's way to the side.
+        "verdict": {"twin_contact": False},
         **changes,
     }
 

@@ -10,7 +10,7 @@ use std::time::Duration;
 use glam::{DMat3, DQuat, DVec3};
 
 use wildcity_client::protocol::message::{
-    Drive, DrivePose, DriveSection, ImagePart, Opened, Outputs, Start,
+    self, Drive, DrivePose, DriveSection, ImagePart, Opened, Outputs, Start,
 };
 use wildcity_client::{
     Client, ClientError, ConnectOptions, Dynamics, DynamicsChoice, DynamicsModel, HttpClient,
@@ -73,6 +73,10 @@ pub struct EpisodeSettings {
 pub enum Outcome {
     /// All steps were driven, or the driver ended the session.
     Completed,
+    /// A contact ended the episode, or another rule of the scenario.
+    DrivingFailure,
+    /// As `Completed`, but the ego left the area that the twin was trained on.
+    OffModel,
     /// The driver refused a request, or its plan cannot be driven.
     AgentError,
     /// The driver did not answer in time.
@@ -146,12 +150,21 @@ pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, 
     };
     Ok(EpisodeReport {
         seed: settings.seed,
-        outcome: failure.as_ref().map_or(Outcome::Completed, outcome_of),
+        outcome: failure.as_ref().map_or_else(|| driven_outcome(closed.outcome), outcome_of),
         reason: failure.map(|error| error.to_string()),
         steps: closed.steps,
         distance_m: closed.distance_m,
         frames_hash: episode.hashes.finalize().to_hex().to_string(),
     })
+}
+
+/// The outcome of an episode in which the driver answered to the end.
+fn driven_outcome(closed: message::Outcome) -> Outcome {
+    match closed {
+        message::Outcome::DrivingFailure => Outcome::DrivingFailure,
+        message::Outcome::OffModel => Outcome::OffModel,
+        _ => Outcome::Completed,
+    }
 }
 
 fn outcome_of(error: &DriverError) -> Outcome {

@@ -285,7 +285,9 @@ class DriveTask(Task):
         return DriveState(station_m, distance_m, float(np.linalg.norm(seen.ego.velocity)), seen)
 
     def _ended(self, state: DriveState) -> tuple[bool, bool]:
-        return state.distance_m > self.config.off_route_m, state.station_m >= self.route.length_m - 0.5
+        # The server ends the episode at a contact with the twin.
+        is_off = state.distance_m > self.config.off_route_m or state.observation.metadata.terminated
+        return is_off, state.station_m >= self.route.length_m - 0.5
 
     def _ahead(self, state: DriveState) -> NDArray[np.float64]:
         pose = state.observation.ego.pose
