@@ -1,4 +1,4 @@
-//! A person who rides a bicycle along x.
+//! A cyclist on a bicycle that points along x.
 
 use std::f64::consts::TAU;
 

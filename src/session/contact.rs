@@ -13,16 +13,15 @@ use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 use parking_lot::Mutex;
-use serde::{Deserialize, Serialize};
 
 use wildcity_scene::Chunk;
 use wildcity_scene::chunk::{BLOCK_M, column};
 use wildcity_scene::geometry::Pose;
+use wildcity_sim::Ego;
 use wildcity_sim::contact::{
     MAX_SWEPT_SPEED_MPS, SOLID_OPACITY, SolidPoint, Solids, StaticLimit, TestedBox,
 };
 use wildcity_sim::traffic::{EgoBox, EgoMotion, EgoState};
-use wildcity_sim::{Ego, EgoModel};
 use wildcity_twin::store::{Catalog, StoreError};
 
 use crate::engine::solid_blocks::SolidBlocks;
@@ -38,27 +37,6 @@ const MEASURED_M: f64 = 0.5;
 /// for longer.
 const TESTED_M: f64 = 0.25;
 const TESTED_RAD: f64 = 0.05;
-
-/// Whether a session looks for contact with the twin, and what it does at a contact. With a scenario, `Off` switches it
-/// off, and the scenario says what a contact does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ContactMode {
-    /// A contact is an event, and ends the episode as a driving failure.
-    End,
-    /// A contact is an event, and the episode goes on.
-    Report,
-    /// Contact with the twin is not looked for.
-    Off,
-}
-
-impl ContactMode {
-    /// The mode of an episode unless the session names one. A teleported ego is not stopped by what it meets: it is
-    /// often put into places where no car drives.
-    pub(crate) fn default_for(model: EgoModel) -> Self {
-        if model == EgoModel::Teleport { Self::Report } else { Self::End }
-    }
-}
 
 /// The solid Gaussians of a version, for an ego of one size. Copies share what they have read.
 #[derive(Clone, Debug)]

@@ -44,7 +44,6 @@ mod stills;
 mod viewpoint;
 
 pub use blocking::run_blocking;
-pub use contact::ContactMode;
 pub use engine::answer_budget::BudgetShare;
 pub use engine::render_queue::{FrameCost, Scratch};
 pub use engine::twin_summaries::{DamagedSummary, TrajectorySummary, TwinSummaries, TwinSummary};
@@ -60,8 +59,8 @@ pub use observe::observation::{
 };
 pub use observe::trust::{RecordedPoses, TrainingCoverage, Trust};
 pub use options::{
-    ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions, ResetOptions, RigChoice,
-    ScenarioOptions, SessionOptions, Start, StepOptions,
+    ContactMode, ImagePart, OnFailure, Outputs, PixelMaps, RandomStart, RepairOptions,
+    ResetOptions, RigChoice, ScenarioOptions, SessionOptions, Start, StepOptions,
 };
 pub use record::command::RecordedCommand;
 pub use record::continuation::Continuation;

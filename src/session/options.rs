@@ -8,9 +8,8 @@ use serde::{Deserialize, Serialize};
 use wildcity_scene::ProfileOverrides;
 use wildcity_scene::Rig;
 use wildcity_scene::geometry::Pose;
-use wildcity_sim::Dynamics;
+use wildcity_sim::{Dynamics, EgoModel};
 
-use crate::contact::ContactMode;
 use crate::observe::encode::Encoding;
 use crate::scenario::load::ScenarioSource;
 use crate::sensors::settings::Sensors;
@@ -121,6 +120,27 @@ pub enum OnFailure {
     Unrepaired,
     /// The request is refused with [`SessionError::Repair`](crate::SessionError::Repair); nothing changed.
     Error,
+}
+
+/// Whether a session looks for contact with the twin, and what it does at a contact. With a scenario, `Off` switches it
+/// off, and the scenario says what a contact does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ContactMode {
+    /// A contact is an event, and ends the episode as a driving failure.
+    End,
+    /// A contact is an event, and the episode goes on.
+    Report,
+    /// Contact with the twin is not looked for.
+    Off,
+}
+
+impl ContactMode {
+    /// The mode of an episode unless the session names one. A teleported ego is not stopped by what it meets: it is
+    /// often put into places where no car drives.
+    pub(crate) fn default_for(model: EgoModel) -> Self {
+        if model == EgoModel::Teleport { Self::Report } else { Self::End }
+    }
 }
 
 /// Options of a step in addition to its command.

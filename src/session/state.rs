@@ -8,13 +8,13 @@ use wildcity_sim::Dynamics;
 use wildcity_sim::traffic::EgoBox;
 use wildcity_twin::residency::Resident;
 
-use crate::contact::{ContactMode, TwinSolids};
+use crate::contact::TwinSolids;
 use crate::engine::answer_budget::BudgetShare;
 use crate::episode::Episode;
 use crate::observe::frame_history::FrameHistory;
 use crate::observe::layout::ObservationLayout;
 use crate::observe::trust::TrainingCoverage;
-use crate::options::RandomStart;
+use crate::options::{ContactMode, RandomStart};
 use crate::prefetch::recorded_drive::RecordedDrive;
 use crate::record::format::profile_hash;
 use crate::repair::references::ReferenceViews;

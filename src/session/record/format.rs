@@ -19,10 +19,10 @@ use wildcity_scene::rig::is_name;
 use wildcity_scene::{ProfileOverrides, RenderProfile, Rig};
 use wildcity_sim::{Dynamics, Ego};
 
-use crate::contact::ContactMode;
 use crate::episode::{Episode, EpisodeSummary};
 use crate::observe::encode::Encoding;
 use crate::observe::schedule::Schedule;
+use crate::options::ContactMode;
 use crate::record::command::RecordedCommand;
 use crate::record::repairs::{RecordedImageRepair, RecordedRepair};
 use crate::sensors::settings::Sensors;

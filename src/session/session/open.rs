@@ -16,7 +16,6 @@ use wildcity_twin::residency::{FrameBytes, Reservation, Resident, RigExtent, Urg
 
 use super::Session;
 use crate::blocking::run_blocking;
-use crate::contact::ContactMode;
 use crate::engine::Engine;
 use crate::error::SessionError;
 use crate::limits;
@@ -24,7 +23,7 @@ use crate::observe::layout::ObservationLayout;
 use crate::observe::schedule::Schedule;
 use crate::observe::trust::TrainingCoverage;
 use crate::options::{
-    ImagePart, Outputs, RandomStart, RigChoice, ScenarioOptions, SessionOptions, Start,
+    ContactMode, ImagePart, Outputs, RandomStart, RigChoice, ScenarioOptions, SessionOptions, Start,
 };
 use crate::prefetch::latest_task::LatestTask;
 use crate::prefetch::recorded_drive::RecordedDrive;
