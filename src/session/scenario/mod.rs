@@ -79,6 +79,8 @@ impl SessionScenario {
     pub(crate) fn pin_assets(&mut self, first: &LoadedScenario) {
         for (actor, pinned) in self.file.actors.iter_mut().zip(&first.scenario.file.actors) {
             actor.asset.clone_from(&pinned.asset);
+            // An actor that got its asset by its size keeps this size.
+            actor.size = pinned.size;
         }
     }
 
