@@ -65,8 +65,8 @@ def test_an_episode_ends_off_the_route_at_its_end_and_at_the_horizon(server: Ser
         finally:
             env.close()
 
-    terminated, truncated, _, distance_m = drive(LEFT, off_route_m=0.2)
-    assert (terminated, truncated) == (True, False) and 0.2 < distance_m < 1.0
+    terminated, truncated, _, distance_m = drive(LEFT, off_route_m=0.05)
+    assert (terminated, truncated) == (True, False) and 0.05 < distance_m < 1.0
     # The wall of the corridor is met before.
     terminated, truncated, _, distance_m = drive(LEFT, off_route_m=3.0)
     assert (terminated, truncated) == (True, False) and distance_m < 3.0
