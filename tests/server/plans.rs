@@ -111,8 +111,9 @@ async fn an_action_that_is_kept_is_as_many_steps() {
         // On record, in a replay, and in a branch.
         let path = server.episodes.path().join(format!("{model}-planned-1.jsonl"));
         let written = lines(&path);
-        assert_eq!(written[2]["notes"], json!({ "n": 1 }));
-        assert_eq!((&written[2]["step"], &written[2]["steps"]), (&json!(20), &json!(10)));
+        let frames: Vec<_> = written.iter().filter(|line| line["kind"] == "frame").collect();
+        assert_eq!(frames[1]["notes"], json!({ "n": 1 }));
+        assert_eq!((&frames[1]["step"], &frames[1]["steps"]), (&json!(20), &json!(10)));
         let report = replay(&server, &path, &Cpu::new(1, Simd::Best).unwrap()).unwrap();
         assert_eq!((report.diverged, report.difference), (None, None), "{model}");
         let mut branch = server.agent().await;
