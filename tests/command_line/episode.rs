@@ -140,18 +140,9 @@ fn a_suite_is_driven_and_its_records_are_read() {
     // The run wrote the same file next to the record; the order of the index differs from file to file.
     let of_run = std::fs::read(dir.path().join("log/episodes/short-0-1.mcap")).unwrap();
     assert_eq!((count(&of_run, "/wildcity/step"), of_run.len()), (9, bytes.len()));
-    let none = [
-        "run",
-        "short.json",
-        "--twins",
-        twins,
-        "--mcap",
-        "false",
-        "--out",
-        "none",
-        "--backend",
-        "cpu",
-    ];
-    assert_eq!(wildcity(&none, dir.path()).status.code(), Some(0));
+    let none = ["run", "short.json", "--twins", twins, "--mcap", "false", "--out", "none"];
+    let accepted = ["--backend", "cpu", "--accept-unjudged", "off_road"];
+    let driven = wildcity(&[&none[..], &accepted].concat(), dir.path());
+    assert_eq!(driven.status.code(), Some(0));
     assert!(!dir.path().join("none/episodes/short-0-1.mcap").exists());
 }
