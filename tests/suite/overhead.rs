@@ -43,9 +43,10 @@ impl Backend for Timed {
 }
 
 /// One camera of 1440 x 928 px on the demo street, with one thread and one episode at a time: the overhead of all steps
-/// adds up. With steps of 11 ms, as at 160 x 103 px, it is a tenth.
+/// adds up. It was below 5 % before every run looked for contact with the twin, which reads the solid Gaussians of the
+/// street once: 1 to 2 % of this run of one camera, and a sixth of that with six.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_takes_less_than_five_percent_more_than_its_rendering() {
+async fn a_run_takes_less_than_a_tenth_more_than_its_rendering() {
     let bench = Bench::new();
     let street = wildcity_generate::street(&StreetSettings::default()).unwrap();
     let new = NewVersion {
@@ -83,7 +84,7 @@ async fn a_run_takes_less_than_five_percent_more_than_its_rendering() {
         let rendering = *timed.spent.lock().unwrap();
         shares.push(whole.as_secs_f64() / rendering.as_secs_f64() - 1.0);
         eprintln!("{whole:?} in all, {rendering:?} of it rendering");
-        if shares[attempt] < 0.05 {
+        if shares[attempt] < 0.10 {
             return;
         }
     }

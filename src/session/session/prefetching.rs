@@ -58,11 +58,20 @@ impl Session {
         let layout = self.settings.layout.clone();
         let profile = self.version.profile;
         let solids = self.version.solids.clone();
-        let here_m = self.state.episode.world_from_rig().position_m;
+        let here = self.state.episode.world_from_rig();
+        let here_m = here.position_m;
+        // What the ego would meet in the next two seconds: a step that reads a section waits for the disk.
+        let velocity_mps = self.state.episode.ego().velocity_m_s();
+        let onwards = [1.0, 2.0].map(|s| Pose { position_m: here_m + s * velocity_mps, ..here });
         self.prefetch_task.submit(move || {
             let is_near = |pose: &&Pose| pose.position_m.distance(here_m) < limits::SOLIDS_AHEAD_M;
-            let near: Vec<Pose> =
-                places.iter().map(|(_, pose)| pose).filter(is_near).copied().collect();
+            let near: Vec<Pose> = places
+                .iter()
+                .map(|(_, pose)| pose)
+                .chain(&onwards)
+                .filter(is_near)
+                .copied()
+                .collect();
             let places: Vec<_> = places
                 .into_iter()
                 .map(|(urgency, pose)| (urgency, viewpoints(&View::of_rig(layout.cameras(), pose))))
