@@ -7,7 +7,7 @@
 //! {"kind":"result", ...}    before the end: verdict and scores
 //! ```
 //!
-//! A session without a scenario writes none of them.
+//! A session without a scenario writes only events: contacts with the twin, and that the ego left the trained area.
 
 use std::collections::BTreeMap;
 

@@ -42,7 +42,7 @@ pub fn scenario_line(
         route,
         limit_us,
         least_progress: least_progress.unwrap_or(wildcity_score::own::LEAST_PROGRESS),
-        checks_static: true,
+        checks_static: resolved.file.verdict.twin_contact != Some(false),
     }
 }
 

@@ -43,12 +43,11 @@ impl Import {
         let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64);
         let bytes = bytes.with_context(context)?;
         let is_json = bytes.trim_ascii_start().first() == Some(&b'{');
-        let (map, geo, warnings) = match is_json {
-            true => (geojson::read(&bytes, self.origin).with_context(context)?, None, Vec::new()),
-            false => {
-                let imported = opendrive::read(&bytes, self.origin).with_context(context)?;
-                (imported.map, imported.geo, imported.warnings)
-            }
+        let (map, geo, warnings) = if is_json {
+            (geojson::read(&bytes, self.origin).with_context(context)?, None, Vec::new())
+        } else {
+            let imported = opendrive::read(&bytes, self.origin).with_context(context)?;
+            (imported.map, imported.geo, imported.warnings)
         };
         output::write(&self.out, map.to_json().as_bytes())?;
         let mut out = io::stdout().lock();

@@ -29,11 +29,11 @@ const NUMBERS: [(&str, &[&str]); 14] = [
 
 /// A file whose coordinates are near the origin.
 pub(super) struct Framed {
-    /// The text.
+    /// The text, with coordinates near the origin.
     pub(super) text: String,
     /// The place of the origin on the earth, if the file says it.
     pub(super) geo: Option<GeoAnchor>,
-    /// Messages for people.
+    /// What a user should know: by how much the file was moved, and what it lacks.
     pub(super) notes: Vec<String>,
 }
 
@@ -41,14 +41,12 @@ pub(super) struct Framed {
 pub(super) fn framed(text: &str, origin: Option<[f64; 2]>) -> Result<Framed, ConvertError> {
     let document = xml::parse(text, NODES)?;
     check_numbers(&document)?;
-    let offset = offset_of(&document)?;
-    let places = places_of(&document);
+    let offset = header_offset(&document)?;
+    let places = geometry_places(&document);
     let mut notes = Vec::new();
-    let (shift_m, origin_m) = shift_of(&places, origin, offset.as_ref(), &mut notes)?;
-    let text = match shift_m == [0.0, 0.0] {
-        true => text.to_owned(),
-        false => moved(text, &document, shift_m),
-    };
+    let (shift_m, origin_m) = chosen_shift(&places, origin, offset.as_ref(), &mut notes)?;
+    let text =
+        if shift_m == [0.0, 0.0] { text.to_owned() } else { moved(text, &document, shift_m) };
     // Far from the origin, coordinates are those of the projection already, and so are heights.
     let is_local = places.iter().flatten().all(|axis| axis.abs() <= f64::from(FARTHEST_M));
     let offset = offset.filter(|_| is_local);
@@ -93,7 +91,7 @@ fn number(node: Node<'_, '_>, name: &str) -> Result<f64, ConvertError> {
     value.ok_or_else(|| wrong(node, format!("{name}={text:?}; write a finite number")))
 }
 
-fn offset_of(document: &Document<'_>) -> Result<Option<Offset>, ConvertError> {
+fn header_offset(document: &Document<'_>) -> Result<Option<Offset>, ConvertError> {
     let header = document.root_element().children().find(|node| node.has_tag_name("header"));
     let offset = header.and_then(|node| node.children().find(|node| node.has_tag_name("offset")));
     let Some(node) = offset else { return Ok(None) };
@@ -107,7 +105,7 @@ fn is_place(node: &Node<'_, '_>) -> bool {
     node.has_tag_name("geometry") || node.has_tag_name("positionInertial")
 }
 
-fn places_of(document: &Document<'_>) -> Vec<[f64; 2]> {
+fn geometry_places(document: &Document<'_>) -> Vec<[f64; 2]> {
     let places = document.descendants().filter(|node| node.has_tag_name("geometry"));
     places
         .filter_map(|node| {
@@ -118,7 +116,7 @@ fn places_of(document: &Document<'_>) -> Vec<[f64; 2]> {
 }
 
 /// The shift of the coordinates, and the origin afterwards in the map's projection, if it is known.
-fn shift_of(
+fn chosen_shift(
     places: &[[f64; 2]],
     origin: Option<[f64; 2]>,
     offset: Option<&Offset>,
@@ -155,9 +153,12 @@ fn shift_of(
                     format!("its roads are more than {} m apart; cut the map", 2.0 * most_m);
                 return Err(ConvertError::new("OpenDRIVE", message));
             }
-            let [east, north] = bounds.map(|[least, most]| match most - least < most_m {
-                true => (least / 1000.0).floor() * 1000.0,
-                false => (0.5 * (least + most)).round(),
+            let [east, north] = bounds.map(|[least, most]| {
+                if most - least < most_m {
+                    (least / 1000.0).floor() * 1000.0
+                } else {
+                    (0.5 * (least + most)).round()
+                }
             });
             let message = format!(
                 "its roads are more than {most_m} m from the origin, where they are not exact: give the easting and \

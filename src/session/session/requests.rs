@@ -109,9 +109,8 @@ impl Session {
         let happened = traffic.as_ref().map_or(events.as_slice(), EpisodeTraffic::events);
         let failed_us = next.is_failed().then(|| first_failure_us(happened)).flatten();
         let left = left_model(&mut next, met.off_model, &rendered, failed_us);
-        match &mut traffic {
-            Some(traffic) => left.into_iter().for_each(|event| traffic.add_event(event)),
-            None => events.extend(left),
+        if let Some(event) = left {
+            add_event(traffic.as_mut(), &mut events, event);
         }
         settle(&mut events);
 
@@ -296,9 +295,8 @@ impl Session {
             trust.filter(|trust| *trust < limits::OFF_MODEL_TRUST).map(|trust| (0, trust));
         let left = left_model(&mut next, off_model, &rendered, None);
         let mut events = Vec::new();
-        match &mut traffic {
-            Some(traffic) => left.into_iter().for_each(|event| traffic.add_event(event)),
-            None => events.extend(left),
+        if let Some(event) = left {
+            add_event(traffic.as_mut(), &mut events, event);
         }
 
         let record = self.frame_record(FrameRequest::Reset, &next, &rendered);
@@ -396,6 +394,14 @@ impl Session {
         }
         let (held_bytes, limit_bytes) = version.resident.memory();
         builder.finish(history, held_bytes, limit_bytes)
+    }
+}
+
+/// Adds an event to those of the traffic, or without a scenario to `events`.
+fn add_event(traffic: Option<&mut EpisodeTraffic>, events: &mut Vec<Event>, event: Event) {
+    match traffic {
+        Some(traffic) => traffic.add_event(event),
+        None => events.push(event),
     }
 }
 
